@@ -1,0 +1,72 @@
+"""Writing files completely or not at all: everything goes to a temporary name in the same folder and is renamed into place."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from bbfit.checks import fail
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write ``data`` to ``path`` atomically; on any failure the old file stays as it was.
+
+    Raises
+    ------
+    OSError
+        if the disk is full or the folder is not writable; the partial file is removed.
+    """
+    path = Path(path)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write ``value`` as indented JSON atomically; NaN and infinity are refused."""
+    write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+
+
+def read_json(name: str, path: Path) -> Any:
+    """Read a JSON file, with an :class:`~bbfit.checks.InputError` that names it when it is damaged."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        fail(name, f"{path} is not valid JSON ({error})", "remove the file or restore it")
+
+
+def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write a ``.safetensors`` file atomically."""
+    from safetensors.torch import save
+
+    write_bytes(path, save(dict(tensors), dict(metadata)))
+
+
+def output_folder(name: str, path: str | Path) -> Path:
+    """Create an output folder if need be and require that it can be written to; return it as a ``Path``."""
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        fail(name, f"{path} is a file, not a folder", "choose another output folder")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except FileExistsError:
+        fail(name, f"a part of {path} is a file, not a folder", "choose another output folder")
+    except OSError as error:
+        fail(name, f"{path} cannot be written to ({error.strerror})", "choose another output folder or free the disk")
+    return path

@@ -1,0 +1,1 @@
+"""Cameras, orbits, billboards and the homographies between them: pure tensors, no files."""

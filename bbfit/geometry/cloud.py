@@ -1,0 +1,163 @@
+"""The billboard cloud: N textured rectangles in space, as a struct of arrays, saved to and loaded from one file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bbfit.checks import check_choice, check_count, check_file, check_shape, fail
+
+FORMAT = "bbfit billboard cloud 1"
+_TENSORS = ("centers", "rights", "ups", "half_extents", "texture_sizes", "two_sided", "texels")
+
+
+@dataclass(frozen=True)
+class BillboardCloud:
+    """N textured rectangles (Décoret et al. 2003, "Billboard Clouds for Extreme Model Simplification").
+
+    The front of a billboard is the side that its normal, ``right x up``, points to. A one-sided entry shows the same texture from both
+    sides. A two-sided entry owns two textures, each drawn only when the camera is on its side; both are stored as seen from the front,
+    so that equal texels of both lie at the same point in space.
+
+    Texture row 0 is at the top. The rectangle spans the texels' outer *edges*; beyond the outermost texel centres the picture fades
+    to transparent over one texel, exactly as bilinear filtering does in an atlas with a transparent margin.
+    """
+
+    centers: Tensor
+    """Rectangle centres in metres, [N, 3]."""
+    rights: Tensor
+    """Unit vectors along texture columns' index (to the right), [N, 3]."""
+    ups: Tensor
+    """Unit vectors from texture bottom to top, perpendicular to ``rights``, [N, 3]."""
+    half_extents: Tensor
+    """Half width and half height in metres, [N, 2]."""
+    texture_sizes: Tensor
+    """Texture height and width in texels, int64 [N, 2]."""
+    two_sided: Tensor
+    """Whether there is a separate back texture, bool [N]."""
+    texels: Tensor
+    """Straight-alpha display-referred RGBA in [0, 1], [P, 4]: per billboard its front texture row by row, then its back texture if any."""
+
+    def __post_init__(self) -> None:
+        n = len(self.centers)
+        check_shape("centers", tuple(self.centers.shape), (n, 3))
+        check_shape("rights", tuple(self.rights.shape), (n, 3))
+        check_shape("ups", tuple(self.ups.shape), (n, 3))
+        check_shape("half_extents", tuple(self.half_extents.shape), (n, 2))
+        check_shape("texture_sizes", tuple(self.texture_sizes.shape), (n, 2))
+        check_shape("two_sided", tuple(self.two_sided.shape), (n,))
+        check_shape("texels", tuple(self.texels.shape), (sum(self._texel_counts), 4))
+
+    def __len__(self) -> int:
+        return self.centers.shape[0]
+
+    @property
+    def _texel_counts(self) -> list[int]:
+        sizes, sides = self.texture_sizes.tolist(), self.two_sided.tolist()
+        return [h * w * (1 + two) for (h, w), two in zip(sizes, sides, strict=True)]
+
+    @property
+    def normals(self) -> Tensor:
+        """Unit normals, [N, 3]."""
+        return torch.linalg.cross(self.rights, self.ups)
+
+    @property
+    def vertex_count(self) -> int:
+        """Vertices of the exported mesh: four a quad, two quads for a two-sided billboard."""
+        return 4 * (len(self) + int(self.two_sided.sum()))
+
+    def textures(self) -> list[Tensor]:
+        """The textures as views into ``texels``, N tensors of [S, h, w, 4]; S = 1 or 2 (front, back)."""
+        parts = self.texels.split(self._texel_counts)
+        sizes, sides = self.texture_sizes.tolist(), self.two_sided.tolist()
+        return [part.reshape(1 + two, h, w, 4) for part, (h, w), two in zip(parts, sizes, sides, strict=True)]
+
+    def to(self, target: torch.device | torch.dtype | str) -> BillboardCloud:
+        """Move to a device, or convert the floating-point tensors to a dtype."""
+        moved = {name: getattr(self, name) for name in _TENSORS}
+        for name, tensor in moved.items():
+            if not isinstance(target, torch.dtype) or tensor.is_floating_point():
+                moved[name] = tensor.to(target)
+        return BillboardCloud(**moved)
+
+    def with_texels(self, texels: Tensor) -> BillboardCloud:
+        """The same rectangles with other texels, [P, 4]."""
+        return replace(self, texels=texels)
+
+    def save(self, path: str | Path) -> None:
+        """Write one ``.safetensors`` file, completely or not at all."""
+        from bbfit.files import write_tensors
+
+        tensors = {name: getattr(self, name).detach().cpu().contiguous() for name in _TENSORS}
+        write_tensors(path, tensors, {"format": FORMAT})
+
+    @staticmethod
+    def load(path: str | Path) -> BillboardCloud:
+        """Read a file that :meth:`save` wrote.
+
+        Raises
+        ------
+        MissingFileError, InputError
+            if the file is missing, empty, not a billboard cloud or damaged.
+        """
+        from safetensors import SafetensorError, safe_open
+
+        path = check_file("cloud", path)
+        try:
+            with safe_open(path, framework="pt") as file:
+                if (file.metadata() or {}).get("format") != FORMAT:
+                    fail("cloud", f"{path} is not a billboard cloud", "expected a file written by bbfit fit")
+                return BillboardCloud(**{name: file.get_tensor(name) for name in _TENSORS})
+        except SafetensorError as error:
+            fail("cloud", f"{path} cannot be read ({error})", "expected a file written by bbfit fit")
+
+
+def even_upright(
+    count: int,
+    *,
+    axis: Tensor,
+    half_extents: Tensor,
+    texture_sizes: Tensor,
+    sides: str = "one",
+    gap: float = 0.0,
+) -> BillboardCloud:
+    """N upright billboards at k·180°/N through a vertical axis, with transparent textures (thesis, section 4.2 and figures 2 and 4).
+
+    Parameters
+    ----------
+    count : N >= 1.
+    axis : [3] point that all rectangles are centred on horizontally and vertically.
+    half_extents : [2] or [N, 2] in metres.
+    texture_sizes : [2] or [N, 2] height and width in texels.
+    sides : ``"one"``, ``"two"`` (front and back texture), or ``"pair"``: two one-sided rectangles ``gap`` metres apart along the
+        normal, both always drawn (thesis, section 6.4). A pair stands next to each other: entries 2k (front) and 2k + 1 (back).
+    """
+    check_count("billboards", count)
+    check_choice("sides", sides, ("one", "two", "pair"))
+    angle = torch.arange(count, dtype=axis.dtype, device=axis.device) * (math.pi / count)
+    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
+    rights = torch.stack([angle.cos(), zero, -angle.sin()], -1)
+    ups = torch.stack([zero, one, zero], -1)
+    centers = axis.expand(count, 3)
+    half_extents, texture_sizes = half_extents.expand(count, 2), texture_sizes.expand(count, 2)
+    if sides == "pair":
+        rights, ups, centers, half_extents, texture_sizes = (
+            tensor.repeat_interleave(2, 0) for tensor in (rights, ups, centers, half_extents, texture_sizes)
+        )
+        offset = torch.tensor([gap / 2, -gap / 2], dtype=axis.dtype, device=axis.device).repeat(count)
+        centers = centers + offset[:, None] * torch.linalg.cross(rights, ups)
+    two = torch.full((len(centers),), sides == "two", device=axis.device)
+    texel_count = int((texture_sizes.prod(-1) * (1 + two.long())).sum())
+    return BillboardCloud(
+        centers.clone(),
+        rights,
+        ups,
+        half_extents.clone(),
+        texture_sizes.clone(),
+        two,
+        torch.zeros(texel_count, 4, dtype=axis.dtype, device=axis.device),
+    )

@@ -1,0 +1,47 @@
+"""The plane homographies between a billboard's texels and a camera's pixels.
+
+A texel (x, y) of a billboard lies at the world point ``texel_to_world @ (x, y, 1)``; projecting it is linear in homogeneous
+coordinates, so texel and pixel are related by one 3x3 matrix (Hartley and Zisserman 2004, section 2.3 and equation 8.1).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cloud import BillboardCloud
+
+
+def texel_to_world(cloud: BillboardCloud) -> Tensor:
+    """Affine maps from homogeneous texel coordinates to homogeneous world points, [N, 4, 3]."""
+    size = cloud.texture_sizes.flip(-1).to(cloud.half_extents)  # width, height
+    step = 2 * cloud.half_extents / size  # metres a texel
+    along_x = cloud.rights * step[:, :1]
+    along_y = -cloud.ups * step[:, 1:]
+    origin = cloud.centers - (along_x * (size[:, :1] - 1) + along_y * (size[:, 1:] - 1)) / 2
+    top = torch.stack([along_x, along_y, origin], -1)
+    bottom = torch.tensor([0.0, 0.0, 1.0], dtype=top.dtype, device=top.device).expand(len(top), 1, 3)
+    return torch.cat([top, bottom], -2)
+
+
+def texel_to_pixel(cloud: BillboardCloud, camera: Camera) -> Tensor:
+    """Homographies from texel centres to pixel centres, [V, N, 3, 3]; singular where a plane is seen edge-on."""
+    return camera.batch().world_to_pixel[:, None] @ texel_to_world(cloud)
+
+
+def texel_depth(cloud: BillboardCloud, camera: Camera) -> Tensor:
+    """Rows that give the camera depth (metres along +Z) of a homogeneous texel, [V, N, 3]."""
+    return (camera.batch().world_to_camera[:, None, 2:3] @ texel_to_world(cloud))[..., 0, :]
+
+
+def signed_distance(cloud: BillboardCloud, camera: Camera) -> Tensor:
+    """How far each camera stands in front of each plane, [V, N]: positive on the front, negative behind, zero edge-on.
+
+    In metres for a pinhole; for parallel projection the sine of the angle between the viewing direction and the plane.
+    """
+    camera = camera.batch()
+    if camera.orthographic:
+        return -(camera.forward @ cloud.normals.mT)
+    towards = camera.position[:, None] - cloud.centers
+    return (towards * cloud.normals).sum(-1)

@@ -1,0 +1,117 @@
+"""Rings of cameras around a tree, framed so that every vertex is in every picture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bbfit.checks import check_count, check_range, fail
+from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinhole_intrinsics
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """Camera directions on horizontal rings around a vertical axis.
+
+    Azimuth 0 looks from +Z; azimuths grow counter-clockwise seen from above, so 90 degrees looks from +X.
+    """
+
+    count: int = 90
+    """Views in all, shared out over the rings as evenly as possible."""
+    elevations_degrees: tuple[float, ...] = (0.0,)
+    """Height of each ring as an angle above the horizon, in (-90, 90]."""
+
+    def __post_init__(self) -> None:
+        if not self.elevations_degrees:
+            fail("elevations", "expected at least one ring")
+        check_count("count", self.count, len(self.elevations_degrees))
+        for elevation in self.elevations_degrees:
+            check_range("elevations", elevation, -90, 90)
+
+    @property
+    def angles_degrees(self) -> NDArray[np.float64]:
+        """Azimuth and elevation of every view, [V, 2]; rings one after another, successive rings turned by half a step."""
+        rings = len(self.elevations_degrees)
+        rows = []
+        for ring, elevation in enumerate(self.elevations_degrees):
+            n = self.count // rings + (ring < self.count % rings)
+            azimuth = (np.arange(n) + 0.5 * (ring % 2)) * 360.0 / n
+            rows.append(np.stack([azimuth, np.full(n, float(elevation))], -1))
+        return np.concatenate(rows)
+
+    @property
+    def directions(self) -> Tensor:
+        """Unit vectors from the target towards each camera, [V, 3] float64."""
+        azimuth, elevation = torch.from_numpy(np.radians(self.angles_degrees)).unbind(-1)
+        return torch.stack(
+            [elevation.cos() * azimuth.sin(), elevation.sin(), elevation.cos() * azimuth.cos()], -1
+        )
+
+    def frame(
+        self,
+        points: NDArray[np.floating],
+        *,
+        target: Tensor,
+        width: int,
+        height: int,
+        fov_x_degrees: float | None = 40.0,
+        margin: float = 0.02,
+    ) -> Camera:
+        """Cameras of one distance (or one scale) at which every point lies inside every image.
+
+        Parameters
+        ----------
+        points : [P, 3] vertices in metres.
+        target : [3] point that the cameras look at.
+        fov_x_degrees : horizontal field of view in (0, 170]; ``None`` for orthographic cameras.
+        margin : share of the image kept free on each side, in [0, 0.4].
+
+        Returns
+        -------
+        :class:`Camera` with V = ``count`` views, float64.
+        """
+        check_range("margin", margin, 0, 0.4)
+        direction = self.directions
+        rotation = look_at(target + direction, target)[:, :3, :3].numpy()
+        # Only hull vertices can touch the frame; the hull of a million-vertex tree has a few hundred.
+        relative = _hull(np.asarray(points, dtype=np.float64)) - target.numpy()
+        local = np.einsum("vij,pj->vpi", rotation, relative)
+        aspect = height / width
+        lateral = np.maximum(np.abs(local[..., 0]), np.abs(local[..., 1]) / aspect) / (1 - 2 * margin)
+        if fov_x_degrees is None:
+            extent = 2 * float(lateral.max())
+            distance = 2 * float(np.linalg.norm(relative, axis=-1).max()) + 1e-3
+            intrinsics = orthographic_intrinsics(extent, width, height)
+        else:
+            check_range("fov_degrees", fov_x_degrees, 0, 170, open_low=True)
+            slope = math.tan(math.radians(fov_x_degrees) / 2)
+            distance = float((lateral / slope - local[..., 2]).max())
+            intrinsics = pinhole_intrinsics(fov_x_degrees, width, height)
+        views = len(direction)
+        return Camera(
+            look_at(target + distance * direction, target),
+            intrinsics.repeat(views, 1, 1),
+            width,
+            height,
+            fov_x_degrees is None,
+        )
+
+
+def _hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The points that are extreme along any of a dense set of directions, a superset test of which is cheap and exact enough.
+
+    A flat or tiny set has no three-dimensional hull, so then all points are kept.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    if len(points) < 8:
+        return points
+    try:
+        return points[ConvexHull(points).vertices]
+    except QhullError:
+        return points

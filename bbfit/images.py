@@ -1,0 +1,78 @@
+"""Reading and writing RGBA images, and converting between straight and premultiplied alpha."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bbfit.checks import MissingFileError, check_shape, fail
+from bbfit.files import write_bytes
+
+
+def read_rgba(path: str | Path) -> NDArray[np.uint8]:
+    """Read a straight-alpha image.
+
+    Returns
+    -------
+    uint8 [H, W, 4] RGBA; 16-bit files are reduced to 8 bits.
+
+    Raises
+    ------
+    MissingFileError, InputError
+        if the file is missing, cut short, not an image, or has no alpha channel.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingFileError(f"image: {path} does not exist; check the spelling or render the views anew")
+    data = path.read_bytes()
+    if path.suffix.lower() == ".png" and not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
+        fail("image", f"{path} is cut short or no PNG", "render or copy it anew")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if image is None:
+        fail("image", f"{path} cannot be decoded", "render or copy it anew")
+    if image.ndim != 3 or image.shape[2] != 4:
+        fail("image", f"{path} has no alpha channel", "give straight-alpha RGBA images")
+    if image.dtype == np.uint16:
+        image = np.rint(image / 257).astype(np.uint8)
+    return np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA))
+
+
+def encode_png(image: NDArray[np.uint8]) -> bytes:
+    """Encode uint8 [H, W, 3] RGB or [H, W, 4] straight RGBA as PNG."""
+    code = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    done, data = cv2.imencode(".png", cv2.cvtColor(image, code))
+    assert done
+    return data.tobytes()
+
+
+def write_png(path: str | Path, image: NDArray[np.uint8]) -> None:
+    """Write uint8 [H, W, 3 or 4] as PNG, completely or not at all."""
+    write_bytes(path, encode_png(image))
+
+
+def to_bytes(image: Tensor) -> NDArray[np.uint8]:
+    """Round values in [0, 1] (clamped) to uint8, same shape."""
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def premultiply(straight: Tensor) -> Tensor:
+    """Straight to premultiplied alpha, [..., 4] (Porter and Duff 1984)."""
+    return torch.cat([straight[..., :3] * straight[..., 3:], straight[..., 3:]], -1)
+
+
+def unpremultiply(premultiplied: Tensor) -> Tensor:
+    """Premultiplied to straight alpha, [..., 4]; black where nothing is."""
+    alpha = premultiplied[..., 3:]
+    colour = torch.where(alpha > 0, premultiplied[..., :3] / alpha.clamp_min(1e-12), 0.0)
+    return torch.cat([colour.clamp(0, 1), alpha], -1)
+
+
+def over_colour(premultiplied: Tensor, colour: float | Tensor = 1.0) -> Tensor:
+    """Composite premultiplied RGBA over an opaque background, [..., 4] -> [..., 3]."""
+    check_shape("image", (premultiplied.shape[-1],), (4,))
+    return premultiplied[..., :3] + (1 - premultiplied[..., 3:]) * colour
