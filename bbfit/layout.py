@@ -1,0 +1,143 @@
+"""The NeRF-synthetic layout of a views folder: ``transforms_train.json`` and ``transforms_test.json`` beside the pictures.
+
+Files and their meaning follow Mildenhall et al. 2020 (``camera_angle_x``, ``frames[].file_path`` without its ending,
+``frames[].transform_matrix``) and nerfstudio's extension of it (``w``, ``h``, ``fl_x``, ``fl_y``, ``cx``, ``cy``, for the file or for a
+frame).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bbfit.checks import MissingFileError, fail
+from bbfit.files import read_json, write_json
+from bbfit.geometry.camera import Camera, camera_from_nerf, camera_to_nerf, pinhole_intrinsics
+
+TRAIN_FILE, TEST_FILE, SINGLE_FILE = "transforms_train.json", "transforms_test.json", "transforms.json"
+TEST_SHARE = 0.25
+
+
+def split_views(count: int, seed: int) -> tuple[list[int], list[int]]:
+    """A seeded random quarter of ``count`` views as test views (thesis, section 5): sorted training and test indices.
+
+    At least one view stays on either side when there are two or more.
+    """
+    test_count = min(max(round(count * TEST_SHARE), 1), count - 1)
+    test = sorted(np.random.default_rng(seed).permutation(count)[:test_count].tolist())
+    return sorted(set(range(count)) - set(test)), test
+
+
+def write_transforms(folder: Path, camera: Camera, image_paths: list[str], train: list[int], test: list[int]) -> None:
+    """Write both transforms files for a batch of cameras.
+
+    ``image_paths`` are relative to ``folder`` and end in ``.png``. Orthographic cameras, which the layout does not know, are marked
+    with ``camera_model = "ORTHOGRAPHIC"`` and ``orthographic_extent_x`` in metres, as well as intrinsics in pixels per metre.
+    """
+    matrices = camera_to_nerf(camera.world_to_camera.double())
+    k = camera.intrinsics[0].double()
+    header: dict[str, Any] = {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": k[0, 0].item(),
+        "fl_y": k[1, 1].item(),
+        "cx": k[0, 2].item() + 0.5,  # the layout counts from the pixel's corner
+        "cy": k[1, 2].item() + 0.5,
+    }
+    if camera.orthographic:
+        header |= {"camera_model": "ORTHOGRAPHIC", "orthographic_extent_x": camera.width / header["fl_x"]}
+    else:
+        header |= {"camera_model": "OPENCV", "camera_angle_x": 2 * math.atan(0.5 * camera.width / header["fl_x"])}
+    for name, indices in ((TRAIN_FILE, train), (TEST_FILE, test)):
+        frames = [
+            {"file_path": "./" + image_paths[i].removesuffix(".png"), "transform_matrix": matrices[i].tolist()} for i in indices
+        ]
+        write_json(folder / name, header | {"frames": frames})
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One entry of a transforms file."""
+
+    image: Path
+    """The picture's file."""
+    camera_to_world: list[list[float]]
+    """Z-up world, OpenGL camera axes, 4 x 4."""
+    header: dict[str, Any]
+    """The file's entries with the frame's own ones over them."""
+
+
+def read_frames(folder: Path) -> tuple[list[Frame], list[Frame] | None]:
+    """Training and test frames of a views folder; ``None`` for the test frames where the folder names none.
+
+    ``transforms.json`` alone (nerfstudio) and a training file alone are read as one list.
+    """
+    for name in (TRAIN_FILE, SINGLE_FILE):
+        if (folder / name).is_file():
+            train = _read_file(folder / name)
+            test = _read_file(folder / TEST_FILE) if (folder / TEST_FILE).is_file() else None
+            return train, test
+    raise MissingFileError(f"views: {folder} has no {TRAIN_FILE} or {SINGLE_FILE}; give a folder that bbfit views wrote")
+
+
+def _read_file(path: Path) -> list[Frame]:
+    content = read_json("views", path)
+    if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
+        fail("views", f"{path} has no list of frames", "expected the NeRF-synthetic layout")
+    header = {key: value for key, value in content.items() if key != "frames"}
+    frames = []
+    for index, entry in enumerate(content["frames"]):
+        if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+            fail("views", f"frame {index} of {path} has no file_path", "expected the NeRF-synthetic layout")
+        matrix = _matrix(entry.get("transform_matrix"))
+        if matrix is None:
+            fail("views", f"frame {index} of {path} has no finite 4x4 transform_matrix", "expected the NeRF-synthetic layout")
+        image = path.parent / entry["file_path"]
+        if image.suffix.lower() not in (".png", ".webp", ".tif", ".tiff", ".exr"):
+            image = image.with_name(image.name + ".png")
+        frames.append(Frame(image, matrix, header | {k: v for k, v in entry.items() if k != "transform_matrix"}))
+    return frames
+
+
+def _matrix(value: Any) -> list[list[float]] | None:
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return array.tolist() if array.shape == (4, 4) and np.isfinite(array).all() else None
+
+
+def cameras_of(frames: list[Frame], width: int, height: int) -> Camera:
+    """The frames' cameras for pictures of ``width`` x ``height`` pixels, float64.
+
+    Intrinsics given for another picture size (``w``, ``h``) are scaled, so pictures may have been reduced since.
+    """
+    matrices = torch.tensor([frame.camera_to_world for frame in frames], dtype=torch.float64)
+    intrinsics = torch.stack([_intrinsics(frame, width, height) for frame in frames])
+    parallel = frames[0].header.get("camera_model") == "ORTHOGRAPHIC"
+    return Camera(camera_from_nerf(matrices), intrinsics, width, height, parallel)
+
+
+def _intrinsics(frame: Frame, width: int, height: int) -> torch.Tensor:
+    header = frame.header
+    try:
+        if "fl_x" in header:
+            scale_x, scale_y = width / float(header.get("w", width)), height / float(header.get("h", height))
+            focal_x = float(header["fl_x"])
+            focal_y = float(header.get("fl_y", focal_x))
+            centre_x = float(header.get("cx", float(header.get("w", width)) / 2))
+            centre_y = float(header.get("cy", float(header.get("h", height)) / 2))
+            return torch.tensor(
+                [[focal_x * scale_x, 0, centre_x * scale_x - 0.5], [0, focal_y * scale_y, centre_y * scale_y - 0.5], [0, 0, 1]],
+                dtype=torch.float64,
+            )
+        if "camera_angle_x" in header:
+            return pinhole_intrinsics(math.degrees(float(header["camera_angle_x"])), width, height)
+    except (TypeError, ValueError, ZeroDivisionError):
+        pass
+    fail("views", f"{frame.image.parent.parent}: the camera has neither a usable fl_x nor camera_angle_x", "add one of them")
