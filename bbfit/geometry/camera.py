@@ -76,9 +76,7 @@ class Camera:
 
     def to(self, target: torch.device | torch.dtype | str) -> Camera:
         """Move to a device or convert to a dtype."""
-        return Camera(
-            self.world_to_camera.to(target), self.intrinsics.to(target), self.width, self.height, self.orthographic
-        )
+        return Camera(self.world_to_camera.to(target), self.intrinsics.to(target), self.width, self.height, self.orthographic)
 
     @property
     def camera_to_world(self) -> Tensor:

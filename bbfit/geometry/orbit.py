@@ -48,9 +48,7 @@ class Orbit:
     def directions(self) -> Tensor:
         """Unit vectors from the target towards each camera, [V, 3] float64."""
         azimuth, elevation = torch.from_numpy(np.radians(self.angles_degrees)).unbind(-1)
-        return torch.stack(
-            [elevation.cos() * azimuth.sin(), elevation.sin(), elevation.cos() * azimuth.cos()], -1
-        )
+        return torch.stack([elevation.cos() * azimuth.sin(), elevation.sin(), elevation.cos() * azimuth.cos()], -1)
 
     def frame(
         self,
