@@ -1,0 +1,1 @@
+"""Fitting a billboard cloud to views."""

@@ -1,0 +1,79 @@
+"""Bounding billboards by what the views show, with OpenCV's bounding rectangles."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.views import ViewSet
+
+# Views that meet a billboard more obliquely than this say nothing useful about its extent.
+_OBLIQUE = math.cos(math.radians(60))
+
+
+def facing(camera: Camera, normals: Tensor, target: Tensor) -> Tensor:
+    """Cosines between billboard normals and the directions towards each camera, [V, N]; 1 is face on."""
+    towards = -camera.forward if camera.orthographic else torch.nn.functional.normalize(camera.position - target, dim=-1)
+    return towards @ normals.mT
+
+
+def facing_view_bounds(planes: BillboardCloud, views: ViewSet, *, pairs: bool) -> Tensor:
+    """Bounds of every billboard in the one view that faces it best (thesis, section 6.3).
+
+    Parameters
+    ----------
+    planes : billboards through a common centre, of any extent.
+    pairs : whether odd entries are the backs of pairs, which face the other way.
+
+    Returns
+    -------
+    [N, 4] left, right, bottom, top in metres along the billboard's axes from its centre.
+    """
+    cosines = facing(views.cameras, planes.normals, planes.centers[0])
+    if pairs:
+        cosines = cosines * torch.tensor([1.0, -1.0]).repeat(len(planes) // 2)
+    best = cosines.argmax(0).tolist()
+    return torch.stack([_silhouette_on_plane(planes, n, views, view) for n, view in enumerate(best)])
+
+
+def silhouette_bounds(planes: BillboardCloud, views: ViewSet) -> Tensor:
+    """Bounds such that in every view the billboard that faces it best covers the whole silhouette.
+
+    Nothing of the tree is then cut off in any training view. Views more than 60 degrees off every billboard's normal (from above, say)
+    are covered only as far as the others reach. Same return as :func:`facing_view_bounds`.
+    """
+    cosines = facing(views.cameras, planes.normals, planes.centers[0]).abs()
+    bounds = torch.tensor([math.inf, -math.inf, math.inf, -math.inf], dtype=planes.centers.dtype).repeat(len(planes), 1)
+    for view, row in enumerate(cosines):
+        # Both rectangles of a pair face a view equally well, up to rounding.
+        for n in torch.nonzero((row > row.max() - 1e-6) & (row > _OBLIQUE))[:, 0].tolist():
+            bounds[n] = _union(bounds[n], _silhouette_on_plane(planes, n, views, view))
+    seen = bounds[:, 0].isfinite()
+    if not seen.any():  # only oblique views: fall back to the best there is
+        return facing_view_bounds(planes, views, pairs=False)
+    widest = torch.stack([bounds[seen, 0].amin(), bounds[seen, 1].amax(), bounds[seen, 2].amin(), bounds[seen, 3].amax()])
+    return torch.where(seen[:, None], bounds, widest)
+
+
+def _union(a: Tensor, b: Tensor) -> Tensor:
+    return torch.where(torch.tensor([True, False, True, False]), torch.minimum(a, b), torch.maximum(a, b))
+
+
+def _silhouette_on_plane(planes: BillboardCloud, n: int, views: ViewSet, view: int) -> Tensor:
+    """The bounding rectangle of a view's alpha > 0, projected through the camera onto plane ``n``: [4] as above."""
+    mask = (views.image(view)[..., 3] > 0).numpy().astype(np.uint8)
+    x, y, width, height = cv2.boundingRect(mask)
+    left, top, right, bottom = x - 0.5, y - 0.5, x + width - 0.5, y + height - 0.5
+    corners = torch.tensor([[left, top, 1], [right, top, 1], [right, bottom, 1], [left, bottom, 1]], dtype=torch.float64)
+    point = torch.stack([planes.rights[n], planes.ups[n], planes.centers[n]], -1)
+    plane_to_world = torch.cat([point, torch.tensor([[0.0, 0.0, 1.0]], dtype=point.dtype)])
+    on_plane = corners @ torch.linalg.inv(views.cameras[view].world_to_pixel @ plane_to_world).mT
+    coordinates = on_plane[:, :2] / on_plane[:, 2:]
+    (left, bottom), (right, top) = coordinates.amin(0), coordinates.amax(0)
+    return torch.stack([left, right, bottom, top])

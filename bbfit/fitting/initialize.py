@@ -1,0 +1,71 @@
+"""The cloud that a fit starts from: where the billboards stand, how large they are, how many texels they own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from bbfit.fitting.bounds import facing_view_bounds, silhouette_bounds
+from bbfit.fitting.config import FitConfig
+from bbfit.geometry.camera import convergence_point
+from bbfit.geometry.cloud import BillboardCloud, even_upright
+from bbfit.views import ViewSet
+
+# Distance between the rectangles of a pair, as a share of their half width: "a very small distance" (thesis, section 6.4).
+PAIR_GAP = 2e-3
+
+
+def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
+    """Evenly turned upright billboards through the tree's axis with seeded random textures, float32 on the CPU.
+
+    The axis is the vertical line through the point that the cameras converge on. Unbounded billboards fill the viewport of a camera
+    that faces them (thesis, sections 4.2 and 6.3).
+    """
+    camera, config = views.cameras, config.resolve()
+    axis = convergence_point(camera)
+    focal = camera.intrinsics[:, 0, 0].mean()
+    if not camera.orthographic:
+        focal = focal / (camera.position - axis).norm(dim=-1).mean()
+    density = config.texel_density * focal  # texels a metre
+    size = torch.tensor([camera.height, camera.width])
+    sides = config.sides
+    planes = even_upright(
+        config.billboards,
+        axis=axis,
+        half_extents=size.flip(0) / focal / 2,
+        texture_sizes=_at_least_one(size * config.texel_density),
+        sides=sides,
+        gap=PAIR_GAP * float(camera.width / focal / 2),
+    )
+    if config.bounds != "none":
+        if config.bounds == "thesis":
+            bounds = facing_view_bounds(planes, views, pairs=sides == "pair")
+        else:
+            bounds = silhouette_bounds(planes, views)
+        planes = bounded(planes, bounds, density)
+    generator = torch.Generator().manual_seed(config.seed)
+    return planes.to(torch.float32).with_texels(torch.rand(len(planes.texels), 4, generator=generator))
+
+
+def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_metre: Tensor) -> BillboardCloud:
+    """Cut billboards down to ``bounds`` ([N, 4] left, right, bottom, top in metres from their centres), textures transparent.
+
+    Each keeps the texels that it covers: square ones, ``texels_a_metre`` to the metre, the rectangle rounded up to whole texels.
+    """
+    left, right, bottom, top = bounds.unbind(-1)
+    size = _at_least_one(torch.stack([top - bottom, right - left], -1) * texels_a_metre)
+    middle = torch.stack([left + right, bottom + top], -1) / 2
+    texels = int((size.prod(-1) * (1 + planes.two_sided.long())).sum())
+    return replace(
+        planes,
+        centers=planes.centers + middle[:, :1] * planes.rights + middle[:, 1:] * planes.ups,
+        half_extents=size.flip(-1) / texels_a_metre / 2,
+        texture_sizes=size,
+        texels=torch.zeros(texels, 4, dtype=planes.texels.dtype),
+    )
+
+
+def _at_least_one(size: Tensor) -> Tensor:
+    return size.ceil().long().clamp_min(1)
