@@ -17,8 +17,8 @@ _PRESETS: dict[str, dict[str, Any]] = {
     "default": {
         "bounds": "silhouette",
         "ssim_weight": 0.005,
-        "steps": 400,
-        "views_per_step": 4,
+        "steps": 300,
+        "views_per_step": 2,
         "learning_rate": 0.05,
         "schedule": "cosine",
     },
@@ -54,9 +54,9 @@ class FitConfig:
     ssim_weight: float | None = None
     """Weight of 1 - SSIM beside the loss. Preset: 0.005; thesis: 0."""
     steps: int | None = None
-    """Optimiser steps. Preset: 400; thesis: 10000."""
+    """Optimiser steps. Preset: 300; thesis: 10000."""
     views_per_step: int | None = None
-    """Training views in every step. Preset: 4; thesis: 1."""
+    """Training views in every step. Preset: 2; thesis: 1."""
     learning_rate: float | None = None
     """Adam's initial rate. Preset: 0.05; thesis: 0.01."""
     schedule: Schedule | None = None

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from kornia.metrics import ssim
+import torch
 from torch import Tensor
+from torch.nn.functional import conv2d
 
 from bbfit.fitting.config import Loss
+
+_SIGMA, _RADIUS = 1.5, 5
 
 
 def image_loss(render: Tensor, target: Tensor, kind: Loss, ssim_weight: float) -> Tensor:
     """The thesis's L1 or L2 loss (section 4.4), plus ``ssim_weight`` times (1 - SSIM).
 
-    Both differences are summed over the four channels and averaged over pixels, as the thesis's ``1/p * sum`` does. SSIM is that of
-    Wang et al. 2004 with the usual Gaussian window (11 pixels, sigma 1.5), averaged over the four channels.
+    Both differences are summed over the four channels and averaged over pixels, as the thesis's ``1/p * sum`` does.
 
     Parameters
     ----------
@@ -25,6 +27,32 @@ def image_loss(render: Tensor, target: Tensor, kind: Loss, ssim_weight: float) -
     difference = render - target
     loss = (difference.abs() if kind == "l1" else difference.square()).sum(-1).mean()
     if ssim_weight:
-        similarity = ssim(render.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2), window_size=11)
-        loss = loss + ssim_weight * (1 - similarity.mean())
+        loss = loss + ssim_weight * (1 - structural_similarity(render, target))
     return loss
+
+
+def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
+    """Mean SSIM (Wang et al. 2004, equation 13; Gaussian window of 11 pixels, sigma 1.5; data range 1) over whole windows.
+
+    Equals :func:`kornia.metrics.ssim` there, at half its cost, since the Gaussian is applied one axis at a time.
+
+    Parameters
+    ----------
+    a, b : [V, H, W, C] in [0, 1], at least 11 pixels high and wide.
+    """
+    a, b = a.permute(0, 3, 1, 2), b.permute(0, 3, 1, 2)
+    c1, c2 = 0.01**2, 0.03**2
+    mean_a, mean_b = _blur(a), _blur(b)
+    variances = _blur(a * a) + _blur(b * b) - mean_a.square() - mean_b.square()
+    covariance = _blur(a * b) - mean_a * mean_b
+    luminance = (2 * mean_a * mean_b + c1) / (mean_a.square() + mean_b.square() + c1)
+    return (luminance * (2 * covariance + c2) / (variances + c2)).mean()
+
+
+def _blur(planes: Tensor) -> Tensor:
+    """The Gaussian window's weighted mean around every pixel that has a whole window, [V, C, H - 10, W - 10]."""
+    channels, taps = planes.shape[1], 2 * _RADIUS + 1
+    offset = torch.arange(-_RADIUS, _RADIUS + 1, dtype=planes.dtype, device=planes.device)
+    window = torch.softmax(-offset.square() / (2 * _SIGMA**2), 0)
+    planes = conv2d(planes, window.view(1, 1, 1, taps).expand(channels, 1, 1, taps), groups=channels)
+    return conv2d(planes, window.view(1, 1, taps, 1).expand(channels, 1, taps, 1), groups=channels)
