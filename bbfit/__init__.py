@@ -1,0 +1,76 @@
+"""bbfit: a 3D tree as a handful of textured planes that look like it from every side."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from bbfit.blender.config import ViewsConfig
+    from bbfit.blender.render import render_views
+    from bbfit.checks import InputError
+    from bbfit.evaluation.report import Report
+    from bbfit.evaluation.scoring import evaluate
+    from bbfit.exporting.config import ExportConfig
+    from bbfit.exporting.model import export
+    from bbfit.fitting.config import FitConfig
+    from bbfit.fitting.loop import FitResult, fit
+    from bbfit.geometry.camera import Camera
+    from bbfit.geometry.cloud import BillboardCloud
+    from bbfit.geometry.orbit import Orbit
+    from bbfit.pipeline import RunConfig, run
+    from bbfit.rendering.dispatch import render
+    from bbfit.views import ViewDataset
+
+# Names are imported when they are first used, so that `bbfit --help` need not wait for torch.
+_HOMES = {
+    "BillboardCloud": "bbfit.geometry.cloud",
+    "Camera": "bbfit.geometry.camera",
+    "ExportConfig": "bbfit.exporting.config",
+    "FitConfig": "bbfit.fitting.config",
+    "FitResult": "bbfit.fitting.loop",
+    "InputError": "bbfit.checks",
+    "Orbit": "bbfit.geometry.orbit",
+    "Report": "bbfit.evaluation.report",
+    "RunConfig": "bbfit.pipeline",
+    "ViewDataset": "bbfit.views",
+    "ViewsConfig": "bbfit.blender.config",
+    "evaluate": "bbfit.evaluation.scoring",
+    "export": "bbfit.exporting.model",
+    "fit": "bbfit.fitting.loop",
+    "render": "bbfit.rendering.dispatch",
+    "render_views": "bbfit.blender.render",
+    "run": "bbfit.pipeline",
+}
+
+__version__ = version("bbfit")
+__all__ = [
+    "BillboardCloud",
+    "Camera",
+    "ExportConfig",
+    "FitConfig",
+    "FitResult",
+    "InputError",
+    "Orbit",
+    "Report",
+    "RunConfig",
+    "ViewDataset",
+    "ViewsConfig",
+    "evaluate",
+    "export",
+    "fit",
+    "render",
+    "render_views",
+    "run",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'bbfit' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

@@ -138,11 +138,12 @@ class ViewDataset:
             fail("views", f"{folder} has {len(train)} training and {len(test or [])} test views", "at least one of each is needed")
         width, height = _common_size([*train, *test])
         cache = _Cache(cache_bytes)
-        sets = (
-            ViewSet(tuple(frame.image for frame in frames), cameras_of(frames, width, height), cache) for frames in (train, test)
-        )
+
+        def view_set(frames: list[Frame]) -> ViewSet:
+            return ViewSet(tuple(frame.image for frame in frames), cameras_of(frames, width, height), cache)
+
         request = read_json("views", folder / REQUEST_FILE) if (folder / REQUEST_FILE).is_file() else {}
-        return ViewDataset(folder, *sets, request if isinstance(request, dict) else {})
+        return ViewDataset(folder, view_set(train), view_set(test), request if isinstance(request, dict) else {})
 
     @property
     def fingerprint(self) -> str:

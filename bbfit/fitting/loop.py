@@ -186,7 +186,12 @@ def _load(path: Path, mark: str, device: torch.device) -> _State | None:
             metadata = file.metadata() or {}
             if metadata.get("fit") != mark:
                 return None
-            parts = [file.get_tensor(name).to(device) for name in ("texels", "first_moment", "second_moment")]
-            return _State(*parts, file.get_tensor("losses").tolist(), float(metadata["seconds"]))
+            return _State(
+                file.get_tensor("texels").to(device),
+                file.get_tensor("first_moment").to(device),
+                file.get_tensor("second_moment").to(device),
+                file.get_tensor("losses").tolist(),
+                float(metadata["seconds"]),
+            )
     except SafetensorError:
         return None

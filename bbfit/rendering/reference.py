@@ -49,11 +49,11 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
     # The margin shifts texel coordinates by one.
     shift = torch.tensor([[1.0, 0, -1], [0, 1, -1], [0, 0, 1]], dtype=matrices.dtype, device=matrices.device)
     if len({source.shape for source in sources}) == 1:  # one call for all planes: kornia works on batch entries in parallel
-        warped = warp_perspective(
+        stacked = warp_perspective(
             torch.cat(sources), (matrices @ shift).transpose(0, 1).flatten(0, 1), (height, width),
             mode="bilinear", padding_mode="zeros", align_corners=True,
         )  # fmt: skip
-        warped = list(warped.split(views))
+        warped = list(stacked.split(views))
     else:
         warped = [
             warp_perspective(

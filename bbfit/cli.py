@@ -1,0 +1,211 @@
+"""The command line: parse, call, print, exit code; nothing else.
+
+Exit codes: 0 done, 2 bad input, 1 a failure of ours, 130 stopped from the keyboard.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from bbfit.blender.config import ViewsConfig
+from bbfit.checks import InputError
+from bbfit.exporting.config import ExportConfig
+from bbfit.fitting.config import FitConfig
+
+if TYPE_CHECKING:
+    from bbfit.pipeline import Progress, RunResult
+
+_out, _err = Console(), Console(stderr=True)
+
+
+def _run(
+    tree: Annotated[Path | None, tyro.conf.Positional] = None,
+    /,
+    out: Path = Path("runs/tree"),
+    views: ViewsConfig = ViewsConfig(),  # noqa: B008
+    fit: FitConfig = FitConfig(),  # noqa: B008
+    export: ExportConfig = ExportConfig(),  # noqa: B008
+) -> None:
+    """Do everything: render a tree, fit billboards to the views, write the models, score them on held-out views.
+
+    Killed and started again, it goes on where it stopped. What stands and has unchanged inputs is not done again.
+
+    Args:
+        tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usdc .usdz .blend) or a folder of views; left out, a small tree that comes
+            with bbfit.
+        out: Folder for the results.
+        views: How the tree is rendered.
+        fit: How the billboards are fitted.
+        export: How the models are written.
+    """
+    from bbfit.pipeline import RunConfig, run
+
+    with _progress() as tell:
+        result = run(tree, out, RunConfig(views, fit, export), on_progress=tell)
+    _show(result)
+
+
+def _views(
+    tree: Annotated[Path, tyro.conf.Positional],
+    /,
+    out: Path,
+    config: Annotated[ViewsConfig, tyro.conf.arg(name="")] = ViewsConfig(),  # noqa: B008
+) -> None:
+    """Render views of a tree with Blender, in the NeRF-synthetic layout.
+
+    Args:
+        tree: The tree's file (.glb .gltf .obj .ply .stl .fbx .usd .usdc .usdz .blend).
+        out: Folder for the views; one that holds a part of them is completed.
+        config: How the tree is rendered.
+    """
+    from bbfit.blender.render import render_views
+
+    with _progress() as tell:
+        render_views(tree, out, config, on_progress=lambda done, total: tell("views", done, total))
+    _out.print(f"{config.count} views in {out}")
+
+
+def _fit(
+    views: Annotated[Path, tyro.conf.Positional],
+    /,
+    out: Path,
+    config: Annotated[FitConfig, tyro.conf.arg(name="")] = FitConfig(),  # noqa: B008
+    export: ExportConfig = ExportConfig(),  # noqa: B008
+) -> None:
+    """Fit billboards to a folder of views, write the models and the score on held-out views.
+
+    Args:
+        views: Folder of views, bbfit's own or any in the NeRF-synthetic layout.
+        out: Folder for the results.
+        config: How the billboards are fitted.
+        export: How the models are written.
+    """
+    from bbfit.checks import check_folder
+    from bbfit.pipeline import RunConfig, run
+
+    check_folder("views", views)
+    with _progress() as tell:
+        result = run(views, out, RunConfig(fit=config, export=export), on_progress=tell)
+    _show(result)
+
+
+def _evaluate(
+    cloud: Annotated[Path, tyro.conf.Positional],
+    views: Annotated[Path, tyro.conf.Positional],
+    /,
+    out: Path | None = None,
+) -> None:
+    """Score a billboard cloud on the held-out views of a folder.
+
+    Args:
+        cloud: A .safetensors file written by bbfit fit.
+        views: Folder of views.
+        out: File for the measures as JSON; left out, they are only shown.
+    """
+    from bbfit.evaluation.scoring import evaluate
+    from bbfit.geometry.cloud import BillboardCloud
+    from bbfit.pipeline import original_tree
+    from bbfit.reporting.tables import report_table
+    from bbfit.views import ViewDataset
+
+    billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
+    with _progress() as tell:
+        report = evaluate(
+            billboards,
+            dataset.test,
+            original=original_tree(dataset),
+            on_view=lambda done, total: tell("evaluate", done, total),
+        )
+    if out is not None:
+        report.save(out)
+    _out.print(report_table(report))
+
+
+def _export(
+    cloud: Annotated[Path, tyro.conf.Positional],
+    /,
+    out: Path,
+    config: Annotated[ExportConfig, tyro.conf.arg(name="")] = ExportConfig(),  # noqa: B008
+) -> None:
+    """Write a billboard cloud as a model that other programs open.
+
+    Args:
+        cloud: A .safetensors file written by bbfit fit.
+        out: The model's file, ending in .glb, or in .obj (its .mtl and .png come beside it).
+        config: How the model is written.
+    """
+    from bbfit.exporting.model import export
+    from bbfit.geometry.cloud import BillboardCloud
+
+    for path in export(BillboardCloud.load(cloud), out, config):
+        _out.print(f"{path}  {path.stat().st_size:,} bytes")
+
+
+_COMMANDS: dict[str, Callable[..., Any]] = {"run": _run, "views": _views, "fit": _fit, "evaluate": _evaluate, "export": _export}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            _COMMANDS,
+            prog="bbfit",
+            description="Compress a 3D tree into a handful of textured planes that look like it from every side.",
+            args=args,
+        )
+    except BrokenPipeError:  # the reader of our output, such as head, has seen enough
+        sys.stdout = None
+        return 0
+    except (InputError, OSError) as error:
+        _err.print(f"bbfit: {error}", style="red", highlight=False, soft_wrap=True, markup=False)
+        return 2
+    except KeyboardInterrupt:
+        _err.print("bbfit: stopped; the same command goes on from here")
+        return 130
+    return 0
+
+
+def _show(result: RunResult) -> None:
+    from bbfit.reporting.tables import report_table
+
+    _out.print(report_table(result.report))
+    if result.skipped:
+        _out.print(f"unchanged, not done again: {', '.join(result.skipped)}", style="dim")
+    _out.print(f"results in {result.folder}: model.glb, model.obj, cloud.safetensors, metrics.json, comparison.png, loss.png")
+
+
+@contextmanager
+def _progress() -> Iterator[Progress]:
+    """One bar a stage, with rate and time left, on standard error."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    with Progress(
+        TextColumn("{task.description:9}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]:>10}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+        console=_err,
+    ) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def tell(stage: str, done: int, total: int, note: str = "") -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total, rate="", note="", completed=done - 1)
+            speed = bars.tasks[list(tasks).index(stage)].speed
+            bars.update(tasks[stage], completed=done, note=note, rate="" if speed is None else f"{speed:.1f}/s")
+
+        yield tell
+
+
+if __name__ == "__main__":
+    sys.exit(main())

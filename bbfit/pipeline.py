@@ -1,0 +1,241 @@
+"""The main job: tree -> views -> fit -> export -> evaluate, every stage done once and only again when its inputs change."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import platform
+import time
+from dataclasses import asdict, dataclass, field
+from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any, Protocol
+
+from bbfit.blender.config import ViewsConfig
+from bbfit.checks import InputError, check_file
+from bbfit.evaluation.report import Report
+from bbfit.evaluation.scoring import OriginalTree, evaluate
+from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.model import export
+from bbfit.files import output_folder, read_json, write_bytes, write_json
+from bbfit.fitting.config import FitConfig
+from bbfit.fitting.loop import Step, fit
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.reporting.plots import comparison_picture, loss_plot
+from bbfit.views import ViewDataset
+
+RECORD_FILE = "run.json"
+# Raise a stage's number when its results change for the same inputs, so that old results are made anew.
+_STAGE_VERSIONS = {"fit": 1, "export": 1, "evaluate": 1}
+_PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headless", "bpy", "trimesh", "xatlas", "scikit-image")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Options of every stage."""
+
+    views: ViewsConfig = field(default_factory=ViewsConfig)
+    """Rendering the tree."""
+    fit: FitConfig = field(default_factory=FitConfig)
+    """Fitting the billboards."""
+    export: ExportConfig = field(default_factory=ExportConfig)
+    """Writing the model."""
+
+
+class Progress(Protocol):
+    """What long work tells while it runs."""
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        """``done`` of ``total`` units of ``stage`` are finished; ``note`` is a short text such as the loss."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run made."""
+
+    folder: Path
+    """Where everything lies."""
+    cloud: BillboardCloud
+    """The fitted billboards."""
+    report: Report
+    """Their score on the held-out views."""
+    skipped: tuple[str, ...]
+    """Stages whose results stood."""
+
+
+def run(
+    source: str | Path | None,
+    out: str | Path,
+    config: RunConfig | None = None,
+    *,
+    on_progress: Progress | None = None,
+) -> RunResult:
+    """Turn a tree, or views of one, into a measured billboard cloud with its model files.
+
+    Writes ``views/`` (from a tree), ``cloud.safetensors``, ``model.glb``, ``model.obj/.mtl/.png``, ``metrics.json``,
+    ``comparison.png``, ``loss.png``, ``loss.csv`` and ``run.json`` (resolved configuration, versions, seeds, seconds). A stage whose
+    results stand unchanged and whose inputs are the same is skipped; a killed run goes on where it stopped.
+
+    Parameters
+    ----------
+    source : a tree's file, a folder of views, or ``None`` for the small tree that comes with bbfit.
+    out : the run's folder, made if need be.
+    on_progress : told how far each stage is.
+
+    Raises
+    ------
+    InputError, OSError
+        if an input cannot be used or the folder cannot be written to; earlier results stay as they were.
+    """
+    config = config or RunConfig()
+    tell = on_progress or (lambda stage, done, total, note="": None)
+    if source is None:
+        with as_file(files("bbfit.data") / "tree.glb") as tree:
+            return run(tree, out, config, on_progress=on_progress)
+    source = Path(source)
+    if not source.is_dir():
+        check_file("tree", source)
+    record = _Record(output_folder("out", out), source, config)
+    if source.is_dir():
+        views = ViewDataset.load(source, seed=config.fit.seed)
+    else:
+        views = _render(source, record, config.views, tell)
+    cloud = _fit(views, record, config.fit, tell)
+    _export(cloud, record, config.export, tell)
+    report = _evaluate(cloud, views, record, tell)
+    return RunResult(record.folder, cloud, report, tuple(record.skipped))
+
+
+def original_tree(views: ViewDataset) -> OriginalTree:
+    """What is known of the tree that views were rendered from: its vertices and bytes, from the folder's ``views.json``."""
+    tree = views.request.get("tree")
+    counts = {name: tree.get(name) for name in ("vertices", "bytes")} if isinstance(tree, dict) else {}
+    return OriginalTree(**{name: value for name, value in counts.items() if isinstance(value, int)})
+
+
+class _Record:
+    """``run.json``: which stage was done with which inputs, what it wrote, how long it took."""
+
+    def __init__(self, folder: Path, source: Path, config: RunConfig) -> None:
+        self.folder, self.skipped = folder, list[str]()
+        path = folder / RECORD_FILE
+        try:
+            earlier = read_json("run", path) if path.is_file() else {}
+        except InputError:
+            earlier = {}  # a damaged record only costs the skipping
+        stages = earlier.get("stages") if isinstance(earlier, dict) else None
+        self.stages: dict[str, dict[str, Any]] = stages if isinstance(stages, dict) else {}
+        resolved = {"views": asdict(config.views), "fit": asdict(config.fit.resolve()), "export": asdict(config.export)}
+        self._head = {
+            "source": str(source.resolve()),
+            "config": json.loads(json.dumps(resolved, default=str)),
+            "seeds": {"views": config.views.seed, "fit": config.fit.seed},
+            "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
+            "machine": platform.platform(),
+        }
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds of the stages done so far."""
+        return {name: stage["seconds"] for name, stage in self.stages.items()}
+
+    def stands(self, stage: str, inputs: str) -> bool:
+        """Whether a stage was done with these inputs and nobody touched what it wrote."""
+        done = self.stages.get(stage)
+        if not isinstance(done, dict) or done.get("inputs") != inputs or not isinstance(done.get("outputs"), dict):
+            return False
+        if any(_hash_file(self.folder / name) != digest for name, digest in done["outputs"].items()):
+            return False
+        self.skipped.append(stage)
+        return True
+
+    def done(self, stage: str, inputs: str, outputs: list[str], seconds: float) -> None:
+        """Note a finished stage."""
+        hashes = {name: _hash_file(self.folder / name) for name in outputs}
+        self.stages[stage] = {"inputs": inputs, "outputs": hashes, "seconds": round(seconds, 3)}
+        write_json(self.folder / RECORD_FILE, self._head | {"stages": self.stages})
+
+
+def _render(tree: Path, record: _Record, config: ViewsConfig, tell: Progress) -> ViewDataset:
+    from bbfit.blender.render import render_views
+
+    folder = render_views(tree, record.folder / "views", config, on_progress=lambda done, total: tell("views", done, total))
+    views = ViewDataset.load(folder)
+    seconds = views.request.get("seconds")
+    record.done("views", views.fingerprint, [], float(seconds) if isinstance(seconds, int | float) else 0.0)
+    return views
+
+
+def _fit(views: ViewDataset, record: _Record, config: FitConfig, tell: Progress) -> BillboardCloud:
+    config, path = config.resolve(), record.folder / "cloud.safetensors"
+    inputs = _hash("fit", {**asdict(config), "checkpoint_every": None}, views.fingerprint)
+    if record.stands("fit", inputs):
+        return BillboardCloud.load(path)
+
+    def on_step(step: Step) -> None:
+        tell("fit", step.index, step.total, f"loss {step.loss:.5f}")
+
+    result = fit(views, config, checkpoint=record.folder / "fit.checkpoint", on_step=on_step)
+    result.cloud.save(path)
+    write_bytes(record.folder / "loss.csv", _loss_table(result.losses))
+    loss_plot(result.losses, record.folder / "loss.png")
+    record.done("fit", inputs, [path.name, "loss.csv", "loss.png"], result.seconds)
+    return result.cloud
+
+
+def _export(cloud: BillboardCloud, record: _Record, config: ExportConfig, tell: Progress) -> None:
+    inputs = _hash("export", asdict(config), _hash_file(record.folder / "cloud.safetensors"))
+    if record.stands("export", inputs):
+        return
+    begun, written = time.perf_counter(), list[Path]()
+    for step, suffix in enumerate((".glb", ".obj"), 1):
+        written += export(cloud, record.folder / f"model{suffix}", config)
+        tell("export", step, 2)
+    record.done("export", inputs, [path.name for path in written], time.perf_counter() - begun)
+
+
+def _evaluate(cloud: BillboardCloud, views: ViewDataset, record: _Record, tell: Progress) -> Report:
+    path = record.folder / "metrics.json"
+    results = [_hash_file(record.folder / name) for name in ("cloud.safetensors", "model.glb")]
+    inputs = _hash("evaluate", results, views.fingerprint)
+    if record.stands("evaluate", inputs):
+        return Report.load(path)
+    begun = time.perf_counter()
+    report = evaluate(
+        cloud,
+        views.test,
+        original=original_tree(views),
+        model_bytes=(record.folder / "model.glb").stat().st_size,
+        seconds={name: seconds for name, seconds in record.seconds.items() if name != "evaluate"},
+        on_view=lambda done, total: tell("evaluate", done, total),
+    )
+    report.save(path)
+    comparison_picture(cloud, views.test, record.folder / "comparison.png")
+    record.done("evaluate", inputs, [path.name, "comparison.png"], time.perf_counter() - begun)
+    return report
+
+
+def _loss_table(losses: list[float]) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["step", "loss"])
+    writer.writerows(enumerate(losses, 1))
+    return text.getvalue().encode()
+
+
+def _hash(stage: str, *inputs: Any) -> str:
+    return sha256(json.dumps([stage, _STAGE_VERSIONS[stage], *inputs], sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _hash_file(path: Path) -> str | None:
+    return sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
