@@ -15,7 +15,7 @@ from bbfit.files import write_bytes
 
 
 def read_rgba(path: str | Path) -> NDArray[np.uint8]:
-    """Read a straight-alpha image.
+    """Read a straight-alpha PNG or WebP picture.
 
     Returns
     -------
@@ -24,15 +24,21 @@ def read_rgba(path: str | Path) -> NDArray[np.uint8]:
     Raises
     ------
     MissingFileError, InputError
-        if the file is missing, cut short, not an image, or has no alpha channel.
+        if the file is missing, cut short, damaged, of another format, or has no alpha channel.
     """
     path = Path(path)
     if not path.is_file():
         raise MissingFileError(f"image: {path} does not exist; check the spelling or render the views anew")
     data = path.read_bytes()
-    if path.suffix.lower() == ".png" and not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
-        fail("image", f"{path} is cut short or no PNG", "render or copy it anew")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    png, webp = data.startswith(b"\x89PNG\r\n\x1a\n"), data[:4] == b"RIFF" and data[8:12] == b"WEBP"
+    if not png and not webp:  # OpenCV would premultiply a TIFF, and hand out an EXR as linear light
+        fail("image", f"{path} is {'neither PNG nor WebP' if data else 'empty'}", "render or copy it anew")
+    if png and not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
+        fail("image", f"{path} is cut short", "render or copy it anew")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:  # a header that promises more pixels than OpenCV takes
+        image = None
     if image is None:
         fail("image", f"{path} cannot be decoded", "render or copy it anew")
     if image.ndim != 3 or image.shape[2] != 4:

@@ -21,6 +21,8 @@ from bbfit.geometry.camera import Camera, camera_from_nerf, camera_to_nerf, pinh
 
 TRAIN_FILE, TEST_FILE, SINGLE_FILE = "transforms_train.json", "transforms_test.json", "transforms.json"
 TEST_SHARE = 0.25
+# How far from orthonormal a camera's axes may be: files in the wild carry four decimals.
+RIGID_TOLERANCE = 1e-3
 
 
 def split_views(count: int, seed: int) -> tuple[list[int], list[int]]:
@@ -54,9 +56,7 @@ def write_transforms(folder: Path, camera: Camera, image_paths: list[str], train
     else:
         header |= {"camera_model": "OPENCV", "camera_angle_x": 2 * math.atan(0.5 * camera.width / header["fl_x"])}
     for name, indices in ((TRAIN_FILE, train), (TEST_FILE, test)):
-        frames = [
-            {"file_path": "./" + image_paths[i].removesuffix(".png"), "transform_matrix": matrices[i].tolist()} for i in indices
-        ]
+        frames = [{"file_path": "./" + image_paths[i].removesuffix(".png"), "transform_matrix": matrices[i].tolist()} for i in indices]
         write_json(folder / name, header | {"frames": frames})
 
 
@@ -96,9 +96,9 @@ def _read_file(path: Path) -> list[Frame]:
             fail("views", f"frame {index} of {path} has no file_path", "expected the NeRF-synthetic layout")
         matrix = _matrix(entry.get("transform_matrix"))
         if matrix is None:
-            fail("views", f"frame {index} of {path} has no finite 4x4 transform_matrix", "expected the NeRF-synthetic layout")
+            fail("views", f"frame {index} of {path} has no rigid 4x4 transform_matrix", "expected the NeRF-synthetic layout")
         image = path.parent / entry["file_path"]
-        if image.suffix.lower() not in (".png", ".webp", ".tif", ".tiff", ".exr"):
+        if image.suffix.lower() not in (".png", ".webp", ".jpg", ".jpeg", ".tif", ".tiff", ".exr"):
             image = image.with_name(image.name + ".png")
         frames.append(Frame(image, matrix, header | {k: v for k, v in entry.items() if k != "transform_matrix"}))
     return frames
@@ -109,7 +109,11 @@ def _matrix(value: Any) -> list[list[float]] | None:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         return None
-    return array.tolist() if array.shape == (4, 4) and np.isfinite(array).all() else None
+    if array.shape != (4, 4) or not np.isfinite(array).all():
+        return None
+    rotation = array[:3, :3]
+    rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=RIGID_TOLERANCE) and np.linalg.det(rotation) > 0
+    return array.tolist() if rigid and np.allclose(array[3], (0, 0, 0, 1)) else None
 
 
 def cameras_of(frames: list[Frame], width: int, height: int) -> Camera:
@@ -132,12 +136,14 @@ def _intrinsics(frame: Frame, width: int, height: int) -> torch.Tensor:
             focal_y = float(header.get("fl_y", focal_x))
             centre_x = float(header.get("cx", float(header.get("w", width)) / 2))
             centre_y = float(header.get("cy", float(header.get("h", height)) / 2))
-            return torch.tensor(
+            intrinsics = torch.tensor(
                 [[focal_x * scale_x, 0, centre_x * scale_x - 0.5], [0, focal_y * scale_y, centre_y * scale_y - 0.5], [0, 0, 1]],
                 dtype=torch.float64,
             )
-        if "camera_angle_x" in header:
-            return pinhole_intrinsics(math.degrees(float(header["camera_angle_x"])), width, height)
-    except (TypeError, ValueError, ZeroDivisionError):
+        else:
+            intrinsics = pinhole_intrinsics(math.degrees(float(header["camera_angle_x"])), width, height)
+        if intrinsics.isfinite().all() and intrinsics[0, 0] > 0 and intrinsics[1, 1] > 0:
+            return intrinsics
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
         pass
     fail("views", f"{frame.image.parent.parent}: the camera has neither a usable fl_x nor camera_angle_x", "add one of them")

@@ -1,0 +1,1 @@
+"""Taking a billboard cloud to other programs as plain glTF or OBJ."""

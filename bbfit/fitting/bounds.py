@@ -15,6 +15,8 @@ from bbfit.views import ViewSet
 
 # Views that meet a billboard more obliquely than this say nothing useful about its extent.
 _OBLIQUE = math.cos(math.radians(60))
+# Billboards whose cosines differ by less face a view equally well.
+_TIE = 1e-3
 
 
 def facing(camera: Camera, normals: Tensor, target: Tensor) -> Tensor:
@@ -51,8 +53,8 @@ def silhouette_bounds(planes: BillboardCloud, views: ViewSet) -> Tensor:
     cosines = facing(views.cameras, planes.normals, planes.centers[0]).abs()
     bounds = torch.tensor([math.inf, -math.inf, math.inf, -math.inf], dtype=planes.centers.dtype).repeat(len(planes), 1)
     for view, row in enumerate(cosines):
-        # Both rectangles of a pair face a view equally well, up to rounding.
-        for n in torch.nonzero((row > row.max() - 1e-6) & (row > _OBLIQUE))[:, 0].tolist():
+        # A view halfway between two billboards counts for both, as it does for both rectangles of a pair.
+        for n in torch.nonzero((row > row.max() - _TIE) & (row > _OBLIQUE))[:, 0].tolist():
             bounds[n] = _union(bounds[n], _silhouette_on_plane(planes, n, views, view))
     seen = bounds[:, 0].isfinite()
     if not seen.any():  # only oblique views: fall back to the best there is

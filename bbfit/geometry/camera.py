@@ -22,6 +22,8 @@ from torch import Tensor
 
 from bbfit.checks import check_count, check_shape, fail
 
+# A viewing direction whose horizontal part is shorter than this counts as straight up or down.
+VERTICAL = 1e-6
 # (x, y, z) of a Z-up world -> (x, z, -y) of ours.
 Z_UP_TO_Y_UP: tuple[tuple[float, ...], ...] = ((1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))
 
@@ -165,7 +167,7 @@ def look_at(position: Tensor, target: Tensor) -> Tensor:
     forward = torch.nn.functional.normalize(target - position, dim=-1)
     up = torch.zeros_like(forward)
     up[:, 1] = 1
-    vertical = forward[:, 1].abs() > 1 - 1e-9
+    vertical = forward[:, ::2].norm(dim=-1) < VERTICAL
     up[vertical] = torch.tensor([0.0, 0.0, -1.0], dtype=up.dtype, device=up.device)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward], -2)

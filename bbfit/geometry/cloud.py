@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from bbfit.checks import check_choice, check_count, check_file, check_shape, fail
+from bbfit.checks import InputError, check_choice, check_count, check_file, check_shape, fail
 
 FORMAT = "bbfit billboard cloud 1"
 _TENSORS = ("centers", "rights", "ups", "half_extents", "texture_sizes", "two_sided", "texels")
@@ -43,13 +43,16 @@ class BillboardCloud:
     """Straight-alpha display-referred RGBA in [0, 1], [P, 4]: per billboard its front texture row by row, then its back texture if any."""
 
     def __post_init__(self) -> None:
+        check_shape("centers", tuple(self.centers.shape), (None, 3))
         n = len(self.centers)
-        check_shape("centers", tuple(self.centers.shape), (n, 3))
         check_shape("rights", tuple(self.rights.shape), (n, 3))
         check_shape("ups", tuple(self.ups.shape), (n, 3))
         check_shape("half_extents", tuple(self.half_extents.shape), (n, 2))
         check_shape("texture_sizes", tuple(self.texture_sizes.shape), (n, 2))
         check_shape("two_sided", tuple(self.two_sided.shape), (n,))
+        if self.texture_sizes.dtype != torch.int64 or (self.texture_sizes < 1).any():
+            fail("texture_sizes", f"expected int64 values of at least 1, got {self.texture_sizes.dtype} {self.texture_sizes.tolist()}")
+        check_choice("two_sided's dtype", self.two_sided.dtype, (torch.bool,))
         check_shape("texels", tuple(self.texels.shape), (sum(self._texel_counts), 4))
 
     def __len__(self) -> int:
@@ -92,7 +95,7 @@ class BillboardCloud:
         """Write one ``.safetensors`` file, completely or not at all."""
         from bbfit.files import write_tensors
 
-        tensors = {name: getattr(self, name).detach().cpu().contiguous() for name in _TENSORS}
+        tensors = {name: getattr(self, name).detach().cpu().clone(memory_format=torch.contiguous_format) for name in _TENSORS}
         write_tensors(path, tensors, {"format": FORMAT})
 
     @staticmethod
@@ -109,11 +112,16 @@ class BillboardCloud:
         path = check_file("cloud", path)
         try:
             with safe_open(path, framework="pt") as file:
-                if (file.metadata() or {}).get("format") != FORMAT:
-                    fail("cloud", f"{path} is not a billboard cloud", "expected a file written by bbfit fit")
-                return BillboardCloud(**{name: file.get_tensor(name) for name in _TENSORS})
-        except SafetensorError as error:
-            fail("cloud", f"{path} cannot be read ({error})", "expected a file written by bbfit fit")
+                known = (file.metadata() or {}).get("format") == FORMAT
+                tensors = {name: file.get_tensor(name) for name in _TENSORS} if known else {}
+            if tensors:
+                for name, tensor in tensors.items():
+                    if not tensor.isfinite().all():
+                        fail(name, "expected finite values")
+                return BillboardCloud(**tensors)
+        except (SafetensorError, InputError) as error:
+            fail("cloud", f"{path} is damaged ({error})", "expected a file written by bbfit fit")
+        fail("cloud", f"{path} is not a billboard cloud", "expected a file written by bbfit fit")
 
 
 def even_upright(

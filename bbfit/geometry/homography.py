@@ -30,9 +30,22 @@ def texel_to_pixel(cloud: BillboardCloud, camera: Camera) -> Tensor:
     return camera.batch().world_to_pixel[:, None] @ texel_to_world(cloud)
 
 
-def texel_depth(cloud: BillboardCloud, camera: Camera) -> Tensor:
-    """Rows that give the camera depth (metres along +Z) of a homogeneous texel, [V, N, 3]."""
-    return (camera.batch().world_to_camera[:, None, 2:3] @ texel_to_world(cloud))[..., 0, :]
+def pixel_depth(cloud: BillboardCloud, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Rows whose quotient is the depth at which a pixel's ray meets a plane, numerator and denominator, both [V, N, 3].
+
+    The ray of the homogeneous pixel p meets the plane (numerator . p) / (denominator . p) metres along the camera's +Z: behind the
+    camera where that is negative, at infinity, on the plane's horizon, where the denominator vanishes. Nothing is inverted that
+    depends on the plane, so planes seen edge-on do no harm, and coincident planes have exactly equal depths whatever their textures.
+    """
+    camera = camera.batch()
+    rotation, translation = camera.world_to_camera[:, None, :3, :3], camera.world_to_camera[:, None, :3, 3]
+    normals = (rotation * cloud.normals[:, None]).sum(-1)  # in camera axes, [V, N, 3]
+    offset = (normals * ((rotation * cloud.centers[:, None]).sum(-1) + translation)).sum(-1, keepdim=True)
+    to_ray = torch.linalg.inv(camera.intrinsics)  # pixel -> (x, y, 1)
+    last = torch.tensor([0.0, 0.0, 1.0], dtype=normals.dtype, device=normals.device)
+    if camera.orthographic:  # rays start at (x, y, 0) and run along (0, 0, 1)
+        return offset * last - (normals * (1 - last)) @ to_ray, normals[..., 2:] * last
+    return offset * last, normals @ to_ray
 
 
 def signed_distance(cloud: BillboardCloud, camera: Camera) -> Tensor:

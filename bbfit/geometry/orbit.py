@@ -14,6 +14,10 @@ from bbfit.checks import check_count, check_range, fail
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinhole_intrinsics
 
 
+# No vertex is nearer to a camera, and no orthographic image narrower, than this share of the tree's radius.
+NEAREST = 1e-3
+
+
 @dataclass(frozen=True)
 class Orbit:
     """Camera directions on horizontal rings around a vertical axis.
@@ -24,7 +28,7 @@ class Orbit:
     count: int = 90
     """Views in all, shared out over the rings as evenly as possible."""
     elevations_degrees: tuple[float, ...] = (0.0,)
-    """Height of each ring as an angle above the horizon, in (-90, 90]."""
+    """Height of each ring as an angle above the horizon, in [-90, 90]."""
 
     def __post_init__(self) -> None:
         if not self.elevations_degrees:
@@ -72,23 +76,33 @@ class Orbit:
         Returns
         -------
         :class:`Camera` with V = ``count`` views, float64.
+
+        Raises
+        ------
+        InputError
+            if there are no points, a coordinate is not finite, or all points lie at the target.
         """
         check_range("margin", margin, 0, 0.4)
+        if not len(points) or not np.isfinite(points).all():
+            fail("points", "expected finite coordinates of at least one vertex", "check the mesh")
         direction = self.directions
         rotation = look_at(target + direction, target)[:, :3, :3].numpy()
         # Only hull vertices can touch the frame; the hull of a million-vertex tree has a few hundred.
         relative = _hull(np.asarray(points, dtype=np.float64)) - target.numpy()
         local = np.einsum("vij,pj->vpi", rotation, relative)
         aspect = height / width
+        radius = float(np.linalg.norm(relative, axis=-1).max())
+        if radius == 0:
+            fail("points", "all vertices lie in one point", "check the mesh")
         lateral = np.maximum(np.abs(local[..., 0]), np.abs(local[..., 1]) / aspect) / (1 - 2 * margin)
         if fov_x_degrees is None:
-            extent = 2 * float(lateral.max())
-            distance = 2 * float(np.linalg.norm(relative, axis=-1).max()) + 1e-3
+            extent = max(2 * float(lateral.max()), NEAREST * radius)
+            distance = 2 * radius
             intrinsics = orthographic_intrinsics(extent, width, height)
         else:
             check_range("fov_degrees", fov_x_degrees, 0, 170, open_low=True)
             slope = math.tan(math.radians(fov_x_degrees) / 2)
-            distance = float((lateral / slope - local[..., 2]).max())
+            distance = float((np.maximum(lateral / slope, NEAREST * radius) - local[..., 2]).max())
             intrinsics = pinhole_intrinsics(fov_x_degrees, width, height)
         views = len(direction)
         return Camera(
@@ -101,9 +115,9 @@ class Orbit:
 
 
 def _hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The points that are extreme along any of a dense set of directions, a superset test of which is cheap and exact enough.
+    """The vertices of the points' convex hull (Barber et al. 1996, "The Quickhull Algorithm for Convex Hulls").
 
-    A flat or tiny set has no three-dimensional hull, so then all points are kept.
+    Of a flat or tiny set, which has no three-dimensional hull, all points are kept.
     """
     from scipy.spatial import ConvexHull, QhullError
 

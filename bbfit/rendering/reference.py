@@ -12,11 +12,13 @@ from torch.nn.functional import pad
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.geometry.homography import signed_distance, texel_depth, texel_to_pixel
+from bbfit.geometry.homography import pixel_depth, signed_distance, texel_to_pixel
 from bbfit.rendering.compositing import composite
 
 # A plane is edge-on, and so not drawn, when the camera is nearer to it than this share of its distance to the billboard's centre.
 EDGE_ON = 1e-5
+# How often a plane is moved off a horizon that runs through a pixel's centre; once is nearly always enough.
+NUDGES = 8
 
 
 def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
@@ -35,37 +37,48 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
         image = torch.zeros(views, height, width, 4, dtype=cloud.texels.dtype, device=cloud.texels.device)
         return image if camera.batched else image[0]
 
-    distance = signed_distance(cloud, cameras)  # [V, N]
+    distance = signed_distance(cloud, cameras).detach()  # [V, N]
     reach = torch.ones_like(distance)
     if not cameras.orthographic:
-        reach = (cameras.position[:, None] - cloud.centers).norm(dim=-1)
-    visible = distance.abs() > EDGE_ON * reach
+        reach = (cameras.position[:, None] - cloud.centers.detach()).norm(dim=-1)
+    visible = (distance.abs() > EDGE_ON * reach) & (cloud.half_extents != 0).all(-1)
+    drawn, depth = _plane_depth(cloud, cameras, visible)
+
     identity = torch.eye(3, dtype=distance.dtype, device=distance.device)
     # Replacing singular matrices *before* they are inverted keeps every gradient finite.
     matrices = torch.where(visible[..., None, None], texel_to_pixel(cloud, cameras), identity)
-    drawn, depth = _plane_depth(matrices.detach(), texel_depth(cloud, cameras).detach(), visible, height, width)
-
-    sources = _facing_textures(cloud, distance.detach() >= 0)
     # The margin shifts texel coordinates by one.
     shift = torch.tensor([[1.0, 0, -1], [0, 1, -1], [0, 0, 1]], dtype=matrices.dtype, device=matrices.device)
+    matrices = (matrices @ shift).transpose(0, 1)  # [N, V, 3, 3]
+    sources = _facing_textures(cloud, distance >= 0)
     if len({source.shape for source in sources}) == 1:  # one call for all planes: kornia works on batch entries in parallel
-        stacked = warp_perspective(
-            torch.cat(sources), (matrices @ shift).transpose(0, 1).flatten(0, 1), (height, width),
-            mode="bilinear", padding_mode="zeros", align_corners=True,
-        )  # fmt: skip
-        warped = list(stacked.split(views))
+        warped = list(_warp(torch.cat(sources), matrices.flatten(0, 1), height, width).split(views))
     else:
-        warped = [
-            warp_perspective(
-                source, matrices[:, n] @ shift, (height, width),
-                mode="bilinear", padding_mode="zeros", align_corners=True,
-            )
-            for n, source in enumerate(sources)
-        ]  # fmt: skip
+        warped = [_warp(source, matrix, height, width) for source, matrix in zip(sources, matrices, strict=True)]
     colours, alphas = zip(*(layer.split((3, 1), 1) for layer in warped), strict=True)
     shown = [alpha * mask for alpha, mask in zip(alphas, drawn, strict=True)]
     image = composite(list(colours), shown, list(depth)).permute(0, 2, 3, 1)
     return image if camera.batched else image[0]
+
+
+def _warp(sources: Tensor, matrices: Tensor, height: int, width: int) -> Tensor:
+    """Each source [B, 4, h, w] seen through its texel-to-pixel matrix [B, 3, 3]: straight RGBA, [B, 4, H, W].
+
+    On the horizon of a plane the texel lies at infinity. Where that line runs exactly through a pixel's centre (a plane parallel to
+    the optical axis and an image of odd width will do) kornia divides by zero, and one such pixel makes the plane's whole gradient
+    NaN. Such a plane is moved by about a millionth of the image, which is what float32 resolves.
+    """
+    for _ in range(NUDGES):
+        warped = warp_perspective(
+            sources, matrices, (height, width), mode="bilinear", padding_mode="zeros", align_corners=True
+        )  # fmt: skip
+        broken = ~warped[:, 3].isfinite().flatten(1).all(1)
+        if not broken.any():
+            break
+        nudge = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
+        nudge[0, 2], nudge[1, 2] = 1.1e-6 * width, 0.7e-6 * height
+        matrices = torch.where(broken[:, None, None], nudge @ matrices, matrices)
+    return warped
 
 
 def _facing_textures(cloud: BillboardCloud, front: Tensor) -> list[Tensor]:
@@ -80,15 +93,13 @@ def _facing_textures(cloud: BillboardCloud, front: Tensor) -> list[Tensor]:
     return sources
 
 
-def _plane_depth(matrices: Tensor, depth_rows: Tensor, visible: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+def _plane_depth(cloud: BillboardCloud, cameras: Camera, visible: Tensor) -> tuple[Tensor, Tensor]:
     """Where each plane is met in front of the camera, bool [N, V, 1, H, W], and at what depth, [N, V, 1, H, W]."""
-    to_texel = torch.linalg.inv(matrices).transpose(0, 1)  # [N, V, 3, 3]
-    y = torch.arange(height, dtype=matrices.dtype, device=matrices.device)[:, None]
-    x = torch.arange(width, dtype=matrices.dtype, device=matrices.device)
-    # H^-1 (x, y, 1) is the texel times 1 / scale; its third coordinate and its depth are both linear in the pixel.
-    rows = torch.stack([to_texel[..., 2, :], (depth_rows.transpose(0, 1)[..., None, :] @ to_texel)[..., 0, :]])
+    rows = torch.stack(pixel_depth(cloud, cameras)).detach().transpose(1, 2)  # [2, N, V, 3]
+    y = torch.arange(cameras.height, dtype=rows.dtype, device=rows.device)[:, None]
+    x = torch.arange(cameras.width, dtype=rows.dtype, device=rows.device)
     a, b, c = (rows[..., i, None, None, None] for i in range(3))
-    scale, scaled_depth = a * x + b * y + c
-    depth = scaled_depth / scale
-    drawn = visible.mT[..., None, None, None] & (depth > 0) & depth.isfinite() & (scale.abs() > 1e-12)
+    numerator, denominator = a * x + b * y + c
+    depth = numerator / denominator
+    drawn = visible.mT[..., None, None, None] & (depth > 0) & depth.isfinite()
     return drawn, torch.where(drawn, depth, torch.inf)

@@ -1,0 +1,72 @@
+"""What views of a tree look like: how many, how large, from where, in which light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from bbfit.checks import InputTypeError, check_choice, check_count, check_range, fail
+
+Device = Literal["cpu", "cuda", "optix", "hip", "oneapi", "metal"]
+Axis = Literal["auto", "origin", "centre"]
+
+
+@dataclass(frozen=True)
+class ViewsConfig:
+    """How a tree is rendered."""
+
+    count: int = 90
+    """Pictures in all, shared out over the rings as evenly as possible; a random quarter becomes the test views."""
+    size: int = 512
+    """Width and height of a picture in pixels."""
+    elevations: tuple[float, ...] = (0.0,)
+    """Height of each ring of cameras as an angle above the horizon, in degrees."""
+    fov_degrees: float = 40.0
+    """Field of view; the cameras step back until the whole tree is in frame."""
+    orthographic: bool = False
+    """Parallel projection instead of a field of view."""
+    samples: int = 16
+    """Light paths a pixel."""
+    denoise: bool = True
+    """Clean the pictures with Open Image Denoise; takes about half of the time, and lets a few samples look like hundreds."""
+    sun_strength: float = 3.0
+    """Strength of the sun in watts a square metre; 0 leaves only the ambient light."""
+    sun_azimuth: float = 35.0
+    """Where the sun stands, counted as the views are: 0 behind the first view's camera, then counter-clockwise seen from above; degrees."""
+    sun_elevation: float = 50.0
+    """Height of the sun above the horizon in degrees."""
+    ambient_strength: float = 1.0
+    """Strength of the light that comes from everywhere: at 1, without sun, a white matt surface is just white. Scales an HDRI too."""
+    hdri: Path | None = None
+    """Panorama (.hdr or .exr) that lights the tree in place of even white; set the sun's strength to 0 when it has its own sun."""
+    device: Device = "cpu"
+    """What Cycles computes on."""
+    workers: int = 1
+    """Blender processes at a time; the processor's threads are shared out among them."""
+    seed: int = 0
+    """Seeds the noise of the renders and the choice of test views."""
+    axis: Axis = "auto"
+    """Vertical line that the cameras circle: through the file's origin, through the centre of the tree's bounding box, or (auto) through
+    the origin where that lies inside the bounding box seen from above, as with a trunk that stands there, else through the centre."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.elevations, tuple | list) or not self.elevations:
+            raise InputTypeError(f"elevations: expected one or more angles, got {self.elevations!r}")
+        for elevation in self.elevations:
+            check_range("elevations", elevation, -90, 90)
+        check_count("count", self.count, 2)
+        if self.count < len(self.elevations):
+            fail("count", f"expected at least one view for each of {len(self.elevations)} rings, got {self.count}")
+        check_count("size", self.size, 8)
+        check_range("size", self.size, 8, 16384)
+        check_range("fov_degrees", self.fov_degrees, 1, 170)
+        check_count("samples", self.samples)
+        check_range("sun_strength", self.sun_strength, 0, 1e6)
+        check_range("sun_azimuth", self.sun_azimuth, -360, 360)
+        check_range("sun_elevation", self.sun_elevation, -90, 90)
+        check_range("ambient_strength", self.ambient_strength, 0, 1e6)
+        check_choice("device", self.device, ("cpu", "cuda", "optix", "hip", "oneapi", "metal"))
+        check_count("workers", self.workers)
+        check_count("seed", self.seed, 0)
+        check_choice("axis", self.axis, ("auto", "origin", "centre"))

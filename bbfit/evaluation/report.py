@@ -1,0 +1,181 @@
+"""What an evaluation found: measures of every view, their averages, and what the model costs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from bbfit.checks import check_file, fail
+from bbfit.files import read_json, write_json
+
+
+@dataclass(frozen=True)
+class OverWhite:
+    """RGB composited over white, data range 1 (:mod:`bbfit.evaluation.metrics`)."""
+
+    psnr: float
+    """Peak signal-to-noise ratio in dB, at most 120."""
+    ssim: float
+    """Structural similarity with a Gaussian window, in [-1, 1]."""
+    flip: float
+    """Mean perceived difference, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Rgba:
+    """Premultiplied RGBA, data range 1 (:mod:`bbfit.evaluation.metrics`)."""
+
+    rmse: float
+    """Root mean squared error over all four channels, in [0, 1]."""
+    psnr: float
+    """Peak signal-to-noise ratio in dB, at most 120."""
+    iou: float
+    """Intersection over union of the silhouettes, alpha >= 0.5, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class ThesisScale:
+    """Premultiplied RGBA as the thesis measured it, with a peak of 4095 (:mod:`bbfit.evaluation.thesis_scale`)."""
+
+    rmse: float
+    """Root mean squared error over 4095."""
+    ssim: float
+    """Structural similarity with a data range of 4095."""
+    psnr: float
+    """Peak signal-to-noise ratio in dB, 72.25 above the honest one."""
+    sre: float
+    """Signal-to-reconstruction-error ratio in dB, the error's norm not squared."""
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Every measure of one view, or their plain means over views."""
+
+    over_white: OverWhite
+    rgba: Rgba
+    thesis_scale: ThesisScale
+    sharpness: float | None
+    """Mean absolute gradient over the target's; ``None`` for a flat target."""
+    brightness: float | None
+    """Mean colour inside the target's silhouette over the target's; ``None`` for an empty or black silhouette."""
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One held-out view and its measures."""
+
+    name: str
+    """The picture's name."""
+    azimuth_degrees: float
+    """Where the camera stands, in [0, 360): 0 looks from +Z, counter-clockwise seen from above."""
+    elevation_degrees: float
+    """Height of the camera above the horizon, in [-90, 90]."""
+    measures: Measures
+
+    def to_json(self) -> dict[str, Any]:
+        """The name, the angles and the groups of measures side by side."""
+        return {name: value for name, value in asdict(self).items() if name != "measures"} | asdict(self.measures)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """A count of the model beside that of the original tree; ``None`` where it is not known."""
+
+    model: int | None = None
+    original: int | None = None
+
+    @property
+    def ratio(self) -> float | None:
+        """Model over original: the ratio of the thesis's table 1, there in per cent."""
+        return self.model / self.original if self.model is not None and self.original else None
+
+    def to_json(self) -> dict[str, int | float | None]:
+        """Both counts and their ratio."""
+        return {"model": self.model, "original": self.original, "ratio": self.ratio}
+
+
+@dataclass(frozen=True)
+class Report:
+    """How close a billboard cloud comes to the held-out views, and what it costs.
+
+    ``dataclasses.replace`` fills in costs that become known later, such as the size of the exported file.
+    """
+
+    views: tuple[ViewScore, ...]
+    """One entry per held-out view, in the order of the view set; at least one."""
+    vertices: Cost = field(default_factory=Cost)
+    """Vertices of the exported mesh and of the original tree."""
+    bytes: Cost = field(default_factory=Cost)
+    """Sizes of the exported file and of the original tree's file."""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Wall-clock seconds of each stage."""
+
+    @property
+    def mean(self) -> Measures:
+        """Plain means over the views; decibels are averaged as decibels, as in the thesis.
+
+        A view in which a measure is ``None`` does not count for it.
+        """
+        return _mean(Measures, [view.measures for view in self.views])
+
+    def to_json(self) -> dict[str, Any]:
+        """The contents of ``metrics.json``; every number is finite, what is unknown or undefined is ``None``.
+
+        Returns
+        -------
+        ``{"over_white": {"psnr", "ssim", "flip"}, "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
+        "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "seconds": {stage: ..},
+        "views": [{"name", "azimuth_degrees", "elevation_degrees", and the measures as above}]}``
+        """
+        return asdict(self.mean) | {
+            "vertices": self.vertices.to_json(),
+            "bytes": self.bytes.to_json(),
+            "seconds": dict(self.seconds),
+            "views": [view.to_json() for view in self.views],
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write :meth:`to_json`, completely or not at all."""
+        write_json(path, self.to_json())
+
+    @staticmethod
+    def load(path: str | Path) -> Report:
+        """Read a file that :meth:`save` wrote.
+
+        Raises
+        ------
+        MissingFileError, InputError
+            if the file is missing, damaged or something else.
+        """
+        path = check_file("metrics", path)
+        content = read_json("metrics", path)
+        try:
+            vertices, sizes = (Cost(content[name]["model"], content[name]["original"]) for name in ("vertices", "bytes"))
+            return Report(tuple(_view(entry) for entry in content["views"]), vertices, sizes, dict(content["seconds"]))
+        except (KeyError, TypeError, ValueError):
+            fail("metrics", f"{path} is not a report", "expected a metrics.json that bbfit evaluate wrote")
+
+
+def _view(entry: dict[str, Any]) -> ViewScore:
+    measures = Measures(
+        OverWhite(**entry["over_white"]),
+        Rgba(**entry["rgba"]),
+        ThesisScale(**entry["thesis_scale"]),
+        entry["sharpness"],
+        entry["brightness"],
+    )
+    return ViewScore(entry["name"], entry["azimuth_degrees"], entry["elevation_degrees"], measures)
+
+
+def _mean(group: type[Any], items: Sequence[Any]) -> Any:
+    """Field by field mean of dataclasses of numbers, ``None`` and further such dataclasses."""
+    means: dict[str, Any] = {}
+    for entry in fields(group):
+        values = [value for item in items if (value := getattr(item, entry.name)) is not None]
+        if values and is_dataclass(values[0]):
+            means[entry.name] = _mean(type(values[0]), values)
+        else:
+            means[entry.name] = sum(values) / len(values) if values else None
+    return group(**means)

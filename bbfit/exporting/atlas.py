@@ -1,0 +1,118 @@
+"""All textures of a cloud in one picture, packed by xatlas and filled so that filtering finds no foreign colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+# Graphics cards compress textures in blocks of 4 x 4 texels.
+BLOCK = 4
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """R textures side by side in one picture, texel for texel."""
+
+    image: NDArray[np.uint8]
+    """Straight-alpha RGBA, [H, W, 4]; both sides are multiples of 4."""
+    corners: NDArray[np.int64]
+    """Column and row of the top-left texel of each texture, [R, 2]."""
+    sizes: NDArray[np.int64]
+    """Width and height of each texture in texels, [R, 2]."""
+
+    @property
+    def used(self) -> float:
+        """Share of the picture that textures cover, in (0, 1]; the rest is padding and gaps."""
+        height, width = self.image.shape[:2]
+        return float(self.sizes.prod(-1).sum() / (height * width))
+
+
+def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
+    """Pack textures without resampling or turning them.
+
+    Each texture gets a cell of its own, at least ``padding`` texels larger on every side and aligned to blocks of n x n texels, n being
+    the largest power of two up to ``padding`` (at least 4): so a mip level of up to n x n texels a texel never mixes two textures.
+
+    Parameters
+    ----------
+    textures : R >= 1 straight-alpha pictures, uint8 [h, w, 4].
+    padding : at least 1 texel, which the fade to transparent at a billboard's rim needs.
+
+    Returns
+    -------
+    :class:`Atlas`. Alpha is 0 outside the textures. Colour there, and wherever filtering a texture cannot show it, is that of the
+    nearest visible texel of the same texture (see :func:`fill_cell`).
+    """
+    sizes = np.array([texture.shape[1::-1] for texture in textures], dtype=np.int64)
+    unit = max(BLOCK, 1 << (padding.bit_length() - 1))
+    cells = np.maximum(-(-(sizes + 2 * padding) // unit), 2)
+    places = _place(cells)
+    width, height = ((places + cells).max(0) * unit).tolist()
+    image = np.zeros((height, width, 4), np.uint8)
+    image[..., :3] = _mean_colour(textures)  # the gaps between cells, which only the smallest mip levels see
+    for texture, place, cell in zip(textures, places * unit, cells * unit, strict=True):
+        (x, y), (w, h) = place.tolist(), cell.tolist()
+        image[y : y + h, x : x + w] = fill_cell(texture, padding, w, h)
+    return Atlas(image, places * unit + padding, sizes)
+
+
+def _place(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Non-overlapping places, int [R, 2], for cells of given whole widths and heights (at least 2), int [R, 2]."""
+    import xatlas
+
+    atlas = xatlas.Atlas()
+    # xatlas rounds a chart's extent up to whole texels and takes one texel more, for the half texels on either side of its outline.
+    charts = [np.array([[0, 0], [w, 0], [w, h], [0, h]], np.float32) for w, h in (cells - 1).tolist()]
+    # It takes charts at equal addresses for copies of one mesh, so all of them must stay alive until it has packed them.
+    triangles = [np.array([[0, 1, 2], [0, 2, 3]], np.uint32) for _ in charts]
+    for chart, triangle in zip(charts, triangles, strict=True):
+        atlas.add_uv_mesh(chart, triangle)
+    options = xatlas.PackOptions()
+    options.padding = 0
+    options.bilinear = False
+    options.rotate_charts = False
+    options.rotate_charts_to_axis = False
+    options.bruteForce = True
+    options.max_chart_size = 0
+    options.texels_per_unit = 1.0
+    options.resolution = 0
+    atlas.generate(pack_options=options)
+    scale = np.array([atlas.width, atlas.height])
+    places = np.stack([np.floor((atlas[n][2] * scale).min(0)) for n in range(len(charts))]).astype(np.int64)
+    ends = [np.ceil((atlas[n][2] * scale).max(0)) for n in range(len(charts))]
+    assert atlas.atlas_count == 1 and np.array_equal(places + cells, ends), "xatlas scaled or split the atlas"
+    return places - places.min(0)
+
+
+def fill_cell(texture: NDArray[np.uint8], padding: int, width: int, height: int) -> NDArray[np.uint8]:
+    """Put a texture into its cell with transparent surroundings that filtering cannot tell from the texture.
+
+    Bilinear filtering with straight alpha shows the colour of a transparent texel next to a visible one, so that colour is part of
+    the picture and stays (around the texture: the colour of its rim). All other transparent texels take the colour of the nearest
+    visible texel, by the exact Euclidean distance transform (Felzenszwalb and Huttenlocher 2012); else they would darken mip levels.
+
+    Returns
+    -------
+    uint8 [height, width, 4] with the texture's top-left texel at (``padding``, ``padding``).
+    """
+    h, w = texture.shape[:2]
+    around = ((padding, height - h - padding), (padding, width - w - padding))
+    cell = np.dstack([np.pad(texture[..., :3], (*around, (0, 0)), "edge"), np.pad(texture[..., 3], around)])
+    visible = cell[..., 3] > 0
+    if not visible.any():
+        return np.zeros_like(cell)
+    unseen = ~ndimage.binary_dilation(visible, np.ones((3, 3)))
+    row, column = ndimage.distance_transform_edt(~visible, return_distances=False, return_indices=True)
+    cell[unseen, :3] = cell[row[unseen], column[unseen], :3]
+    return cell
+
+
+def _mean_colour(textures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Alpha-weighted mean colour, [3]."""
+    flat = [texture.reshape(-1, 4).astype(np.float64) for texture in textures]
+    weight = sum(part[:, 3].sum() for part in flat)
+    total = sum((part[:, 3] @ part[:, :3] for part in flat), np.zeros(3))
+    return np.rint(total / max(weight, 1)).astype(np.uint8)

@@ -1,0 +1,52 @@
+"""Writing a billboard cloud as a model that other programs open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bbfit.checks import check_folder, fail
+from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.gltf import glb_bytes
+from bbfit.exporting.obj import mtl_bytes, obj_bytes
+from bbfit.exporting.quads import cloud_quads
+from bbfit.files import write_bytes
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import encode_png
+
+SUFFIXES = (".glb", ".obj")
+
+
+def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None = None) -> list[Path]:
+    """Write a billboard cloud as GLB (one file) or as OBJ with an MTL and a PNG of the same stem, by the ending of ``path``.
+
+    Textures are rounded to 8 bits and otherwise kept texel for texel. Coordinates keep the cloud's metres and origin.
+
+    Returns
+    -------
+    The files written, the model first.
+
+    Raises
+    ------
+    InputError
+        for another ending, an empty cloud or one with values that are not finite.
+    MissingFileError, OSError
+        if the folder does not exist or cannot be written to; files that were there stay as they were.
+    """
+    path, config = Path(path), config or ExportConfig()
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        fail("model file", f"{path} ends in {path.suffix or 'nothing'}", f"choose an ending of {' or '.join(SUFFIXES)}")
+    check_folder("model file's folder", path.parent)
+    quads = cloud_quads(cloud, config.padding)
+    if suffix == ".glb":
+        contents = {path: glb_bytes(quads, config)}
+    else:
+        material, texture = path.with_suffix(".mtl"), path.with_suffix(".png")
+        contents = {
+            path: obj_bytes(quads, config, material_file=material.name),
+            material: mtl_bytes(texture_file=texture.name),
+            texture: encode_png(quads.atlas.image),
+        }
+    for file, data in reversed(contents.items()):  # what is referred to before what refers to it
+        write_bytes(file, data)
+    return list(contents)

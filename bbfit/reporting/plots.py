@@ -1,0 +1,208 @@
+"""Pictures of a result: ``comparison.png`` (targets beside renders) and ``loss.png``."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bbfit.checks import check_count, fail
+from bbfit.evaluation import metrics
+from bbfit.evaluation.scoring import held_out, view_angles
+from bbfit.files import write_bytes
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import encode_png, over_colour, to_bytes
+from bbfit.views import ViewSet
+
+if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw
+    from PIL.ImageFont import FreeTypeFont
+
+_INK, _FAINT, _LINE, _PAPER = (32, 36, 42), (112, 118, 126), (214, 217, 222), (242, 243, 245)
+_CELL_LEAST = 220  # pixels: what the writing under a small picture needs
+
+
+def comparison_picture(cloud: BillboardCloud, views: ViewSet, path: str | Path, *, count: int = 4, title: str = "") -> None:
+    """Write a PNG of some views, a row each: target, result, and the perceived difference.
+
+    Pictures are shown over white, pixel for pixel. The difference is the FLIP map (:func:`bbfit.evaluation.metrics.flip_map`) in the
+    colours of magma: black is no difference. Under each row stand the view's name, azimuth, PSNR and SSIM over white and mean FLIP.
+
+    Parameters
+    ----------
+    cloud : the result.
+    views : held-out views; ``count`` of them are shown, spread evenly in azimuth (:func:`spread_views`).
+    path : the PNG to write, completely or not at all.
+    title : stands above the pictures.
+
+    Raises
+    ------
+    InputError
+        as :func:`bbfit.evaluation.scoring.evaluate`.
+    """
+    from PIL import Image, ImageDraw
+
+    check_count("count", count)
+    if len(views) == 0:
+        fail("views", "there is no held-out view to show", "give views with a test split")
+    width, height = views.cameras.width, views.cameras.height
+    metrics.check_size(width, height)
+    angles = view_angles(views.cameras).numpy()
+    rows = spread_views(angles, count)
+
+    text = int(np.clip(width // 32, 12, 28))  # pixels
+    cell, gap, line = max(width, _CELL_LEAST), text, 2 * text
+    head = line * (3 if title else 2) - text // 2
+    row = height + 3 * text
+    size = (3 * cell + 4 * gap, head + len(rows) * row + text // 2)
+    sheet = Image.new("RGB", size, _PAPER)
+    draw = ImageDraw.Draw(sheet)
+    font, bold = _font("DejaVuSans.ttf", text), _font("DejaVuSans-Bold.ttf", text)
+    left = [gap + column * (cell + gap) for column in range(3)]
+
+    if title:
+        draw.text((gap, line // 2), title, _INK, _font("DejaVuSans-Bold.ttf", text * 5 // 4))
+    noun = "billboard" if len(cloud) == 1 else "billboards"
+    for x, name, note in zip(
+        left, ("Target", "Result", "Difference"), ("", f"{len(cloud)} {noun}, {cloud.vertex_count} vertices", "perceived"), strict=True
+    ):
+        draw.text((x, head - text * 3 // 2), name, _INK, bold)
+        draw.text((x + bold.getlength(name + "  "), head - text * 3 // 2), note, _FAINT, font)
+    _colour_bar(sheet, draw, font, left[2] + cell, head - text * 3 // 2, text)
+
+    for number, index in enumerate(rows):
+        top = head + number * row + text // 4
+        target, result = (over_colour(picture) for picture in held_out(cloud, views, index))
+        pair = target.numpy(), result.numpy()
+        error = metrics.flip_map(*pair)
+        for x, picture in zip(left, (to_bytes(target), to_bytes(result), _magma(error)), strict=True):
+            x += (cell - width) // 2
+            draw.rectangle((x - 1, top - 1, x + width, top + height), outline=_LINE)
+            sheet.paste(Image.fromarray(picture), (x, top))
+        captions = (
+            f"{views.names[index]}  ·  azimuth {angles[index, 0]:.0f}°" + _height(angles[index, 1]),
+            f"PSNR {metrics.psnr(*pair):.2f} dB  ·  SSIM {metrics.ssim(*pair):.3f}",
+            f"mean FLIP {error.mean():.3f}",
+        )
+        for x, caption in zip(left, captions, strict=True):
+            draw.text((x, top + height + text // 2), caption, _INK, font)
+    write_bytes(path, encode_png(np.asarray(sheet)))
+
+
+def spread_views(angles: NDArray[np.float64], count: int) -> list[int]:
+    """Indices of at most ``count`` views that are spread evenly in azimuth, in order of azimuth.
+
+    Starting from the first view, each next one is the unused view nearest to a full turn's k-th part; among equally near ones the one
+    nearest to the horizon.
+
+    Parameters
+    ----------
+    angles : azimuth and elevation in degrees, [V, 2].
+    """
+    unused = list(range(len(angles)))
+    chosen: list[int] = []
+    for k in range(min(count, len(angles))):
+        wanted = angles[0, 0] + k * 360 / min(count, len(angles))
+        away = {i: round(abs((angles[i, 0] - wanted + 180) % 360 - 180), 3) for i in unused}
+        chosen.append(min(unused, key=lambda i: (away[i], abs(angles[i, 1]), i)))
+        unused.remove(chosen[-1])
+    return sorted(chosen, key=lambda i: (angles[i, 0], angles[i, 1]))
+
+
+def loss_plot(losses: Sequence[float], path: str | Path, *, label: str = "loss") -> None:
+    """Write a PNG of the loss of each step on a logarithmic axis, with its running mean over a fiftieth of the steps.
+
+    Parameters
+    ----------
+    losses : loss of every step, the first one first; values that are not finite and positive leave a gap.
+    path : the PNG to write, completely or not at all.
+    label : of the vertical axis.
+
+    Raises
+    ------
+    InputError
+        if there are no losses.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, StrMethodFormatter
+
+    values = np.asarray(losses, dtype=np.float64)
+    if values.ndim != 1 or len(values) == 0:
+        fail("losses", f"expected a list of at least one number, got shape {list(values.shape)}")
+    shown = np.where(np.isfinite(values) & (values > 0), values, np.nan)
+    steps = np.arange(1, len(shown) + 1)
+    window = max(len(shown) // 50, 1)
+
+    figure = Figure(figsize=(9, 5), dpi=120, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    colour, raw = "#1f5f8b", "#a9c6da"
+    axes.plot(steps, shown, color=raw if window > 1 else colour, linewidth=0.8, marker="o" if len(steps) == 1 else None, label="each step")
+    if window > 1:
+        mean = running_mean(shown, window)
+        axes.plot(steps, mean, color=colour, linewidth=2, label=f"mean of {window} steps")
+        axes.legend(frameon=False)
+    if np.isfinite(shown).any():  # a logarithmic axis needs something positive
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_locator(NullLocator())
+        final = float(np.nanmean(shown[-window:])) if np.isfinite(shown[-window:]).any() else float("nan")
+        noun = "step" if len(steps) == 1 else "steps"
+        axes.set_title(f"{len(steps):,} {noun}, {final:.4g} at the end", loc="left", fontsize=11)
+    axes.set_xlim(0, max(len(steps), 2))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes.set_xlabel("step")
+    axes.set_ylabel(label)
+    axes.grid(True, color="#e4e7ea", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    buffer = io.BytesIO()
+    canvas.print_png(buffer, metadata={"Software": None})
+    write_bytes(path, buffer.getvalue())
+
+
+def running_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """Centred mean over ``window`` values, shorter at the ends, same length; NaN counts for nothing, and gives NaN where alone."""
+    valid = np.isfinite(values)
+    sums, counts = (np.concatenate([[0.0], np.cumsum(part)]) for part in (np.where(valid, values, 0.0), valid))
+    index = np.arange(len(values))
+    low, high = np.maximum(index - (window - 1) // 2, 0), np.minimum(index + window // 2 + 1, len(values))
+    total, count = sums[high] - sums[low], counts[high] - counts[low]
+    return np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
+
+
+def _magma(error: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Values in [0, 1] as magma's RGB bytes, [...] -> [..., 3]."""
+    from matplotlib import colormaps
+
+    return np.ascontiguousarray(colormaps["magma"](error, bytes=True)[..., :3])
+
+
+def _colour_bar(sheet: Any, draw: ImageDraw, font: FreeTypeFont, right: int, top: int, text: int) -> None:
+    """The scale of the difference, ending at ``right``."""
+    from PIL import Image
+
+    length, thickness = 6 * text, text * 3 // 4
+    end = right - int(font.getlength(" 1"))
+    bar = np.broadcast_to(_magma(np.linspace(0, 1, length)), (thickness, length, 3))
+    sheet.paste(Image.fromarray(np.ascontiguousarray(bar)), (end - length, top + text // 4))
+    draw.text((end, top), " 1", _FAINT, font)
+    draw.text((end - length, top), "0 ", _FAINT, font, anchor="ra")
+
+
+def _height(elevation: float) -> str:
+    return f", elevation {elevation:.0f}°" if abs(elevation) >= 0.5 else ""
+
+
+def _font(name: str, size: int) -> FreeTypeFont:
+    """A font that comes with matplotlib, so that pictures look the same everywhere."""
+    from matplotlib import get_data_path
+    from PIL import ImageFont
+
+    return ImageFont.truetype(Path(get_data_path(), "fonts", "ttf", name), size)

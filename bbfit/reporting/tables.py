@@ -1,0 +1,62 @@
+"""The report as a table for the screen."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bbfit.evaluation.report import Cost, Report
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+_UP, _DOWN, _ONE = "↑", "↓", "→ 1"
+
+
+def report_table(report: Report, title: str = "Held-out views") -> Table:
+    """A ``rich`` table of the mean measures and the costs, at most 100 columns wide.
+
+    An arrow tells which way is better. The thesis scale stands beside the honest ones, for comparison with the thesis's figures only.
+    """
+    from rich import box
+    from rich.table import Table
+
+    mean, count = report.mean, len(report.views)
+    table = Table(
+        title=f"{title}: mean of {count}" if count > 1 else f"{title}: one view", box=box.SIMPLE_HEAD, title_style="bold", pad_edge=False
+    )
+    table.add_column("measure")
+    table.add_column("better", justify="center", style="dim")
+    for name in ("over white", "premultiplied RGBA"):
+        table.add_column(name, justify="right")
+    table.add_column("thesis scale", justify="right", style="dim")
+
+    white, rgba, thesis = mean.over_white, mean.rgba, mean.thesis_scale
+    table.add_row("PSNR, dB", _UP, f"{white.psnr:.2f}", f"{rgba.psnr:.2f}", f"{thesis.psnr:.3f}")
+    table.add_row("RMSE", _DOWN, "", f"{rgba.rmse:.4f}", f"{thesis.rmse:.2e}")
+    table.add_row("SSIM", _UP, f"{white.ssim:.4f}", "", f"{thesis.ssim:.7f}")
+    table.add_row("SRE, dB", _UP, "", "", f"{thesis.sre:.3f}")
+    table.add_row("FLIP", _DOWN, f"{white.flip:.4f}", "", "")
+    table.add_row("silhouette IoU", _UP, "", f"{rgba.iou:.4f}", "")
+    table.add_row("sharpness", _ONE, _share(mean.sharpness), "", "")
+    table.add_row("brightness", _ONE, "", _share(mean.brightness), "")
+
+    table.add_section()
+    table.add_row("[bold]cost[/]", "", "[bold]model[/]", "[bold]original[/]", "[bold not dim]ratio[/]")
+    for name, cost in (("vertices", report.vertices), ("file, bytes", report.bytes)):
+        table.add_row(name, _DOWN, _count(cost.model), _count(cost.original), _percent(cost))
+    if report.seconds:
+        table.caption = "seconds: " + "  ·  ".join(f"{stage} {seconds:,.1f}" for stage, seconds in report.seconds.items())
+        table.caption_justify = "left"
+    return table
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _count(value: int | None) -> str:
+    return "-" if value is None else f"{value:,}"
+
+
+def _percent(cost: Cost) -> str:
+    return "-" if cost.ratio is None else f"{100 * cost.ratio:.3g} %"

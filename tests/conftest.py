@@ -1,0 +1,64 @@
+"""Fixtures that several folders share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cloud import BillboardCloud, even_upright
+from bbfit.geometry.orbit import Orbit
+from bbfit.images import to_bytes, unpremultiply, write_png
+from bbfit.layout import split_views, write_transforms
+from bbfit.rendering.reference import render_reference
+
+torch.set_num_threads(1)
+
+
+def smooth_texture(height: int, width: int, seed: int) -> torch.Tensor:
+    """A smooth straight-alpha texture that is opaque in the middle and fades to nothing, [h, w, 4]."""
+    generator = torch.Generator().manual_seed(seed)
+    colour = torch.nn.functional.interpolate(
+        torch.rand(1, 3, 4, 4, generator=generator), (height, width), mode="bicubic", align_corners=True
+    )
+    y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+    alpha = (1.6 * (1 - (x**2 + y**2).sqrt() / 0.8)).clamp(0, 1)
+    return torch.cat([colour[0].permute(1, 2, 0).clamp(0, 1), alpha[..., None]], -1)
+
+
+def write_views(folder: Path, cloud: BillboardCloud, camera: Camera, *, seed: int = 0) -> Path:
+    """A views folder of renders of ``cloud``, in the layout that ``bbfit views`` writes."""
+    (folder / "images").mkdir(parents=True)
+    names = [f"images/{index:04d}.png" for index in range(len(camera))]
+    for index, name in enumerate(names):
+        write_png(folder / name, to_bytes(unpremultiply(render_reference(cloud, camera[index]))))
+    write_transforms(folder, camera, names, *split_views(len(camera), seed))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def known_cloud() -> BillboardCloud:
+    """Two crossed billboards with smooth textures, about the point (0.3, 1.2, -0.2)."""
+    planes = even_upright(
+        2,
+        axis=torch.tensor([0.3, 1.2, -0.2]),
+        half_extents=torch.tensor([1.0, 1.2]),
+        texture_sizes=torch.tensor([36, 30]),
+    )
+    return planes.with_texels(torch.cat([smooth_texture(36, 30, seed).reshape(-1, 4) for seed in (1, 2)]))
+
+
+@pytest.fixture(scope="session")
+def ring(known_cloud: BillboardCloud) -> Camera:
+    """Sixteen cameras around ``known_cloud``, 48 x 40 pixels."""
+    extent = known_cloud.half_extents[0].tolist()
+    points = known_cloud.centers[0].numpy() + [[x, y, z] for x in (-extent[0], extent[0]) for y in (-extent[1], extent[1]) for z in (-1, 1)]
+    return Orbit(16).frame(points, target=known_cloud.centers[0].double(), width=48, height=40)
+
+
+@pytest.fixture(scope="session")
+def views_folder(tmp_path_factory: pytest.TempPathFactory, known_cloud: BillboardCloud, ring: Camera) -> Path:
+    """Sixteen views of ``known_cloud`` on disk. Do not change it."""
+    return write_views(tmp_path_factory.mktemp("known") / "views", known_cloud, ring)
