@@ -65,7 +65,7 @@ def output_folder(name: str, path: str | Path) -> Path:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass
-    except FileExistsError:
+    except (FileExistsError, NotADirectoryError):
         fail(name, f"a part of {path} is a file, not a folder", "choose another output folder")
     except OSError as error:
         fail(name, f"{path} cannot be written to ({error.strerror})", "choose another output folder or free the disk")

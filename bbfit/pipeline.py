@@ -103,6 +103,8 @@ def run(
         views = ViewDataset.load(source, seed=config.fit.seed)
     else:
         views = _render(source, record, config.views, tell)
+    views.train.check()
+    views.test.check()
     cloud = _fit(views, record, config.fit, tell)
     _export(cloud, record, config.export, tell)
     report = _evaluate(cloud, views, record, tell)

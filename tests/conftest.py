@@ -1,4 +1,4 @@
-"""Fixtures that several folders share."""
+"""What all tests share: one thread each, a small scene with views of it, and the folder of real trees beside the checkout."""
 
 from __future__ import annotations
 
@@ -14,7 +14,17 @@ from bbfit.images import to_bytes, unpremultiply, write_png
 from bbfit.layout import split_views, write_transforms
 from bbfit.rendering.reference import render_reference
 
-torch.set_num_threads(1)
+torch.set_num_threads(1)  # the suite runs in as many processes as there are cores
+
+SHARED = Path(__file__).resolve().parents[1] / "../shared"
+
+
+@pytest.fixture
+def shared() -> Path:
+    """The folder with real trees and views; the test skips where it is absent."""
+    if not SHARED.is_dir():
+        pytest.skip("the folder with real trees is not here")
+    return SHARED
 
 
 def smooth_texture(height: int, width: int, seed: int) -> torch.Tensor:

@@ -30,14 +30,14 @@ class ViewsConfig:
     """Light paths a pixel."""
     denoise: bool = True
     """Clean the pictures with Open Image Denoise; takes about half of the time, and lets a few samples look like hundreds."""
-    sun_strength: float = 3.0
+    sun_strength: float = 2.5
     """Strength of the sun in watts a square metre; 0 leaves only the ambient light."""
-    sun_azimuth: float = 35.0
-    """Where the sun stands, counted as the views are: 0 behind the first view's camera, then counter-clockwise seen from above; degrees."""
-    sun_elevation: float = 50.0
+    sun_azimuth: float = 30.0
+    """Direction of the sun in degrees: 0 is behind the first view's camera, growing counter-clockwise seen from above, as views do."""
+    sun_elevation: float = 45.0
     """Height of the sun above the horizon in degrees."""
     ambient_strength: float = 1.0
-    """Strength of the light that comes from everywhere: at 1, without sun, a white matt surface is just white. Scales an HDRI too."""
+    """Strength of the light from everywhere: at 1, without sun, an open white matt surface is just white. Scales an HDRI too."""
     hdri: Path | None = None
     """Panorama (.hdr or .exr) that lights the tree in place of even white; set the sun's strength to 0 when it has its own sun."""
     device: Device = "cpu"
@@ -47,8 +47,8 @@ class ViewsConfig:
     seed: int = 0
     """Seeds the noise of the renders and the choice of test views."""
     axis: Axis = "auto"
-    """Vertical line that the cameras circle: through the file's origin, through the centre of the tree's bounding box, or (auto) through
-    the origin where that lies inside the bounding box seen from above, as with a trunk that stands there, else through the centre."""
+    """Vertical line that the cameras circle: through the file's origin, or through the centre of the tree's bounding box. Auto takes the
+    origin where it lies inside the bounding box seen from above, as where the trunk stands on it, else the centre."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.elevations, tuple | list) or not self.elevations:

@@ -51,7 +51,8 @@ class Blender:
             env=environment,
             start_new_session=True,  # an interrupt from the keyboard is the parent's to handle
         )
-        threading.Thread(target=self._listen, args=(events,), daemon=True).start()
+        self._listener = threading.Thread(target=self._listen, args=(events,), daemon=True)
+        self._listener.start()
         self.send(job)
 
     @property
@@ -71,8 +72,11 @@ class Blender:
     def _listen(self, events: queue.Queue[tuple[Blender, dict[str, Any]]]) -> None:
         assert self._process.stdout
         for line in self._process.stdout:
-            event = json.loads(line)
-            event["payload"] = self._process.stdout.read(event["payload"])
+            event = json.loads(line) if line.endswith(b"\n") else {"payload": -1}
+            length = event["payload"]
+            event["payload"] = self._process.stdout.read(max(length, 0))
+            if len(event["payload"]) != length:
+                break  # the process died in the middle of a message
             events.put((self, event))
         events.put((self, {"event": "exit"}))
 
@@ -89,7 +93,8 @@ class Blender:
         """End the process now."""
         self._process.kill()
         self._process.wait()
-        for stream in (self._process.stdin, self._log):
+        self._listener.join()
+        for stream in (self._process.stdin, self._process.stdout, self._log):
             try:
                 assert stream
                 stream.close()

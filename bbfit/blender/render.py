@@ -30,6 +30,9 @@ __all__ = ["REQUEST_FILE", "BlenderError", "render_views"]
 REQUEST_FILE = "views.json"
 # What may differ between two starts on one folder: it changes how long the pictures take, not what they show.
 _FREE = ("workers", "device")
+# Cycles' pixel filter (Blackman-Harris, width 1.5, of which Cycles makes 3) spreads a surface 1.5 pixels about a pixel's centre: what keeps
+# this many pixels from the picture's edge leaves its outermost pixels empty.
+_FILTER_REACH = 2.0
 
 
 def render_views(
@@ -41,10 +44,10 @@ def render_views(
 ) -> Path:
     """Render views of a tree with Blender's Cycles.
 
-    Writes ``images/0000.png`` and so on (straight-alpha RGBA), ``transforms_train.json``, ``transforms_test.json`` and ``views.json``
-    (what was asked and what was found of the tree; ``"complete": true`` when all is there). The transforms are written last, so a
-    half-finished folder has none. Every vertex is in every picture. Started again with the same tree and the same settings, other
-    than workers and device, the views that are still missing or damaged are rendered, and no others.
+    Writes ``images/0000.png`` and so on (straight-alpha RGBA), ``transforms_train.json``, ``transforms_test.json`` and
+    ``views.json`` (what was asked and what was found of the tree; ``"complete": true`` when all is there). The transforms are
+    written last, so a half-finished folder has none. Every vertex is in every picture. Started again with the same tree and the
+    same settings, other than workers and device, it renders the views that are still missing or damaged, and no others.
 
     Parameters
     ----------
@@ -59,8 +62,8 @@ def render_views(
     Raises
     ------
     MissingFileError, InputError
-        if the tree cannot be used, if ``out`` holds other views or cannot be written to, or if there is no Blender. Earlier views are
-        left as they were.
+        if the tree cannot be used, if ``out`` holds other views or cannot be written to, or if there is no Blender. Earlier views
+        are left as they were.
     BlenderError
         if Blender crashes again and again; finished views are kept.
     """
@@ -188,6 +191,7 @@ def _cameras(points: NDArray[np.float64], config: ViewsConfig) -> tuple[Camera, 
         width=config.size,
         height=config.size,
         fov_x_degrees=None if config.orthographic else config.fov_degrees,
+        margin=max(0.02, _FILTER_REACH / config.size),
     )
     return camera, target, float((camera.position[0] - target).norm())
 
@@ -213,7 +217,7 @@ def _job(tree: Path, config: ViewsConfig, frames: int) -> dict[str, Any]:
 def _frames(
     camera: Camera, points: NDArray[np.float64], config: ViewsConfig, paths: list[Path], indices: list[int]
 ) -> list[dict[str, Any]]:
-    """What the worker needs for each picture; Blender's cameras have the axes of the NeRF-synthetic layout's, its world is Z up too."""
+    """What the worker needs for each picture; Blender's camera axes and its Z-up world are those of the NeRF-synthetic layout."""
     matrices = camera_to_nerf(camera.world_to_camera)
     reach = np.linalg.norm(points[:, None] - camera.position[0].numpy(), axis=-1).max() + 2 * np.ptp(points, axis=0).sum()
     return [

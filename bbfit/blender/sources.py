@@ -44,9 +44,9 @@ def check_tree(tree: str | Path) -> list[Path]:
     Raises
     ------
     MissingFileError, InputError
-        if the file, or one that a glTF refers to, is missing; if the file is empty, of an unknown format, or a damaged glTF; if a
-        glTF refers to a file outside its folder; if a glTF or PLY holds vertices that are NaN or infinite, which Blender's importers
-        of these two silently move to the origin.
+        if the file, or one that a glTF refers to, is missing; if the file is empty, of an unknown format, or a damaged glTF; if
+        a glTF refers to a file outside its folder; if a glTF or PLY holds vertices that are NaN or infinite, which Blender's
+        importers of these two silently replace by 0.
     """
     path = check_file("tree", tree)
     ending = path.suffix.lower()
@@ -183,14 +183,14 @@ def _ply_positions(data: bytes) -> NDArray[np.floating] | None:
     body = body.lstrip(b"\r").removeprefix(b"\n")
     try:
         if encoding == "ascii":
-            rows = [line.split() for line in body.splitlines()[: int(count)]]
-            return np.array([[float(row[names.index(axis)]) for axis in "xyz"] for row in rows]).reshape(-1, 3)
+            words = [line.split() for line in body.splitlines()[: int(count)]]
+            return np.array([[float(row[names.index(axis)]) for axis in "xyz"] for row in words]).reshape(-1, 3)
         order = ">" if encoding == "binary_big_endian" else "<"
         layout = np.dtype([(name, order + _PLY_TYPES[kind]) for kind, name in properties])
         rows = np.frombuffer(body, layout, int(count))
     except (ValueError, IndexError):
         return None
-    return np.stack([rows[axis].astype(np.float64) for axis in "xyz"], -1)
+    return np.stack([np.asarray(rows[axis], np.float64) for axis in "xyz"], -1)
 
 
 def _check_finite(path: Path, positions: NDArray[np.floating] | None) -> None:

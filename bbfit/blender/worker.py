@@ -1,11 +1,11 @@
 """Runs in a process of its own, as the only importer of bpy: loads one tree, measures it, renders the frames that it is told to.
 
-It is started by path and knows nothing of bbfit, so that it starts fast. It speaks JSON lines: on standard input one job, then one line a
-frame; on standard output ``ready`` (followed by the vertices as raw float32, if the job asks for them), ``done`` a frame, or ``refused``
-with the reason. What Blender itself prints goes to standard error. When standard input ends, because the parent closed it or died, so
-does this process, in the middle of a render if need be.
+It is started by path and knows nothing of bbfit, so that it starts fast. It speaks JSON lines: on standard input one job, then one
+line a frame; on standard output ``ready`` (followed by the vertices as raw float32, if the job asks for them), ``done`` a frame, or
+``refused`` with the reason. What Blender itself prints goes to standard error. When standard input ends, because the parent closed it
+or died, so does this process, in the middle of a render if need be.
 
-One process renders one frame at a time, never two scenes: two renders at once crash Blender.
+One process renders one frame at a time and never two scenes: two renders at once crash Blender.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def load(path: str) -> None:
         ".usd": lambda: bpy.ops.wm.usd_import(filepath=path, validate_meshes=False),
         ".blend": lambda: append_scene(path),
     }
-    importers |= {".gltf": importers[".glb"]} | dict.fromkeys((".usda", ".usdc", ".usdz"), importers[".usd"])
+    importers |= {".gltf": importers[".glb"]} | dict.fromkeys([".usda", ".usdc", ".usdz"], importers[".usd"])
     bpy.ops.wm.read_factory_settings(use_empty=True)
     try:
         importers[ending]()
@@ -209,10 +209,10 @@ def add_plain_material() -> None:
         if found.type not in SURFACES or found.data is None:
             continue
         if not found.material_slots:
-            found.data.materials.append(None)
+            found.data.materials.append(None)  # a slot
         for slot in found.material_slots:
             if slot.material is None:
-                colours = getattr(found.data, "color_attributes", ())
+                colours = getattr(found.data, "color_attributes", [])
                 slot.material = plain_material(colours[0].name if len(colours) else "")
     bpy.context.view_layer.update()
 
@@ -228,7 +228,6 @@ def plain_material(attribute: str) -> Any:
     material.use_nodes = True
     surface = material.node_tree.nodes["Principled BSDF"]
     surface.inputs["Roughness"].default_value = 1.0
-    surface.inputs["Specular IOR Level"].default_value = 0.0
     surface.inputs["Base Color"].default_value = (0.5, 0.5, 0.5, 1.0)
     if attribute:
         node = material.node_tree.nodes.new("ShaderNodeVertexColor")

@@ -29,6 +29,7 @@ class Quads:
     culled: NDArray[np.bool_]
     """Whether only the side that the normal points to is shown, [Q]; the other quads show the same from both sides."""
     atlas: Atlas
+    """The textures: per billboard the front, then the back if there is one."""
 
     def triangles(self, chosen: NDArray[np.intp]) -> NDArray[np.int64]:
         """Vertex indices of the chosen quads' triangles, [2 * len(chosen), 3], counting their corners only."""
@@ -38,9 +39,13 @@ class Quads:
 def cloud_quads(cloud: BillboardCloud, padding: int) -> Quads:
     """Quads and atlas that any renderer with bilinear filtering shows as :func:`~bbfit.rendering.reference.render_reference` does.
 
-    A billboard's picture fades to transparent over one texel beyond its outermost texel centres, half a texel beyond its rectangle.
-    So each quad is half a texel larger than its rectangle on every side, and reaches to the centres of the padding texels around its
-    texture. A two-sided billboard gives two quads at the same place, front and back, of opposite winding.
+    A billboard's picture fades to transparent over one texel beyond its outermost texel centres, so half a texel beyond its
+    rectangle. Each quad is half a texel larger than its rectangle on every side and reaches to the centres of the padding texels
+    around its texture. A two-sided billboard gives two quads at the same place, front and back, of opposite winding.
+
+    Textures are rounded to 8 bits, which moves a premultiplied colour by at most 1/255 a layer. Transparent texels change their
+    colour (:func:`~bbfit.exporting.atlas.fill_cell`); that shows within a texel of the silhouette, by at most 1/4 a layer, where they
+    had another colour before. Alpha is not touched by it.
 
     Raises
     ------

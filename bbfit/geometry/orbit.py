@@ -13,7 +13,6 @@ from torch import Tensor
 from bbfit.checks import check_count, check_range, fail
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinhole_intrinsics
 
-
 # No vertex is nearer to a camera, and no orthographic image narrower, than this share of the tree's radius.
 NEAREST = 1e-3
 

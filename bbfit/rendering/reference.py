@@ -34,7 +34,7 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
     cameras = camera.batch().to(cloud.texels.dtype)
     views, height, width = len(cameras), cameras.height, cameras.width
     if len(cloud) == 0:
-        image = torch.zeros(views, height, width, 4, dtype=cloud.texels.dtype, device=cloud.texels.device)
+        image = cloud.texels.new_zeros(views, height, width, 4) + cloud.texels.sum()  # of no texels, so that backward() works
         return image if camera.batched else image[0]
 
     distance = signed_distance(cloud, cameras).detach()  # [V, N]
@@ -66,8 +66,9 @@ def _warp(sources: Tensor, matrices: Tensor, height: int, width: int) -> Tensor:
 
     On the horizon of a plane the texel lies at infinity. Where that line runs exactly through a pixel's centre (a plane parallel to
     the optical axis and an image of odd width will do) kornia divides by zero, and one such pixel makes the plane's whole gradient
-    NaN. Such a plane is moved by about a millionth of the image, which is what float32 resolves.
+    NaN. Such a plane is moved by a few roundings of a pixel's coordinate, in float32 by a millionth of the image.
     """
+    eps = torch.finfo(matrices.dtype).eps
     for _ in range(NUDGES):
         warped = warp_perspective(
             sources, matrices, (height, width), mode="bilinear", padding_mode="zeros", align_corners=True
@@ -76,7 +77,7 @@ def _warp(sources: Tensor, matrices: Tensor, height: int, width: int) -> Tensor:
         if not broken.any():
             break
         nudge = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
-        nudge[0, 2], nudge[1, 2] = 1.1e-6 * width, 0.7e-6 * height
+        nudge[0, 2], nudge[1, 2] = 10 * eps * width, 7 * eps * height
         matrices = torch.where(broken[:, None, None], nudge @ matrices, matrices)
     return warped
 

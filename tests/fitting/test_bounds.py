@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from bbfit.fitting.bounds import facing, facing_view_bounds, silhouette_bounds
+
+from bbfit.fitting.bounds import facing, facing_view_bounds
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
 from bbfit.geometry.camera import convergence_point

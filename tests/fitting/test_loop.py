@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+
 from bbfit.checks import InputError
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import FitResult, Step, draw_views, fit, learning_rate

@@ -5,6 +5,7 @@ from __future__ import annotations
 import kornia
 import pytest
 import torch
+
 from bbfit.fitting.losses import image_loss, structural_similarity
 
 

@@ -1,0 +1,37 @@
+"""A tiny scene with a known answer: two crossing billboards, and a views folder that holds exactly what they look like."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from bbfit.geometry.cloud import BillboardCloud, even_upright
+from bbfit.geometry.orbit import Orbit
+from bbfit.images import to_bytes, unpremultiply, write_png
+from bbfit.layout import write_transforms
+from bbfit.rendering.dispatch import render
+from bbfit.views import ViewDataset
+
+
+def crossing_billboards(count: int = 2) -> BillboardCloud:
+    """Upright billboards of 2 x 3 metres with blotches of random colour and alpha, float32."""
+    cloud = even_upright(
+        count,
+        axis=torch.tensor([0.0, 1.5, 0.0]),
+        half_extents=torch.tensor([1.0, 1.5]),
+        texture_sizes=torch.tensor([12, 8]),
+    )
+    return cloud.with_texels(torch.rand(cloud.texels.shape, generator=torch.Generator().manual_seed(1)))
+
+
+def write_views(folder: Path, cloud: BillboardCloud, *, count: int = 8, width: int = 40, height: int = 32) -> ViewDataset:
+    """Render views at azimuths k * 360 / count into a folder; every other one, from the first, is a test view."""
+    corners = torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (0.0, 3.0) for z in (-1.0, 1.0)])
+    target = torch.tensor([0.0, 1.5, 0.0], dtype=torch.float64)
+    camera = Orbit(count).frame(corners.double().numpy(), target=target, width=width, height=height)
+    for index, image in enumerate(render(cloud, camera)):
+        write_png(folder / f"{index:04d}.png", to_bytes(unpremultiply(image)))
+    names = [f"{index:04d}.png" for index in range(count)]
+    write_transforms(folder, camera, names, list(range(1, count, 2)), list(range(0, count, 2)))
+    return ViewDataset.load(folder)

@@ -1,0 +1,180 @@
+"""The billboard cloud: its layout in memory, its file, and the thesis's even arrangement."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from bbfit.checks import InputError, MissingFileError
+from bbfit.geometry.cloud import FORMAT, BillboardCloud, even_upright
+
+
+def small_cloud(dtype: torch.dtype = torch.float32) -> BillboardCloud:
+    """Two billboards, one of them two-sided, with random texels."""
+    cloud = even_upright(
+        2,
+        axis=torch.tensor([0.1, 2.0, -0.3], dtype=dtype),
+        half_extents=torch.tensor([[1.0, 2.0], [0.5, 0.25]], dtype=dtype),
+        texture_sizes=torch.tensor([[3, 2], [4, 5]]),
+    )
+    cloud = replace(cloud, two_sided=torch.tensor([False, True]), texels=torch.zeros(6 + 40, 4, dtype=dtype))
+    return cloud.with_texels(torch.rand(46, 4, generator=torch.Generator().manual_seed(0), dtype=dtype))
+
+
+def test_textures_are_views_into_the_texels_in_order() -> None:
+    cloud = small_cloud()
+    first, second = cloud.textures()
+    assert first.shape == (1, 3, 2, 4) and second.shape == (2, 4, 5, 4)
+    assert torch.equal(torch.cat([first.reshape(-1, 4), second[0].reshape(-1, 4), second[1].reshape(-1, 4)]), cloud.texels)
+    second[1, 3, 4] = 0.5
+    assert (cloud.texels[-1] == 0.5).all()
+
+
+def test_counts() -> None:
+    cloud = small_cloud()
+    assert len(cloud) == 2 and cloud.vertex_count == 4 * 3
+
+
+def test_dtype_conversion_leaves_whole_numbers_alone() -> None:
+    cloud = small_cloud().to(torch.float64)
+    kinds = {field.name: getattr(cloud, field.name).dtype for field in fields(cloud)}
+    assert kinds.pop("texture_sizes") == torch.int64 and kinds.pop("two_sided") == torch.bool
+    assert set(kinds.values()) == {torch.float64}
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
+def test_upright_billboards_stand_evenly_around_the_axis(count: int) -> None:
+    axis = torch.tensor([1.0, 2, 3], dtype=torch.float64)
+    cloud = even_upright(count, axis=axis, half_extents=torch.ones(2).double(), texture_sizes=torch.tensor([2, 3]))
+    azimuth = torch.atan2(cloud.normals[:, 0], cloud.normals[:, 2])  # 0 faces +Z, 90 degrees faces +X
+    assert torch.allclose(azimuth * 180 / math.pi, torch.arange(count).double() * 180 / count)
+    assert (cloud.ups == torch.tensor([0.0, 1, 0])).all() and (cloud.rights[:, 1] == 0).all()
+    assert torch.allclose(cloud.rights.norm(dim=-1), torch.ones(count).double())
+    assert (cloud.centers == axis).all() and (cloud.texels == 0).all() and len(cloud.texels) == 6 * count
+    assert cloud.vertex_count == 4 * count
+
+
+def test_two_sided_billboards_own_two_textures() -> None:
+    cloud = even_upright(3, axis=torch.zeros(3), half_extents=torch.ones(2), texture_sizes=torch.tensor([2, 3]), sides="two")
+    assert cloud.two_sided.all() and len(cloud.texels) == 36 and cloud.vertex_count == 24
+
+
+def test_a_pair_stands_a_gap_apart_along_the_normal() -> None:
+    half_extents = torch.tensor([[1.0, 2], [3, 4]])
+    axis = torch.tensor([1.0, 2, 3])
+    cloud = even_upright(2, axis=axis, half_extents=half_extents, texture_sizes=torch.tensor([2, 3]), sides="pair", gap=0.5)
+    assert len(cloud) == 4 and not cloud.two_sided.any() and cloud.vertex_count == 16
+    assert torch.equal(cloud.half_extents, half_extents[[0, 0, 1, 1]])
+    expected = torch.tensor([[0, 0, 0.25], [0, 0, -0.25], [0.25, 0, 0], [-0.25, 0, 0]])
+    assert torch.allclose(cloud.centers - axis, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(("count", "sides"), [(0, "one"), (-1, "one"), (2.0, "one"), (True, "one"), (2, "both")])
+def test_bad_arrangements_are_refused(count: int, sides: str) -> None:
+    with pytest.raises(InputError, match="expected"):
+        even_upright(count, axis=torch.zeros(3), half_extents=torch.ones(2), texture_sizes=torch.tensor([2, 3]), sides=sides)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("centers", torch.zeros(3)),
+        ("centers", torch.zeros(3, 3)),
+        ("ups", torch.zeros(2, 2)),
+        ("texels", torch.zeros(45, 4)),
+        ("texels", torch.zeros(46, 3)),
+        ("texture_sizes", torch.tensor([[3, 2], [0, 5]])),
+        ("texture_sizes", torch.tensor([[3.0, 2], [4, 5]])),
+        ("two_sided", torch.tensor([0, 1])),
+    ],
+)
+def test_inconsistent_tensors_are_refused(name: str, value: torch.Tensor) -> None:
+    with pytest.raises(InputError, match="expected"):
+        replace(small_cloud(), **{name: value})
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_file_gives_back_the_same_bits(tmp_path: Path, dtype: torch.dtype) -> None:
+    cloud, path = small_cloud(dtype), tmp_path / "cloud.safetensors"
+    replace(cloud, texels=cloud.texels.requires_grad_()).save(path)
+    loaded = BillboardCloud.load(path)
+    for field in fields(cloud):
+        before, after = getattr(cloud, field.name).detach(), getattr(loaded, field.name)
+        assert before.dtype == after.dtype and torch.equal(before, after)
+    assert [p.name for p in tmp_path.iterdir()] == ["cloud.safetensors"]
+
+
+def test_tensors_that_share_memory_or_are_strided_are_saved(tmp_path: Path) -> None:
+    cloud, path = small_cloud(), tmp_path / "cloud.safetensors"
+    both = torch.rand(2, 3, 2)
+    shared = replace(cloud, centers=both[..., 0], rights=both[..., 1], ups=both[..., 1])
+    shared.save(path)
+    assert torch.equal(BillboardCloud.load(path).ups, both[..., 1])
+
+
+def test_an_empty_cloud_is_saved(tmp_path: Path) -> None:
+    empty = BillboardCloud(
+        *(torch.zeros(0, n) for n in (3, 3, 3, 2)),
+        torch.zeros(0, 2, dtype=torch.int64),
+        torch.zeros(0, dtype=torch.bool),
+        torch.zeros(0, 4),
+    )
+    empty.save(tmp_path / "cloud.safetensors")
+    assert len(BillboardCloud.load(tmp_path / "cloud.safetensors")) == 0
+
+
+def test_a_failed_save_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "cloud.safetensors"
+    small_cloud().save(path)
+    before = path.read_bytes()
+
+    def full_disk(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        small_cloud(torch.float64).save(path)
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def tensors_of(cloud: BillboardCloud) -> dict[str, torch.Tensor]:
+    return {field.name: getattr(cloud, field.name) for field in fields(cloud)}
+
+
+def test_unusable_files_are_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.safetensors"
+    good, known = tensors_of(small_cloud()), {"format": FORMAT}
+    with pytest.raises(MissingFileError, match=r"cloud\.safetensors"):
+        BillboardCloud.load(path)
+    small_cloud().save(path)
+    whole = path.read_bytes()
+
+    damaged: list[bytes] = [b"", b"{}", b"\0" * 64, whole[:5], whole[:100], whole[:-1], b"\x89PNG" + whole[4:]]
+    for data in damaged:
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=r"cloud\.safetensors"):
+            BillboardCloud.load(path)
+
+    nan = good["texels"].clone()
+    nan[3, 1] = torch.nan
+    foreign = [
+        (good, None),
+        (good, {"format": "another"}),
+        ({k: v for k, v in good.items() if k != "ups"}, known),
+        (good | {"texels": nan}, known),
+        (good | {"texels": torch.zeros(3, 4)}, known),
+        (good | {"texture_sizes": torch.tensor([[3, 2], [-4, 5]])}, known),
+        (good | {"texture_sizes": torch.rand(2, 2)}, known),
+        (good | {"centers": torch.tensor(1.0)}, known),
+    ]
+    for tensors, metadata in foreign:
+        save_file(tensors, path, metadata)
+        with pytest.raises(InputError, match=r"cloud\.safetensors.*bbfit fit"):
+            BillboardCloud.load(path)
+    with pytest.raises(InputError, match="not a file"):
+        BillboardCloud.load(tmp_path)

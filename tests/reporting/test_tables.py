@@ -1,0 +1,41 @@
+"""The table on the screen."""
+
+from __future__ import annotations
+
+import pytest
+from rich.console import Console
+
+from bbfit.evaluation.report import Cost, Measures, OverWhite, Report, Rgba, ThesisScale, ViewScore
+from bbfit.reporting.tables import report_table
+
+MEASURES = Measures(
+    OverWhite(21.234, 0.8125, 0.1061), Rgba(0.0712, 23.456, 0.7345), ThesisScale(2.24e-5, 0.9999966, 92.605, 17.28), 0.9, None
+)
+REPORT = Report(
+    (ViewScore("0000", 0, 0, MEASURES), ViewScore("0001", 90, 0, MEASURES)),
+    Cost(32, 10_525_153),
+    Cost(123_456, None),
+    {"views": 1234.56, "fit": 60, "export": 0.4, "evaluate": 15.04},
+)
+
+
+@pytest.mark.parametrize("width", [80, 100])
+def test_every_figure_is_there_and_nothing_is_cut(width: int) -> None:
+    console = Console(width=width)
+    with console.capture() as capture:
+        console.print(report_table(REPORT, "willow"))
+    text = capture.get()
+    for figure in (
+        "willow: mean of 2", "21.23", "23.46", "92.605", "0.0712", "2.24e-05", "0.8125", "0.9999966", "17.280", "0.1061", "0.7345",
+        "0.900", "10,525,153", "0.000304 %", "123,456", "views 1,234.6", "evaluate 15.0",
+    ):  # fmt: skip
+        assert figure in text, figure
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= width
+    rows = {line.split("  ")[0].strip(): line for line in text.splitlines()}
+    assert "↑" in rows["PSNR, dB"] and "↓" in rows["FLIP"] and "→ 1" in rows["sharpness"]
+    assert rows["brightness"].rstrip().endswith("-") and "None" not in text
+
+
+def test_one_view() -> None:
+    assert report_table(Report(REPORT.views[:1])).title == "Held-out views: one view"

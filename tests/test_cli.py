@@ -1,0 +1,159 @@
+"""The command line: exit codes, one clear line for bad input, options plain and nested."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bbfit.cli import main
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import write_png
+
+QUICK = ["--billboards", "2", "--steps", "3"]
+
+
+@pytest.fixture(scope="module")
+def fitted(views_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("cli") / "fit"
+    assert main(["fit", str(views_folder), "--out", str(out), *QUICK]) == 0
+    return out
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """Run a command that must fail for bad input, and return the one line that it says."""
+    capsys.readouterr()
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("bbfit: ") and not captured.out
+    return lines[0]
+
+
+@pytest.mark.parametrize("command", [[], ["run"], ["views"], ["fit"], ["evaluate"], ["export"]])
+def test_help_shows_defaults_and_needs_no_torch(command: list[str]) -> None:
+    script = (
+        "import sys; from bbfit.cli import main\n"
+        "try: main(sys.argv[1:])\n"
+        "finally: print('torch' in sys.modules, 'cv2' in sys.modules, file=sys.stderr)"
+    )
+    result = subprocess.run([sys.executable, "-c", script, *command, "--help"], capture_output=True, text=True)
+    assert result.returncode == 0 and result.stderr.split() == ["False", "False"]
+    assert "usage" in result.stdout
+    assert not command or command == ["evaluate"] or "default:" in result.stdout
+
+
+def test_fit_writes_what_run_writes_for_the_same_views(views_folder: Path, fitted: Path, tmp_path: Path) -> None:
+    nested = ["--fit.billboards", "2", "--fit.steps", "3"]
+    assert main(["run", str(views_folder), "--out", str(tmp_path), *nested]) == 0
+    for name in ("cloud.safetensors", "model.glb", "model.obj"):
+        assert (tmp_path / name).read_bytes() == (fitted / name).read_bytes()
+
+
+def test_evaluate_writes_and_shows_the_measures(
+    fitted: Path, views_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "again.json"
+    assert main(["evaluate", str(fitted / "cloud.safetensors"), str(views_folder), "--out", str(path)]) == 0
+    again, before = json.loads(path.read_text()), json.loads((fitted / "metrics.json").read_text())
+    assert again["views"] == before["views"]
+    assert f"{before['over_white']['psnr']:.2f}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["tree.glb", "tree.obj"])
+def test_export(fitted: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(fitted / "cloud.safetensors"), "--out", str(tmp_path / name), "--alpha", "mask"]) == 0
+    assert name in capsys.readouterr().out.replace("\n", "")
+    assert (tmp_path / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["fit", "{tmp}/none", "--out", "{tmp}/o"], "does not exist"),
+        (["fit", "{tmp}", "--out", "{tmp}/o"], "no transforms_train.json"),
+        (["fit", "{views}", "--out", "{tmp}/o", "--billboards", "0"], "at least 1"),
+        (["fit", "{views}", "--out", "{views}/transforms_train.json"], "is a file"),
+        (["run", "{tmp}/none.glb", "--out", "{tmp}/o"], "none.glb"),
+        (["run", "{tmp}/empty.glb", "--out", "{tmp}/o"], "is empty"),
+        (["run", "{tmp}/tree.docx", "--out", "{tmp}/o"], ".glb"),
+        (["views", "{tmp}/none.glb", "--out", "{tmp}/o"], "none.glb"),
+        (["evaluate", "{tmp}/none.safetensors", "{views}"], "none.safetensors"),
+        (["evaluate", "{tmp}/tree.docx", "{views}"], "tree.docx"),
+        (["export", "{cloud}", "--out", "{tmp}/model.stl"], ".glb or .obj"),
+        (["export", "{cloud}", "--out", "{tmp}/nowhere/model.glb"], "nowhere"),
+        (["export", "{tmp}/empty.glb", "--out", "{tmp}/model.glb"], "empty.glb"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    arguments: list[str], says: str, views_folder: Path, fitted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "empty.glb").touch()
+    (tmp_path / "tree.docx").write_text("not a tree")
+    places = {"tmp": tmp_path, "views": views_folder, "cloud": fitted / "cloud.safetensors"}
+    assert says in refused([part.format(**places) for part in arguments], capsys)
+    assert not (tmp_path / "o" / "cloud.safetensors").exists()
+
+
+def test_a_view_without_content_is_named(views_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    views = Path(shutil.copytree(views_folder, tmp_path / "views"))
+    for picture in (views / "images").iterdir():
+        write_png(picture, np.zeros((40, 48, 4), np.uint8))
+    assert "fully transparent" in refused(["fit", str(views), "--out", str(tmp_path / "out"), *QUICK], capsys)
+
+
+@pytest.mark.parametrize(
+    "arguments", [["grow-wings"], ["fit"], ["fit", "x", "--out", "y", "--steps", "many"], ["run", "--fit.no-such", "1"]]
+)
+def test_unknown_options_are_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert capsys.readouterr().err
+
+
+def test_a_fault_of_ours_is_exit_code_1(views_folder: Path, tmp_path: Path) -> None:
+    script = "import sys, bbfit.cli as cli, bbfit.pipeline as p\np.run = lambda *a, **k: 1 / 0\nsys.exit(cli.main(sys.argv[1:]))"
+    command = [sys.executable, "-c", script, "fit", str(views_folder), "--out", str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 1 and "ZeroDivisionError" in result.stderr
+
+
+def test_a_disk_that_fills_up_leaves_the_earlier_model(fitted: Path, tmp_path: Path) -> None:
+    """A limit on file size makes a real write fail half-way, as a full disk does."""
+    model = tmp_path / "model.glb"
+    model.write_bytes(b"earlier")
+    script = "import sys; from bbfit.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", script, "export", str(fitted / "cloud.safetensors"), "--out", str(model)]
+    limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))  # noqa: E731
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+    result = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit, env=environment)
+    assert result.returncode == 2, result.stderr
+    assert result.stderr.startswith("bbfit: ") and len(result.stderr.strip().splitlines()) == 1
+    assert model.read_bytes() == b"earlier" and [path.name for path in tmp_path.iterdir()] == ["model.glb"]
+
+
+def test_a_run_killed_outright_goes_on(views_folder: Path, tmp_path: Path) -> None:
+    """SIGKILL in the middle of the fit; the same command ends with the result of an unbroken run."""
+    script = "import sys; from bbfit.cli import main; sys.exit(main(sys.argv[1:]))"
+    options = ["--billboards", "2", "--steps", "120", "--checkpoint-every", "10"]
+    command = [sys.executable, "-c", script, "fit", str(views_folder), *options, "--out"]
+    one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}  # as this process, so that the results are equal to the bit
+    process = subprocess.Popen([*command, str(tmp_path / "broken")], stderr=subprocess.DEVNULL, env=one_thread)
+    while not (tmp_path / "broken" / "fit.checkpoint").exists():
+        assert process.poll() is None, "the fit ended before it was killed"
+    process.kill()
+    process.wait()
+    assert not (tmp_path / "broken" / "cloud.safetensors").exists()
+    for name in ("broken", "whole"):
+        assert main(["fit", str(views_folder), *options, "--out", str(tmp_path / name)]) == 0
+    whole, broken = (BillboardCloud.load(tmp_path / name / "cloud.safetensors") for name in ("whole", "broken"))
+    assert torch.equal(whole.texels, broken.texels)

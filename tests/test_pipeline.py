@@ -1,0 +1,127 @@
+"""The main job on a folder of views: everything is written, nothing is done twice, a kill costs little."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from bbfit.checks import InputError
+from bbfit.exporting.config import ExportConfig
+from bbfit.fitting.config import FitConfig
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import read_rgba
+from bbfit.pipeline import RunConfig, RunResult, run
+
+CONFIG = RunConfig(fit=FitConfig(billboards=2, steps=20, checkpoint_every=5))
+FILES = ("cloud.safetensors", "comparison.png", "loss.csv", "loss.png", "metrics.json", "run.json")
+MODELS = ("model.glb", "model.mtl", "model.obj", "model.png")
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.fixture(scope="module")
+def done(views_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    return run(views_folder, tmp_path_factory.mktemp("runs") / "new" / "run", CONFIG)
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def test_everything_is_written(done: RunResult) -> None:
+    assert sorted(path.name for path in done.folder.iterdir()) == sorted([*FILES, *MODELS])
+    assert done.skipped == ()
+    metrics = json.loads((done.folder / "metrics.json").read_text())
+    assert set(metrics) >= {"over_white", "rgba", "thesis_scale", "vertices", "bytes", "seconds", "views"}
+    assert metrics["vertices"]["model"] == done.cloud.vertex_count == 8
+    assert metrics["bytes"]["model"] == (done.folder / "model.glb").stat().st_size
+    assert set(metrics["seconds"]) == {"fit", "export", "evaluate"}
+    assert len(metrics["views"]) == 4
+    assert torch.equal(BillboardCloud.load(done.folder / "cloud.safetensors").texels, done.cloud.texels)
+    assert len((done.folder / "loss.csv").read_text().splitlines()) == 21
+    assert read_rgba(done.folder / "model.png").shape[2] == 4
+
+
+def test_record_holds_the_resolved_configuration(done: RunResult) -> None:
+    record = json.loads((done.folder / "run.json").read_text())
+    assert record["config"]["fit"]["learning_rate"] == 0.05 and record["config"]["fit"]["bounds"] == "silhouette"
+    assert record["seeds"] == {"views": 0, "fit": 0}
+    assert {"bbfit", "torch", "kornia", "python"} <= set(record["versions"])
+    assert set(record["stages"]) == {"fit", "export", "evaluate"}
+
+
+def test_nothing_is_done_twice(views_folder: Path, done: RunResult) -> None:
+    before, told = snapshot(done.folder), []
+    again = run(views_folder, done.folder, CONFIG, on_progress=lambda *event: told.append(event))
+    assert again.skipped == ("fit", "export", "evaluate") and told == []
+    assert again.report == done.report
+    assert snapshot(done.folder) == before
+
+
+def test_only_what_depends_on_a_change_is_done_again(views_folder: Path, tmp_path: Path, done: RunResult) -> None:
+    run(views_folder, tmp_path, CONFIG)
+    masked = dataclasses.replace(CONFIG, export=ExportConfig(alpha="mask"))
+    assert run(views_folder, tmp_path, masked).skipped == ("fit",)
+    (tmp_path / "comparison.png").unlink()
+    assert run(views_folder, tmp_path, masked).skipped == ("fit", "export")
+    (tmp_path / "model.obj").write_text("spoilt")
+    assert "fit" in run(views_folder, tmp_path, masked).skipped
+    assert (tmp_path / "model.obj").read_text() != "spoilt"
+    other = dataclasses.replace(masked, fit=dataclasses.replace(CONFIG.fit, seed=1))
+    assert run(views_folder, tmp_path, other).skipped == ()
+    (tmp_path / "run.json").write_text("{")
+    assert run(views_folder, tmp_path, other).skipped == ()
+
+
+def test_a_killed_run_goes_on_to_the_same_result(views_folder: Path, tmp_path: Path, done: RunResult) -> None:
+    def kill(stage: str, index: int, total: int, note: str = "") -> None:
+        if stage == "fit" and index == 13:
+            raise Killed
+
+    with pytest.raises(Killed):
+        run(views_folder, tmp_path, CONFIG, on_progress=kill)
+    assert [path.name for path in tmp_path.iterdir()] == ["fit.checkpoint"]
+    steps = []
+    result = run(views_folder, tmp_path, CONFIG, on_progress=lambda stage, index, *rest: steps.append((stage, index)))
+    assert steps[0] == ("fit", 11)
+    assert torch.equal(result.cloud.texels, done.cloud.texels)
+    for name in ("cloud.safetensors", "loss.csv", *MODELS):
+        assert (tmp_path / name).read_bytes() == (done.folder / name).read_bytes()
+
+
+def test_bad_views_leave_earlier_results_as_they_were(views_folder: Path, tmp_path: Path, done: RunResult) -> None:
+    import shutil
+
+    views = shutil.copytree(views_folder, tmp_path / "views")
+    before = snapshot(done.folder)
+    picture = sorted((views / "images").iterdir())[-1]
+    picture.write_bytes(picture.read_bytes()[:200])
+    with pytest.raises(InputError, match=picture.name):
+        run(views, done.folder, CONFIG)
+    assert snapshot(done.folder) == before
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_a_bad_picture_of_either_split_is_found_before_the_fit(views_folder: Path, tmp_path: Path, split: str) -> None:
+    import shutil
+
+    views = Path(shutil.copytree(views_folder, tmp_path / "views"))
+    name = json.loads((views / f"transforms_{split}.json").read_text())["frames"][-1]["file_path"] + ".png"
+    (views / name).write_bytes((views / name).read_bytes()[:-5])
+    with pytest.raises(InputError, match="cut short"):
+        run(views, tmp_path / "out", CONFIG, on_progress=lambda *event: pytest.fail("work was begun"))
+
+
+def test_out_must_be_a_folder_that_can_be_written(views_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="is a file"):
+        run(views_folder, tmp_path / "file", CONFIG)
+    with pytest.raises(InputError, match="is a file"):
+        run(views_folder, tmp_path / "file" / "deeper", CONFIG)
+    assert (tmp_path / "file").read_text() == "mine"

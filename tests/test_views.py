@@ -1,0 +1,197 @@
+"""Views folders: bbfit's own, NeRF-synthetic scenes, nerfstudio's intrinsics, and broken ones."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from bbfit.checks import InputError, MissingFileError
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import premultiply, write_png
+from bbfit.rendering.reference import render_reference
+from bbfit.views import ViewDataset
+
+
+@pytest.fixture
+def folder(views_folder: Path, tmp_path: Path) -> Path:
+    """A copy of the views that a test may spoil."""
+    return Path(shutil.copytree(views_folder, tmp_path / "views"))
+
+
+def edit(folder: Path, change: Callable[[dict], None], names: tuple[str, ...] = ("train", "test")) -> None:
+    for name in names:
+        path = folder / f"transforms_{name}.json"
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+
+
+def test_cameras_and_pictures_survive_the_disk(views_folder: Path, known_cloud: BillboardCloud, ring: Camera) -> None:
+    views = ViewDataset.load(views_folder)
+    assert (len(views.train), len(views.test)) == (12, 4)
+    assert not set(views.train.paths) & set(views.test.paths)
+    for split in (views.train, views.test):
+        numbers = [int(name) for name in split.names]
+        torch.testing.assert_close(split.cameras.world_to_camera, ring.world_to_camera[numbers], atol=1e-12, rtol=0)
+        torch.testing.assert_close(split.cameras.intrinsics, ring.intrinsics[numbers], atol=1e-9, rtol=0)
+        assert split.images([0]).dtype == torch.uint8
+        image = render_reference(known_cloud, split.cameras)
+        # Straight colour and alpha are rounded to bytes: each is off by half a step, and so their product by at most one.
+        assert (split.targets(range(len(split))) - image).abs().max() < 1 / 255
+
+
+def test_nerf_synthetic_scene_without_intrinsics(folder: Path) -> None:
+    """`camera_angle_x` alone, other sizes than square: the same cameras, to rounding."""
+    expected = ViewDataset.load(folder).train.cameras
+
+    def strip(content: dict) -> None:
+        for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model"):
+            del content[key]
+
+    edit(folder, strip)
+    torch.testing.assert_close(ViewDataset.load(folder).train.cameras.intrinsics, expected.intrinsics, atol=1e-9, rtol=0)
+
+
+def test_nerfstudio_intrinsics_per_frame_and_for_another_size(folder: Path) -> None:
+    def change(content: dict) -> None:
+        for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x"):
+            content.pop(key, None)
+        for index, frame in enumerate(content["frames"]):
+            frame |= {"w": 96, "h": 80, "fl_x": 100.0 + index, "fl_y": 120.0, "cx": 48.0, "cy": 41.0}
+
+    edit(folder, change)
+    camera = ViewDataset.load(folder).train.cameras
+    assert (camera.width, camera.height) == (48, 40)
+    expected = torch.tensor([[50.5, 0, 23.5], [0, 60, 20.0], [0, 0, 1]], dtype=torch.float64)
+    torch.testing.assert_close(camera.intrinsics[1], expected)
+
+
+def test_one_file_without_split_gives_a_seeded_quarter(folder: Path) -> None:
+    train, test = (json.loads((folder / f"transforms_{name}.json").read_text()) for name in ("train", "test"))
+    (folder / "transforms_train.json").unlink()
+    (folder / "transforms_test.json").unlink()
+    (folder / "transforms.json").write_text(json.dumps(train | {"frames": train["frames"] + test["frames"]}))
+    first, again, other = (ViewDataset.load(folder, seed=seed) for seed in (0, 0, 5))
+    assert (len(first.train), len(first.test)) == (12, 4)
+    assert first.test.paths == again.test.paths != other.test.paths
+
+
+def test_pictures_in_memory_stay_within_the_bound(views_folder: Path) -> None:
+    one = 48 * 40 * 4
+    views = ViewDataset.load(views_folder, cache_bytes=3 * one)
+    pictures = [views.train.image(index).clone() for index in range(len(views.train))]
+    cache = views.train._cache
+    assert sum(picture.numel() for picture in cache._pictures.values()) == cache._held == 3 * one
+    assert all(torch.equal(views.train.image(index), picture) for index, picture in enumerate(pictures))
+
+
+def test_fingerprint_follows_content_not_place(views_folder: Path, folder: Path) -> None:
+    before = ViewDataset.load(views_folder).fingerprint
+    assert ViewDataset.load(folder).fingerprint == before
+    edit(folder, lambda content: content["frames"][0]["transform_matrix"][0].__setitem__(3, 9.0), ("train",))
+    assert ViewDataset.load(folder).fingerprint != before
+
+
+def first_picture(folder: Path) -> Path:
+    return next(iter(ViewDataset.load(folder).train.paths))
+
+
+def cut_short(folder: Path) -> None:
+    path = first_picture(folder)
+    path.write_bytes(path.read_bytes()[:-30])
+
+
+def drop_alpha(folder: Path) -> None:
+    path = first_picture(folder)
+    cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., :3])
+
+
+def make_transparent(folder: Path) -> None:
+    write_png(first_picture(folder), np.zeros((40, 48, 4), np.uint8))
+
+
+def make_smaller(folder: Path) -> None:
+    write_png(first_picture(folder), np.full((40, 40, 4), 255, np.uint8))
+
+
+def remove(folder: Path) -> None:
+    first_picture(folder).unlink()
+
+
+def scribble(folder: Path) -> None:
+    first_picture(folder).write_text("no picture")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (cut_short, "cut short"),
+        (drop_alpha, "no alpha"),
+        (make_transparent, "transparent"),
+        (make_smaller, "40x40"),
+        (remove, "does not exist"),
+        (scribble, "damaged"),
+    ],
+)
+def test_bad_pictures_are_named(folder: Path, spoil: Callable[[Path], None], says: str) -> None:
+    name = first_picture(folder).name
+    spoil(folder)
+    with pytest.raises(InputError, match=says) as caught:
+        ViewDataset.load(folder).train.check()
+    assert name in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda content: content.pop("frames"), "no list of frames"),
+        (lambda content: content["frames"][0].pop("file_path"), "no file_path"),
+        (lambda content: content["frames"][0].update(transform_matrix=[[1, 2], [3, 4]]), "4x4"),
+        (lambda content: content["frames"][0]["transform_matrix"][0].__setitem__(0, math.nan), "4x4"),
+        (lambda content: [content.pop(key) for key in ("fl_x", "camera_angle_x")], "camera_angle_x"),
+        (lambda content: content.update(fl_x="wide"), "fl_x"),
+        (lambda content: content.update(frames=[]), "0 training"),
+    ],
+)
+def test_bad_transforms_are_named(folder: Path, change: Callable[[dict], None], says: str) -> None:
+    edit(folder, change, ("train",))
+    with pytest.raises(InputError, match=says):
+        ViewDataset.load(folder)
+
+
+def test_folders_that_are_no_views(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(MissingFileError, match="does not exist"):
+        ViewDataset.load(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="not a folder"):
+        ViewDataset.load(folder / "transforms_train.json")
+    with pytest.raises(MissingFileError, match=r"no transforms_train\.json"):
+        ViewDataset.load(tmp_path)
+    (folder / "transforms_train.json").write_text('{"frames": [')
+    with pytest.raises(InputError, match="not valid JSON"):
+        ViewDataset.load(folder)
+
+
+@pytest.mark.parametrize("tree", ["acer", "quaking_aspen", "weeping_willow"])
+def test_shared_views(shared: Path, tree: str) -> None:
+    views = ViewDataset.load(shared / "views" / tree)
+    assert (len(views.train), len(views.test)) == (68, 22)
+    assert (views.train.cameras.width, views.train.cameras.height) == (512, 512)
+    camera = views.train.cameras[0]
+    # View 0 stands on +Z of the Y-up world, level, and looks at the axis.
+    x, y, z = camera.position.tolist()
+    assert abs(x) < 1e-9 and y > 0 and z > 10
+    torch.testing.assert_close(camera.forward, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64))
+    # The trunk's base at the origin is where the picture is opaque at the bottom.
+    column, row = camera.project(torch.tensor([[0.0, 0.05, 0.0]], dtype=torch.float64))[0].round().int().tolist()
+    picture = premultiply(views.train.image(0).float() / 255)
+    assert picture[row, column, 3] == 1
+    assert picture[row + 20 :, :, 3].max() == 0
