@@ -123,7 +123,7 @@ def measure(target: Tensor, image: Tensor) -> Measures:
             thesis_scale.sre(*rgba),
         ),
         metrics.sharpness(*white),
-        metrics.brightness(*rgba[::-1]),
+        metrics.brightness(*rgba),
     )
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from scipy import ndimage
+
+from bbfit.images import bleed_colour
 
 # Graphics cards compress textures in blocks of 4 x 4 texels.
 BLOCK = 4
@@ -87,12 +89,7 @@ def _place(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def fill_cell(texture: NDArray[np.uint8], padding: int, width: int, height: int) -> NDArray[np.uint8]:
-    """Put a texture into its cell; give every transparent texel the colour of the nearest opaque one, and a ring around the texture
-    that of its rim.
-
-    Filtering with straight alpha shows the colour of transparent texels: next to visible ones in bilinear filtering, everywhere in mip
-    levels. Found by the exact Euclidean distance transform (Felzenszwalb and Huttenlocher 2012). As opaque counts at least half of
-    the texture's largest alpha: fainter texels often have a colour that no view determined.
+    """Put a texture into its cell, transparent texels and the margin in their neighbours' colour (:func:`~bbfit.images.bleed_colour`).
 
     Returns
     -------
@@ -100,13 +97,7 @@ def fill_cell(texture: NDArray[np.uint8], padding: int, width: int, height: int)
     """
     h, w = texture.shape[:2]
     cell = np.pad(texture, ((padding, height - h - padding), (padding, width - w - padding), (0, 0)))
-    alpha = cell[..., 3]
-    if not alpha.any():
-        return np.zeros_like(cell)
-    source = 2 * alpha.astype(np.int64) >= alpha.max()
-    row, column = ndimage.distance_transform_edt(~source, return_distances=False, return_indices=True)
-    hidden = alpha == 0
-    pass
+    cell = bleed_colour(torch.from_numpy(cell)).numpy()
     # The rim fades out in its own colour, as in the reference renderer.
     inner = cell[padding : padding + h, padding : padding + w, :3]
     cell[padding - 1 : padding + h + 1, padding - 1 : padding + w + 1, :3] = np.pad(inner, ((1, 1), (1, 1), (0, 0)), "edge")

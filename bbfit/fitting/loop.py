@@ -20,6 +20,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
 from bbfit.fitting.losses import image_loss
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import bleed_colour
 from bbfit.rendering.dispatch import render
 from bbfit.views import ViewDataset
 
@@ -73,7 +74,7 @@ def fit(
     """Fit a billboard cloud to the training views; the test views are not looked at.
 
     Each step draws some training views, renders the cloud from their cameras, and lets Adam (Kingma and Ba 2015) move the texels down
-    the gradient of the loss; texels are kept in [0, 1].
+    the gradient of the loss; texels are kept in [0, 1]. At the end transparent texels get their neighbours' colour.
 
     Parameters
     ----------
@@ -127,8 +128,10 @@ def fit(
             _save(checkpoint, mark, state)
     if checkpoint is not None:
         checkpoint.unlink(missing_ok=True)
-    cloud = start.with_texels(texels.detach()).to("cpu")
-    return FitResult(cloud, state.losses, config, state.seconds)
+    cloud = start.with_texels(texels.detach())
+    # No view determines the colour of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
+    bled = [bleed_colour(side).reshape(-1, 4) for texture in cloud.textures() for side in texture]
+    return FitResult(cloud.with_texels(torch.cat(bled)).to("cpu"), state.losses, config, state.seconds)
 
 
 def learning_rate(config: FitConfig, index: int) -> float:

@@ -68,7 +68,7 @@ def comparison_picture(cloud: BillboardCloud, views: ViewSet, path: str | Path, 
         draw.text((gap, line // 2), title, _INK, _font("DejaVuSans-Bold.ttf", text * 5 // 4))
     noun = "billboard" if len(cloud) == 1 else "billboards"
     for x, name, note in zip(
-        left, ("Target", "Result", "Difference"), ("", f"{len(cloud)} {noun}, {cloud.vertex_count} vertices", "perceived"), strict=True
+        left, ("Target", "Result", "Difference"), ("", f"{len(cloud)} {noun}, {cloud.vertex_count} vertices", "FLIP"), strict=True
     ):
         draw.text((x, head - text * 3 // 2), name, _INK, bold)
         draw.text((x + bold.getlength(name + "  "), head - text * 3 // 2), note, _FAINT, font)
@@ -188,7 +188,7 @@ def _colour_bar(sheet: Any, draw: ImageDraw, font: FreeTypeFont, right: int, top
     """The scale of the difference, ending at ``right``."""
     from PIL import Image
 
-    length, thickness = 6 * text, text * 3 // 4
+    length, thickness = 5 * text, text * 3 // 4
     end = right - int(font.getlength(" 1"))
     bar = np.broadcast_to(_magma(np.linspace(0, 1, length)), (thickness, length, 3))
     sheet.paste(Image.fromarray(np.ascontiguousarray(bar)), (end - length, top + text // 4))

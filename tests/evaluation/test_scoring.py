@@ -79,6 +79,7 @@ def test_measures_are_taken_from_the_right_pictures() -> None:
     assert measures.over_white.psnr == 120 and measures.over_white.flip == 0
     assert measures.rgba.rmse == pytest.approx(0.25, rel=1e-12)
     assert measures.thesis_scale.rmse == pytest.approx(0.25 / 4095, rel=1e-12)
+    assert measures.thesis_scale.sre == -120  # the signal is the target's, and it has none
 
 
 def test_costs_and_stages(views: ViewDataset) -> None:

@@ -65,7 +65,9 @@ def test_one_thesis_step_is_one_adam_step(views: ViewDataset) -> None:
     (image - views.train.targets(chosen)).square().sum(-1).mean().backward()
     assert texels.grad is not None
     expected = (start.texels - 0.01 * texels.grad / (texels.grad.abs() + 1e-8)).clamp(0, 1)
-    torch.testing.assert_close(fit(views, config).cloud.texels, expected, atol=2e-7, rtol=0)
+    fitted, hidden = fit(views, config).cloud.texels, expected[:, 3] < 0.5 / 255
+    torch.testing.assert_close(fitted[~hidden], expected[~hidden], atol=2e-7, rtol=0)
+    assert (fitted[hidden, 3] == 0).all()
 
 
 def test_same_seed_same_result_other_seed_another(views: ViewDataset) -> None:

@@ -29,10 +29,8 @@ def facing_cloud(depths: list[float], sizes: list[tuple[int, int]], half_extents
     """Upright rectangles that face +Z, at the given distances from :func:`camera_on_z` on its optical axis."""
     n = len(depths)
     centers = torch.stack([torch.zeros(n), torch.zeros(n), -torch.tensor(depths)], -1)
-    axes = torch.eye(3)
-    return cloud_of(
-        centers, axes[:1].expand(n, 3), axes[1:2].expand(n, 3), torch.tensor(half_extents, dtype=torch.float64).expand(n, 2), sizes
-    )
+    axes, half = torch.eye(3), torch.tensor(half_extents, dtype=torch.float64)
+    return cloud_of(centers, axes[:1].expand(n, 3), axes[1:2].expand(n, 3), half.expand(n, 2), sizes)
 
 
 def camera_on_z(width: int, height: int, *, fov: float | None = 60.0, extent: float = 4.0) -> Camera:

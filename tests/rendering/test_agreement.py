@@ -59,7 +59,7 @@ def test_units_do_not_matter(scale: float) -> None:
             assert (image.double() - render_reference(cloud, camera)).abs().max() < allowed
 
 
-@pytest.mark.parametrize(("dtype", "allowed"), [(torch.float32, 2e-6), (torch.float64, 1e-14)])  # measured 4e-7 and 1e-15
+@pytest.mark.parametrize(("dtype", "allowed"), [(torch.float32, 5e-6), (torch.float64, 1e-14)])  # measured 1.3e-6 and 2e-15
 @pytest.mark.parametrize("orthographic", [False, True])
 @pytest.mark.parametrize(("width", "height"), [(16, 16), (9, 14), (31, 8), (1, 5)])
 def test_one_texel_a_pixel_is_the_texture_itself(dtype: torch.dtype, allowed: float, orthographic: bool, width: int, height: int) -> None:

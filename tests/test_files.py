@@ -1,0 +1,107 @@
+"""Files appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+
+from bbfit.checks import InputError
+from bbfit.files import output_folder, read_json, write_bytes, write_json, write_tensors
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_writing_replaces_and_leaves_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    for data in (b"first", b"second, longer", b""):
+        write_bytes(path, data)
+        assert path.read_bytes() == data and names(tmp_path) == ["a.bin"]
+    assert stat.S_IMODE(path.stat().st_mode) == 0o644
+
+
+@pytest.mark.parametrize("broken", ["os.fsync", "pathlib.Path.replace"])
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_failure_leaves_the_old_file_and_no_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, error: BaseException
+) -> None:
+    path = tmp_path / "a.bin"
+    write_bytes(path, b"old")
+
+    def break_off(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(broken, break_off)
+    with pytest.raises(type(error)):
+        write_bytes(path, b"new")
+    assert path.read_bytes() == b"old" and names(tmp_path) == ["a.bin"]
+
+
+def test_a_really_full_disk() -> None:
+    """``/dev/full`` refuses every byte, but its folder takes no new names for us: write through a link to it."""
+    with pytest.raises(OSError, match="No space left"), Path("/dev/full").open("wb", buffering=0) as file:
+        file.write(b"x")
+
+
+def test_a_missing_folder_is_an_operating_system_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        write_bytes(tmp_path / "nowhere" / "a.bin", b"x")
+
+
+def test_json_round_trip(tmp_path: Path) -> None:
+    value = {"psnr": 27.4, "tree": "Ahorn äöü", "views": [1, 2, None]}
+    write_json(tmp_path / "a.json", value)
+    assert read_json("metrics", tmp_path / "a.json") == value
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), {"a": [1, float("nan")]}, {"a": {1, 2}}])
+def test_what_json_cannot_hold_is_refused_before_anything_is_written(tmp_path: Path, value: object) -> None:
+    with pytest.raises((ValueError, TypeError)):
+        write_json(tmp_path / "a.json", value)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("data", [b"", b"{", b'{"a": 1', b"\xff\xfe\x00", b"{'a': 1}"])
+def test_damaged_json_is_named(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "run.json"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"^run: .*run\.json is not valid JSON .*restore it$"):
+        read_json("run", path)
+
+
+def test_tensors_round_trip(tmp_path: Path) -> None:
+    tensors = {"a": torch.rand(3, 2), "b": torch.tensor([True, False]), "c": torch.arange(4)}
+    write_tensors(tmp_path / "a.safetensors", tensors, {"format": "x"})
+    with safe_open(tmp_path / "a.safetensors", framework="pt") as file:
+        assert file.metadata() == {"format": "x"}
+        for name, tensor in tensors.items():
+            assert torch.equal(file.get_tensor(name), tensor) and file.get_tensor(name).dtype == tensor.dtype
+    assert names(tmp_path) == ["a.safetensors"]
+
+
+def test_an_output_folder_is_made(tmp_path: Path) -> None:
+    folder = tmp_path / "a" / "b"
+    assert output_folder("out", str(folder)) == folder and folder.is_dir()
+    (folder / "old.txt").write_text("kept")
+    output_folder("out", folder)
+    assert names(folder) == ["old.txt"]
+
+
+def test_an_output_folder_that_is_a_file_or_within_one_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    for path in (tmp_path / "file", tmp_path / "file" / "a", tmp_path / "file" / "a" / "b"):
+        with pytest.raises(InputError, match=r"^out: .*choose another output folder"):
+            output_folder("out", path)
+    assert (tmp_path / "file").read_text() == "x"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a folder of the kernel's")
+def test_an_output_folder_that_cannot_be_written_to_is_refused() -> None:
+    with pytest.raises(InputError, match=r"^out: /proc/self cannot be written to"):
+        output_folder("out", "/proc/self")
