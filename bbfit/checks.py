@@ -35,7 +35,7 @@ def check_range(name: str, value: float, low: float, high: float, *, open_low: b
     """Require ``low <= value <= high`` (``low < value`` with ``open_low``) and a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputTypeError(f"{name}: expected a number, got {value!r}")
-    inside = (low < value if open_low else low <= value) and value <= high
+    inside = (low < value if open_low else low <= value) and value <= high and value != float("inf")
     if not inside:  # NaN lands here too
         if high == float("inf"):
             wanted = f"more than {low:g}" if open_low else f"at least {low:g}"

@@ -52,7 +52,7 @@ def read_rgba(path: str | Path) -> NDArray[np.uint8]:
 def encode_png(image: NDArray[np.uint8]) -> bytes:
     """Encode uint8 [H, W, 3] RGB or [H, W, 4] straight RGBA as PNG."""
     code = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
-    done, data = cv2.imencode(".png", cv2.cvtColor(image, code))
+    done, data = cv2.imencode(".png", cv2.cvtColor(image, code), [cv2.IMWRITE_PNG_COMPRESSION, 9])
     assert done
     return data.tobytes()
 

@@ -7,7 +7,7 @@ import io
 import json
 import platform
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import as_file, files
@@ -106,7 +106,7 @@ def run(
     views.train.check()
     views.test.check()
     cloud = _fit(views, record, config.fit, tell)
-    _export(cloud, record, config.export, tell)
+    _export(cloud, record, export_config(views, config.export), tell)
     report = _evaluate(cloud, views, record, tell)
     return RunResult(record.folder, cloud, report, tuple(record.skipped))
 
@@ -116,6 +116,13 @@ def original_tree(views: ViewDataset) -> OriginalTree:
     tree = views.request.get("tree")
     counts = {name: tree.get(name) for name in ("vertices", "bytes")} if isinstance(tree, dict) else {}
     return OriginalTree(**{name: value for name, value in counts.items() if isinstance(value, int)})
+
+
+def export_config(views: ViewDataset, config: ExportConfig) -> ExportConfig:
+    """``config`` with the up axis of the file that the views were rendered from, where that is left open and known."""
+    tree = views.request.get("tree")
+    known = config.up == "auto" and isinstance(tree, dict) and tree.get("up_axis") == "z"
+    return replace(config, up="z") if known else config
 
 
 class _Record:

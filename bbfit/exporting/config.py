@@ -8,7 +8,7 @@ from typing import Literal, get_args
 from bbfit.checks import check_choice, check_count, check_range
 
 Alpha = Literal["blend", "mask"]
-Up = Literal["y", "z"]
+Up = Literal["auto", "y", "z"]
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,9 @@ class ExportConfig:
     """Least alpha that is drawn with ``mask``, in (0, 1]."""
     padding: int = 8
     """Texels kept free around each texture in the atlas, at least 1; with 8 the mip levels 1 to 3 never mix two textures."""
-    up: Up = "y"
-    """Up axis of an OBJ file's coordinates; choose z if the tree came from a Z-up file. A GLB is Y up, as glTF demands."""
+    up: Up = "auto"
+    """Up axis of an OBJ file's coordinates. ``auto``: that of the tree's own file where the views tell it (.ply, .stl and .blend are Z up),
+    else y. A GLB is Y up, as glTF demands."""
 
     def __post_init__(self) -> None:
         check_choice("alpha", self.alpha, get_args(Alpha))

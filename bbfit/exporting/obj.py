@@ -24,7 +24,7 @@ def obj_bytes(quads: Quads, config: ExportConfig, *, material_file: str) -> byte
     if config.up == "z":
         corners, normals = _z_up(corners), _z_up(normals)
     uvs = quads.uvs.reshape(-1, 2) * [1, -1] + [0, 1]  # OBJ counts v from the bottom
-    lines = [f"# bbfit billboard cloud, metres, {config.up.upper()} up"]
+    lines = [f"# bbfit billboard cloud, metres, {'Z' if config.up == 'z' else 'Y'} up"]
     if quads.culled.any():
         lines.append("# has separate front and back faces: turn on back-face culling")
     lines += [f"mtllib {material_file}", "o billboards"]

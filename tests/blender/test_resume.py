@@ -1,0 +1,231 @@
+"""Kills, crashes and second starts: finished views are kept, unfinished ones are not taken for finished."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from bbfit.blender import processes
+from bbfit.blender.config import ViewsConfig
+from bbfit.blender.render import BlenderError, render_views
+from bbfit.checks import InputError
+from bbfit.files import read_json
+from bbfit.images import read_rgba
+
+from .conftest import SMALL, box
+
+CONFIG = ViewsConfig(**SMALL)
+
+_RENDER = """
+import sys
+from bbfit.blender.config import ViewsConfig
+from bbfit.blender.render import render_views
+tree, out, samples, size, limit = sys.argv[1:]
+if int(limit):
+    import resource
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), resource.RLIM_INFINITY))
+config = ViewsConfig(count=4, size=int(size), samples=int(samples), denoise=False)
+render_views(tree, out, config, on_progress=lambda done, total: print(done, flush=True))
+"""
+
+
+def start(tree: Path, out: Path, *, samples: int = 4, size: int = 32, limit: int = 0) -> subprocess.Popen[str]:
+    """Render views in a process that may be killed."""
+    arguments = [sys.executable, "-c", _RENDER, str(tree), str(out), str(samples), str(size), str(limit)]
+    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that only waits to be collected does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def times(out: Path) -> dict[str, int]:
+    """When each picture was written."""
+    return {path.name: path.stat().st_mtime_ns for path in sorted((out / "images").iterdir())}
+
+
+def assert_same_pictures(out: Path, expected: Path) -> None:
+    """Pixel for pixel, and nothing left over."""
+    names = [path.name for path in sorted((expected / "images").iterdir())]
+    assert [path.name for path in sorted((out / "images").iterdir())] == names
+    for name in names:
+        np.testing.assert_array_equal(read_rgba(out / "images" / name), read_rgba(expected / "images" / name))
+    for name in ("transforms_train.json", "transforms_test.json"):
+        assert (out / name).read_bytes() == (expected / name).read_bytes()
+
+
+def test_killed_in_the_middle_and_started_again(thing_glb: Path, tmp_path: Path) -> None:
+    """Blender dies with its parent; only what is missing or cut short is rendered again; pixels are those of an unbroken run."""
+    out, config = tmp_path / "views", ViewsConfig(**SMALL | {"samples": 600})
+    parent = start(thing_glb, out, samples=600)
+    assert parent.stdout
+    for _ in range(3):  # 0, 1, 2 views
+        parent.stdout.readline()
+    workers = [int(pid) for pid in Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()]
+    assert workers
+    parent.kill()
+    parent.communicate()
+    deadline = time.monotonic() + 10
+    while any(map(alive, workers)):
+        assert time.monotonic() < deadline, "Blender outlives its parent"
+        time.sleep(0.05)
+    assert not (out / "transforms_train.json").exists()
+    assert read_json("views", out / "views.json")["complete"] is False
+
+    finished = times(out)
+    kept = [name for name in finished if name.endswith("g")]
+    assert 2 <= len(kept) < 4
+    cut = out / "images" / kept[0]
+    cut.write_bytes(cut.read_bytes()[:-20])
+    (out / "images/.0003.png.part").write_bytes(b"half a picture")
+    progress: list[int] = []
+    render_views(thing_glb, out, config, on_progress=lambda done, total: progress.append(done))
+    assert progress == list(range(len(kept) - 1, 5))
+    later = times(out)
+    assert [name for name in kept if later[name] == finished[name]] == kept[1:]
+    assert read_json("views", out / "views.json")["complete"] is True
+    assert_same_pictures(out, render_views(thing_glb, tmp_path / "unbroken", config))
+
+
+def test_finished_folder_needs_no_blender(thing_glb: Path, unbroken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "BlenderPool", None)
+    before, progress = times(unbroken), []
+    render_views(thing_glb, unbroken, CONFIG, on_progress=lambda done, total: progress.append((done, total)))
+    assert progress == [(4, 4)] and times(unbroken) == before
+
+
+def test_two_workers_make_no_difference(thing_glb: Path, unbroken: Path, tmp_path: Path) -> None:
+    out = render_views(thing_glb, tmp_path / "views", ViewsConfig(**SMALL | {"workers": 2}))
+    assert_same_pictures(out, unbroken)
+    render_views(thing_glb, out, ViewsConfig(**SMALL | {"workers": 3, "device": "cuda"}))  # all stands, so none is asked for
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"size": 64}, "size 32, not 64"),
+        ({"elevations": (0.0, 20.0)}, r"elevations 0\.0, not 0\.0 20\.0"),
+        ({"seed": 7}, "seed 0, not 7"),
+        ({"orthographic": True}, "orthographic False, not True"),
+        ({"hdri": "sky"}, "hdri None, not sky.hdr"),
+    ],
+)
+def test_other_settings_are_refused(thing_glb: Path, unbroken: Path, tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    if "hdri" in change:
+        change = {"hdri": tmp_path / "sky.hdr"}
+        change["hdri"].write_bytes(b"not looked into")
+    before = times(unbroken), (unbroken / "views.json").read_bytes()
+    with pytest.raises(InputError, match=f"{said}; choose another output folder, or remove"):
+        render_views(thing_glb, unbroken, ViewsConfig(**SMALL | change))
+    assert (times(unbroken), (unbroken / "views.json").read_bytes()) == before
+
+
+def test_another_tree_is_refused(unbroken: Path, tmp_path: Path) -> None:
+    for name, said in (("other.glb", "views of another tree, thing.glb"), ("thing.glb", "an earlier version of thing.glb")):
+        trimesh.Scene([box((0, 0, 0), (1, 1, 1), (9, 9, 9))]).export(str(tmp_path / name))
+        with pytest.raises(InputError, match=said):
+            render_views(tmp_path / name, unbroken, CONFIG)
+
+
+def test_folder_with_other_content_is_refused(thing_glb: Path, unbroken: Path, tmp_path: Path) -> None:
+    views = tmp_path / "views"
+    shutil.copytree(unbroken, views)
+    (views / "views.json").unlink()
+    with pytest.raises(InputError, match="views from elsewhere"):
+        render_views(thing_glb, views, CONFIG)
+    (views / "transforms_train.json").unlink()
+    (views / "transforms_test.json").unlink()
+    with pytest.raises(InputError, match="views from elsewhere"):
+        render_views(thing_glb, views, CONFIG)
+    (views / "views.json").write_text("[]")
+    with pytest.raises(InputError, match="was not written by bbfit"):
+        render_views(thing_glb, views, CONFIG)
+    (views / "views.json").write_text("{")
+    with pytest.raises(InputError, match="not valid JSON"):
+        render_views(thing_glb, views, CONFIG)
+    with pytest.raises(InputError, match="is a file, not a folder"):
+        render_views(thing_glb, views / "views.json", CONFIG)
+
+
+class Fragile(processes.Blender):
+    """A worker that is killed as soon as it has been handed its second frame, for the first ``deaths`` workers."""
+
+    deaths = 0
+
+    def send(self, request: dict[str, Any]) -> None:
+        super().send(request)
+        self.handed = getattr(self, "handed", -2) + 1  # the job, then frames
+        if self.handed == 1 and Fragile.deaths > 0:
+            Fragile.deaths -= 1
+            os.kill(self.pid, signal.SIGKILL)
+
+
+def test_crashed_worker_is_replaced(thing_glb: Path, unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "Blender", Fragile)
+    monkeypatch.setattr(Fragile, "deaths", 2)
+    progress: list[int] = []
+    out = render_views(thing_glb, tmp_path / "views", CONFIG, on_progress=lambda done, total: progress.append(done))
+    assert progress == [0, 1, 2, 3, 4] and Fragile.deaths == 0
+    assert_same_pictures(out, unbroken)
+
+
+def test_blender_that_crashes_again_and_again(
+    thing_glb: Path, unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is said at which frame and what is kept; and the next start goes on from there."""
+    monkeypatch.setattr(processes, "Blender", Fragile)
+    monkeypatch.setattr(Fragile, "deaths", 3)
+    out = tmp_path / "views"
+    with pytest.raises(BlenderError, match=r"crashed 3 times, last at 0003\.png \(signal 9.*3 of 4 views are finished and kept"):
+        render_views(thing_glb, out, CONFIG)
+    assert len(times(out)) == 3 and not (out / "transforms_train.json").exists()
+    progress: list[int] = []
+    render_views(thing_glb, out, CONFIG, on_progress=lambda done, total: progress.append(done))
+    assert progress == [3, 4]
+    assert_same_pictures(out, unbroken)
+
+
+def test_crash_while_reading(thing_glb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    worker = tmp_path / "worker.py"
+    worker.write_text("import os, sys; sys.stderr.write('Fra: 1\\nout of luck\\n'); sys.stderr.flush(); os.abort()")
+    monkeypatch.setattr(processes, "WORKER", worker)
+    with pytest.raises(BlenderError, match=r"crashed while reading .*thing\.glb \(signal 6; its last words: out of luck\)"):
+        render_views(thing_glb, tmp_path / "views", CONFIG)
+    assert not (tmp_path / "views").exists()
+
+
+def test_full_disk_is_told_and_survived(thing_glb: Path, tmp_path: Path) -> None:
+    """A limit on the size of files stands in for the full disk: it lets views.json pass and cuts the pictures."""
+    out, limit = tmp_path / "views", 2500
+    parent = start(thing_glb, out, samples=1, size=96, limit=limit)
+    _, said = parent.communicate()
+    assert parent.returncode == 1
+    assert re.search(r"InputError: views: .*0000\.png could not be .*; free the disk .*then start again", said), said
+    assert not list((out / "images").glob("[0-9]*")) and not (out / "transforms_train.json").exists()
+    assert start(thing_glb, out, samples=1, size=96).wait() == 0
+    assert min(path.stat().st_size for path in (out / "images").iterdir()) > limit
+    assert len(list((out / "images").iterdir())) == 4
+
+
+def test_picture_that_cannot_be_put_in_its_place(thing_glb: Path, unbroken: Path, tmp_path: Path) -> None:
+    out = tmp_path / "views"
+    shutil.copytree(unbroken, out)
+    (out / "images/0001.png").unlink()
+    (out / "images/0001.png/in the way").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"0001\.png could not be written \(Is a directory\); free the disk or make"):
+        render_views(thing_glb, out, CONFIG)

@@ -1,0 +1,125 @@
+"""Reading and writing pictures, and the two kinds of alpha."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from bbfit.checks import InputError, MissingFileError
+from bbfit.images import encode_png, over_colour, premultiply, read_rgba, to_bytes, unpremultiply, write_png
+
+
+def noise(channels: int = 4) -> NDArray[np.uint8]:
+    return np.random.default_rng(0).integers(0, 256, (24, 31, channels), dtype=np.uint8)
+
+
+def test_png_round_trip_keeps_every_byte(tmp_path: Path) -> None:
+    image = noise()
+    image[:4, :, 3] = 0  # colour under full transparency stays as well
+    write_png(tmp_path / "a.png", image)
+    assert np.array_equal(read_rgba(tmp_path / "a.png"), image)
+    with Image.open(tmp_path / "a.png") as other:  # a second reader: channels in order, alpha straight
+        assert other.mode == "RGBA" and np.array_equal(np.asarray(other), image)
+
+
+def test_rgb_is_written_without_alpha(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", noise(3))
+    with Image.open(tmp_path / "a.png") as other:
+        assert other.mode == "RGB" and np.array_equal(np.asarray(other), noise(3))
+    with pytest.raises(InputError, match=r"a\.png has no alpha channel"):
+        read_rgba(tmp_path / "a.png")
+
+
+def test_other_writers_pictures_are_read(tmp_path: Path) -> None:
+    image = noise()
+    Image.fromarray(image).save(tmp_path / "a.webp", lossless=True, exact=True)
+    assert np.array_equal(read_rgba(tmp_path / "a.webp"), image)
+
+    grey = np.ascontiguousarray(image[..., [0, 3]])
+    Image.fromarray(grey).save(tmp_path / "grey.png")
+    assert np.array_equal(read_rgba(tmp_path / "grey.png"), grey[..., [0, 0, 0, 1]])
+
+    paletted = Image.fromarray(image).quantize(32)
+    paletted.save(tmp_path / "palette.png")
+    with Image.open(tmp_path / "palette.png") as again:
+        assert np.array_equal(read_rgba(tmp_path / "palette.png"), np.asarray(again.convert("RGBA")))
+
+
+def test_sixteen_bits_are_rounded_to_eight(tmp_path: Path) -> None:
+    deep = np.array([[[0, 128, 129, 65535], [257, 385, 386, 32768]]], dtype=np.uint16)  # RGBA
+    done, data = cv2.imencode(".png", deep[..., [2, 1, 0, 3]])
+    assert done
+    (tmp_path / "a.png").write_bytes(data.tobytes())
+    assert read_rgba(tmp_path / "a.png").tolist() == [[[0, 0, 1, 255], [1, 1, 2, 128]]]
+
+
+def test_damaged_pictures_are_refused_by_name(tmp_path: Path) -> None:
+    path, good = tmp_path / "r_0.png", encode_png(noise())
+    flipped = bytearray(good)
+    flipped[len(good) // 2] ^= 0xFF
+    huge = bytearray(good)
+    huge[16:24] = struct.pack(">II", 100_000, 100_000)
+    huge[29:33] = struct.pack(">I", zlib.crc32(bytes(huge[12:29])))
+    for data, message in (
+        (b"", "is empty"),
+        (b"no picture at all", "neither PNG nor WebP"),
+        (good[:-1], "is cut short"),
+        (good[: len(good) // 2], "is cut short"),
+        (good[:300] + good[600:], "cannot be decoded"),
+        (bytes(flipped), "cannot be decoded"),
+        (bytes(huge), "cannot be decoded"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=rf"^image: .*r_0\.png {message}|r_0\.png is {message}"):
+            read_rgba(path)
+    path.unlink()
+    for missing in (path, tmp_path):
+        with pytest.raises(MissingFileError, match="does not exist"):
+            read_rgba(missing)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".jpg"])
+def test_formats_whose_alpha_would_be_misread_are_refused(tmp_path: Path, suffix: str) -> None:
+    Image.fromarray(noise(4 if suffix == ".tif" else 3)).save(tmp_path / f"a{suffix}")
+    with pytest.raises(InputError, match="neither PNG nor WebP"):
+        read_rgba(tmp_path / f"a{suffix}")
+
+
+def test_rounding_to_bytes() -> None:
+    values = torch.tensor([-1.0, 0, 0.49 / 255, 0.51 / 255, 1 - 0.49 / 255, 1, 7])
+    assert to_bytes(values).tolist() == [0, 0, 0, 1, 255, 255, 255]
+    every = torch.arange(256, dtype=torch.float32) / 255
+    assert to_bytes(every).tolist() == list(range(256))
+
+
+def test_premultiplied_and_back() -> None:
+    straight = torch.rand(50, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    straight[:5, 3] = 1
+    assert torch.equal(premultiply(straight)[:5], straight[:5])
+    assert torch.allclose(unpremultiply(premultiply(straight)), straight, atol=1e-14)
+    assert premultiply(torch.tensor([0.5, 1.0, 0.25, 0.5])).tolist() == [0.25, 0.5, 0.125, 0.5]
+
+
+def test_nothing_is_black_and_has_finite_gradients() -> None:
+    nothing = torch.zeros(3, 4, requires_grad=True)
+    straight = unpremultiply(nothing)
+    assert (straight == 0).all()
+    straight.sum().backward()
+    assert nothing.grad is not None and nothing.grad.isfinite().all()
+
+
+def test_over_a_background() -> None:
+    image = torch.tensor([[0.25, 0, 0.5, 0.5], [0, 0, 0, 0], [0.1, 0.2, 0.3, 1]])
+    assert torch.allclose(over_colour(image), torch.tensor([[0.75, 0.5, 1], [1, 1, 1], [0.1, 0.2, 0.3]]))
+    assert torch.equal(over_colour(image, 0.0), image[:, :3])
+    assert over_colour(image, torch.tensor([1.0, 0, 0]))[1].tolist() == [1, 0, 0]
+    with pytest.raises(InputError, match="shape"):
+        over_colour(image[:, :3])
