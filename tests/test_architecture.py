@@ -234,10 +234,14 @@ def test_every_public_name_and_module_says_what_it_is_for() -> None:
 
 
 def test_every_dataclass_field_is_documented_below_it() -> None:
+    """Save those whose type is a dataclass of ours: it says itself what it is."""
+    ours = {node.name for _, _, node in dataclasses()}
     bare = []
     for path, name, node in dataclasses():
         for field, below in zip(node.body, [*node.body[1:], None], strict=True):
-            if isinstance(field, ast.AnnAssign) and not documented(ast.unparse(field.target), below):
+            if not isinstance(field, ast.AnnAssign) or ours & set(ast.unparse(field.annotation).split(" | ")):
+                continue
+            if not documented(ast.unparse(field.target), below):
                 bare.append(f"{relative(path)}: {name}.{ast.unparse(field.target)}")
     assert not bare
 

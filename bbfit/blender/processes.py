@@ -72,12 +72,13 @@ class Blender:
     def _listen(self, events: queue.Queue[tuple[Blender, dict[str, Any]]]) -> None:
         assert self._process.stdout
         for line in self._process.stdout:
-            event = json.loads(line) if line.endswith(b"\n") else {"payload": -1}
-            length = event["payload"]
-            event["payload"] = self._process.stdout.read(max(length, 0))
-            if len(event["payload"]) != length:
+            if not line.endswith(b"\n"):
                 break  # the process died in the middle of a message
-            events.put((self, event))
+            event: dict[str, Any] = json.loads(line)
+            payload = self._process.stdout.read(event["payload"])
+            if len(payload) < event["payload"]:
+                break
+            events.put((self, event | {"payload": payload}))
         events.put((self, {"event": "exit"}))
 
     def last_words(self) -> str:

@@ -329,11 +329,11 @@ def render(frame: dict[str, Any]) -> None:
     scene.camera.matrix_world = Matrix(frame["camera_to_world"])
     scene.cycles.seed = frame["seed"]
     part = path.with_name(f".{path.name}.part")
-    scene.render.filepath = str(part)
+    scene.render.filepath = str(part).replace("{", "{{").replace("}", "}}")  # Blender fills in {names}
     try:
         bpy.ops.render.render(write_still=True)
     except RuntimeError as error:
-        raise Refused("views", f"{path} could not be rendered ({str(error).strip().removeprefix('Error: ')})", AGAIN) from error
+        raise Refused("views", f"{path} could not be rendered ({' '.join(str(error).split()).removeprefix('Error: ')})", AGAIN) from error
     try:
         if not part.read_bytes().endswith(b"IEND\xaeB`\x82"):
             raise Refused("views", f"{path} could not be written completely", AGAIN)

@@ -84,7 +84,9 @@ class Cost:
     """A count of the model beside that of the original tree; ``None`` where it is not known."""
 
     model: int | None = None
+    """Of the billboards."""
     original: int | None = None
+    """Of the tree."""
 
     @property
     def ratio(self) -> float | None:

@@ -17,7 +17,7 @@ from bbfit.files import read_json
 from bbfit.images import read_rgba
 from bbfit.views import ViewDataset
 
-from .conftest import FORMATS, SMALL, box, thing
+from .conftest import FORMATS, SMALL, box, run_in_blender, thing
 
 
 def pictures(folder: Path) -> np.ndarray:
@@ -149,3 +149,39 @@ def test_surface_without_material_is_grey(tmp_path: Path) -> None:
     trimesh.creation.box(bounds=[(-1, -1, 0), (1, 1, 2)]).export(str(tmp_path / "plain.stl"))
     config = ViewsConfig(**SMALL | {"count": 2, "sun_strength": 0.0})
     np.testing.assert_allclose(colour(pictures(render_views(tmp_path / "plain.stl", tmp_path / "views", config))), 188, atol=3)
+
+
+def test_what_a_blend_makes_at_render_time_is_measured(tmp_path: Path) -> None:
+    """Modifiers as they are when rendering, instances of collections, curves; out of a folder with an awkward name."""
+    folder = tmp_path / "a#b %04d {x} \u00fc"
+    folder.mkdir()
+    run_in_blender(
+        """
+import bpy, os, sys
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.mesh.primitive_cube_add(size=1, location=(0.5, 0.5, 0.5))
+array = bpy.context.object.modifiers.new("array", "ARRAY")
+array.count, array.show_viewport = 3, False
+bpy.context.object.hide_viewport = True
+leaves = bpy.data.collections.new("leaves")
+bpy.ops.mesh.primitive_plane_add(size=1, location=(0, 0, 0))
+leaf = bpy.context.object
+bpy.context.scene.collection.objects.unlink(leaf)
+leaves.objects.link(leaf)
+for height in (4, 6):
+    empty = bpy.data.objects.new("instance", None)
+    empty.instance_type, empty.instance_collection, empty.location = "COLLECTION", leaves, (0, -2, height)
+    bpy.context.scene.collection.objects.link(empty)
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
+sys.stdout.flush()
+os._exit(0)
+""",
+        str(folder / "tree.blend"),
+    )
+    out = render_views(folder / "tree.blend", folder / "views", ViewsConfig(**SMALL))
+    tree = read_json("views", out / "views.json")["tree"]
+    assert tree["faces"] == 3 * 12 + 2 * 2 and tree["vertices"] == 3 * 8 + 2 * 4
+    np.testing.assert_allclose(tree["bounds"], [[-0.5, 0.0, -1.0], [3.0, 6.0, 2.5]], atol=1e-5)
+    alpha = pictures(out)[..., 3]
+    assert alpha[:, 1:-1, 1:-1].any((1, 2)).all()
+    assert not any(side.any() for side in (alpha[:, 0], alpha[:, -1], alpha[:, :, 0], alpha[:, :, -1]))
