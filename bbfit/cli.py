@@ -107,7 +107,7 @@ def _evaluate(
     Args:
         cloud: A .safetensors file written by bbfit fit.
         views: Folder of views.
-        out: File for the measures as JSON; left out, they are only shown.
+        out: File for the measures as JSON; left out, metrics.json beside the cloud.
     """
     from bbfit.evaluation.scoring import evaluate
     from bbfit.geometry.cloud import BillboardCloud
@@ -121,11 +121,13 @@ def _evaluate(
             billboards,
             dataset.test,
             original=original_tree(dataset),
+            model_bytes=model.stat().st_size if (model := cloud.with_name("model.glb")).is_file() else None,
             on_view=lambda done, total: tell("evaluate", done, total),
         )
-    if out is not None:
-        report.save(out)
+    out = out or cloud.with_name("metrics.json")
+    report.save(out)
     _out.print(report_table(report))
+    _out.print(f"measures in {out}", soft_wrap=True)
 
 
 def _export(
@@ -178,7 +180,9 @@ def _show(result: RunResult) -> None:
     _out.print(report_table(result.report))
     if result.skipped:
         _out.print(f"unchanged, not done again: {', '.join(result.skipped)}", style="dim")
-    _out.print(f"results in {result.folder}: model.glb, model.obj, cloud.safetensors, metrics.json, comparison.png, loss.png")
+    _out.print(
+        f"results in {result.folder}: comparison.png, model.glb, model.obj, metrics.json, cloud.safetensors, loss.png", soft_wrap=True
+    )
 
 
 @contextmanager
