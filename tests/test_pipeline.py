@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from bbfit.blender.config import ViewsConfig
 from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
@@ -96,8 +99,6 @@ def test_a_killed_run_goes_on_to_the_same_result(views_folder: Path, tmp_path: P
 
 
 def test_bad_views_leave_earlier_results_as_they_were(views_folder: Path, tmp_path: Path, done: RunResult) -> None:
-    import shutil
-
     views = shutil.copytree(views_folder, tmp_path / "views")
     before = snapshot(done.folder)
     picture = sorted((views / "images").iterdir())[-1]
@@ -109,8 +110,6 @@ def test_bad_views_leave_earlier_results_as_they_were(views_folder: Path, tmp_pa
 
 @pytest.mark.parametrize("split", ["train", "test"])
 def test_a_bad_picture_of_either_split_is_found_before_the_fit(views_folder: Path, tmp_path: Path, split: str) -> None:
-    import shutil
-
     views = Path(shutil.copytree(views_folder, tmp_path / "views"))
     name = json.loads((views / f"transforms_{split}.json").read_text())["frames"][-1]["file_path"] + ".png"
     (views / name).write_bytes((views / name).read_bytes()[:-5])
@@ -125,3 +124,36 @@ def test_out_must_be_a_folder_that_can_be_written(views_folder: Path, tmp_path: 
     with pytest.raises(InputError, match="is a file"):
         run(views_folder, tmp_path / "file" / "deeper", CONFIG)
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_from_a_tree_to_a_model(tmp_path: Path) -> None:
+    """The whole job with Blender, on the tree that comes with bbfit; a second run does nothing."""
+    config = RunConfig(ViewsConfig(count=8, size=48, samples=2, denoise=False), FitConfig(billboards=2, steps=10))
+    told = []
+    run(None, tmp_path, config, on_progress=lambda stage, done, total, note="": told.append((stage, done, total)))
+    assert [event for event in told if event[0] == "views"] == [("views", done, 8) for done in range(9)]
+    assert {"views/views.json", "views/images/0007.png"} <= {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")}
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["vertices"]["original"] > 10_000 and 0 < metrics["vertices"]["ratio"] < 1e-3
+    assert metrics["bytes"]["original"] > 100_000
+    assert set(metrics["seconds"]) == {"views", "fit", "export", "evaluate"} and metrics["seconds"]["views"] > 0
+    # The model stands where the tree stands: on the ground, around the trunk at the origin.
+    corners = [[float(word) for word in line.split()[1:]] for line in (tmp_path / "model.obj").read_text().splitlines() if line[:2] == "v "]
+    low, high = (np.array(corners).min(0), np.array(corners).max(0))
+    bounds = np.array(json.loads((tmp_path / "views" / "views.json").read_text())["tree"]["bounds"])
+    assert abs(low[1] - bounds[0, 1]) < 0.5 and abs(high[1] - bounds[1, 1]) < 2  # branches nearer to a camera reach higher on the plane
+    assert low[0] < 0 < high[0] and low[2] < 0 < high[2]
+
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*") if path.name not in ("run.json",)}
+    assert run(None, tmp_path, config).skipped == ("fit", "export", "evaluate")
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    with pytest.raises(InputError, match="size 48"):
+        run(None, tmp_path, dataclasses.replace(config, views=dataclasses.replace(config.views, size=64)))
+
+
+def test_an_obj_of_a_z_up_tree_is_z_up(views_folder: Path, tmp_path: Path) -> None:
+    views = Path(shutil.copytree(views_folder, tmp_path / "views"))
+    (views / "views.json").write_text(json.dumps({"tree": {"up_axis": "z", "vertices": 5000, "bytes": 90_000}}))
+    run(views, tmp_path / "out", CONFIG)
+    assert "Z up" in (tmp_path / "out" / "model.obj").read_text().splitlines()[0]
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["vertices"] == {"model": 8, "original": 5000, "ratio": 8 / 5000}

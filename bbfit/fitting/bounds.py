@@ -1,4 +1,4 @@
-"""Bounding billboards by what the views show, with OpenCV's bounding rectangles."""
+"""Bounding billboards by what the views show, with OpenCV's bounding rectangles and convex hulls."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def facing_view_bounds(planes: BillboardCloud, views: ViewSet, *, pairs: bool) -
     if pairs:
         cosines = cosines * torch.tensor([1.0, -1.0]).repeat(len(planes) // 2)
     best = cosines.argmax(0).tolist()
-    return torch.stack([_silhouette_on_plane(planes, n, views, view) for n, view in enumerate(best)])
+    return torch.stack([_bounds_on_plane(planes, n, views.cameras[view], _box(views, view)) for n, view in enumerate(best)])
 
 
 def silhouette_bounds(planes: BillboardCloud, views: ViewSet) -> Tensor:
@@ -53,9 +53,10 @@ def silhouette_bounds(planes: BillboardCloud, views: ViewSet) -> Tensor:
     cosines = facing(views.cameras, planes.normals, planes.centers[0]).abs()
     bounds = torch.tensor([math.inf, -math.inf, math.inf, -math.inf], dtype=planes.centers.dtype).repeat(len(planes), 1)
     for view, row in enumerate(cosines):
+        outline = _outline(views, view)
         # A view halfway between two billboards counts for both, as it does for both rectangles of a pair.
         for n in torch.nonzero((row > row.max() - _TIE) & (row > _OBLIQUE))[:, 0].tolist():
-            bounds[n] = _union(bounds[n], _silhouette_on_plane(planes, n, views, view))
+            bounds[n] = _union(bounds[n], _bounds_on_plane(planes, n, views.cameras[view], outline))
     seen = bounds[:, 0].isfinite()
     if not seen.any():  # only oblique views: fall back to the best there is
         return facing_view_bounds(planes, views, pairs=False)
@@ -67,15 +68,27 @@ def _union(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(torch.tensor([True, False, True, False]), torch.minimum(a, b), torch.maximum(a, b))
 
 
-def _silhouette_on_plane(planes: BillboardCloud, n: int, views: ViewSet, view: int) -> Tensor:
-    """The bounding rectangle of a view's alpha > 0, projected through the camera onto plane ``n``: [4] as above."""
+def _outline(views: ViewSet, view: int) -> Tensor:
+    """Corners of the convex hull of a view's pixels with alpha > 0, in pixel coordinates of pixel *edges*, [P, 2] float64."""
+    mask = (views.image(view)[..., 3] > 0).numpy().astype(np.uint8)
+    centres = torch.from_numpy(cv2.convexHull(cv2.findNonZero(mask))[:, 0]).double()
+    to_edges = torch.tensor([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]], dtype=torch.float64)
+    return (centres[:, None] + to_edges).flatten(0, 1)
+
+
+def _box(views: ViewSet, view: int) -> Tensor:
+    """Corners of the bounding rectangle of a view's alpha > 0, as :func:`_outline`."""
     mask = (views.image(view)[..., 3] > 0).numpy().astype(np.uint8)
     x, y, width, height = cv2.boundingRect(mask)
-    left, top, right, bottom = x - 0.5, y - 0.5, x + width - 0.5, y + height - 0.5
-    corners = torch.tensor([[left, top, 1], [right, top, 1], [right, bottom, 1], [left, bottom, 1]], dtype=torch.float64)
+    return torch.tensor([[x, y], [x + width, y], [x + width, y + height], [x, y + height]], dtype=torch.float64) - 0.5
+
+
+def _bounds_on_plane(planes: BillboardCloud, n: int, camera: Camera, pixels: Tensor) -> Tensor:
+    """Bounds of pixels, [P, 2], projected through one camera onto plane ``n``: left, right, bottom, top, [4]."""
     point = torch.stack([planes.rights[n], planes.ups[n], planes.centers[n]], -1)
     plane_to_world = torch.cat([point, torch.tensor([[0.0, 0.0, 1.0]], dtype=point.dtype)])
-    on_plane = corners @ torch.linalg.inv(views.cameras[view].world_to_pixel @ plane_to_world).mT
+    homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], -1)
+    on_plane = homogeneous @ torch.linalg.inv(camera.world_to_pixel @ plane_to_world).mT
     coordinates = on_plane[:, :2] / on_plane[:, 2:]
     (left, bottom), (right, top) = coordinates.amin(0), coordinates.amax(0)
     return torch.stack([left, right, bottom, top])

@@ -72,6 +72,25 @@ def test_silhouette_bounds_cut_nothing_off(views: ViewDataset, count: int, sides
     assert checked >= (len(views.train) // 2 if count == 1 else len(views.train))
 
 
+def test_silhouette_bounds_are_tight(views: ViewDataset) -> None:
+    """Each of a billboard's four edges is touched, to a texel, by the silhouette of some view that the billboard faces best."""
+    cloud = start_cloud(views.train, FitConfig(billboards=2, bounds="silhouette"))
+    camera = views.train.cameras.to(torch.float32)
+    cosines = facing(camera, cloud.normals, convergence_point(views.train.cameras).float()).abs()
+    matrices = torch.linalg.inv(texel_to_pixel(cloud, camera))
+    for n in range(2):
+        reached = []
+        for view in torch.nonzero(cosines[:, n] > cosines.amax(1) - 1e-3)[:, 0].tolist():
+            rows, columns = torch.nonzero(views.train.image(view)[..., 3] > 0).float().unbind(-1)
+            corners = [torch.stack([columns + x, rows + y, torch.ones_like(rows)], -1) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
+            texels = torch.cat(corners) @ matrices[view, n].mT
+            reached.append(texels[:, :2] / texels[:, 2:])
+        low, high = torch.cat(reached).amin(0), torch.cat(reached).amax(0)
+        size = cloud.texture_sizes[n].flip(0)
+        assert ((low > -0.5 - 1e-3) & (low < 0.5 + 1e-3)).all()
+        assert ((high < size - 0.5 + 1e-3) & (high > size - 1.5 - 1e-3)).all()
+
+
 def test_bounds_save_texels_and_keep_their_density(views: ViewDataset) -> None:
     whole = start_cloud(views.train, FitConfig(bounds="none"))
     part = start_cloud(views.train, FitConfig(bounds="silhouette"))
