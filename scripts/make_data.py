@@ -203,7 +203,7 @@ def make_tree(seed: int) -> trimesh.Scene:
     """The tree, Y up, in metres, its foot on the origin."""
     tree = Tree(seed)
     tree.grow(np.array([0.0, 0.0, 0.0]), unit(UP + 0.05 * LIGHT), length=4.0, radius=0.14)
-    parts = {BARK[0]: tree.bark.build(*BARK, double_sided=False)}
+    parts: dict[str, trimesh.parent.Geometry] = {BARK[0]: tree.bark.build(*BARK, double_sided=False)}
     parts |= {tone[0]: mesh.build(*tone, double_sided=True) for tone, mesh in zip(LEAVES, tree.leaves, strict=True)}
     return trimesh.Scene(parts)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bbfit.checks import MissingFileError, check_file, fail
 
-# The axis that points up in files of each format. FBX and USD say so themselves, and their importers follow.
+# The axis that points up in files of each format. An FBX or USD may say otherwise than this default, and its importer follows.
 UP_AXIS = {
     ".glb": "y",
     ".gltf": "y",

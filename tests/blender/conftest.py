@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +58,9 @@ os._exit(0)
 
 def run_in_blender(script: str, *arguments: str) -> None:
     """Run a script that uses bpy in a process of its own."""
-    done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True)
+    with tempfile.TemporaryDirectory() as scratch:  # os._exit, which the scripts end with, leaves Blender's own behind
+        environment = os.environ | {"TMPDIR": scratch}
+        done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
 
 
