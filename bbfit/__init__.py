@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from bbfit.blender.config import ViewsConfig
-    from bbfit.blender.render import render_views
+    from bbfit.blender.views_folder import render_views
     from bbfit.checks import InputError
     from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
@@ -40,7 +40,7 @@ _HOMES = {
     "export": "bbfit.exporting.model",
     "fit": "bbfit.fitting.loop",
     "render": "bbfit.rendering.dispatch",
-    "render_views": "bbfit.blender.render",
+    "render_views": "bbfit.blender.views_folder",
     "run": "bbfit.pipeline",
 }
 

@@ -65,7 +65,7 @@ def _views(
         out: Folder for the views; one that holds a part of them is completed.
         config: How the tree is rendered.
     """
-    from bbfit.blender.render import render_views
+    from bbfit.blender.views_folder import render_views
 
     with _progress() as tell:
         render_views(tree, out, config, on_progress=lambda done, total: tell("views", done, total))

@@ -20,6 +20,8 @@ from bbfit.files import read_json, write_json
 from bbfit.geometry.camera import Camera, camera_from_nerf, camera_to_nerf, pinhole_intrinsics
 
 TRAIN_FILE, TEST_FILE, SINGLE_FILE = "transforms_train.json", "transforms_test.json", "transforms.json"
+REQUEST_FILE = "views.json"
+"""What ``bbfit views`` notes beside the transforms: what was asked, and what was found of the tree."""
 TEST_SHARE = 0.25
 # How far from orthonormal a camera's axes may be: files in the wild carry four decimals.
 RIGID_TOLERANCE = 1e-3

@@ -169,7 +169,7 @@ class _Record:
 
 
 def _render(tree: Path, record: _Record, config: ViewsConfig, tell: Progress) -> ViewDataset:
-    from bbfit.blender.render import render_views
+    from bbfit.blender.views_folder import render_views
 
     folder = render_views(tree, record.folder / "views", config, on_progress=lambda done, total: tell("views", done, total))
     views = ViewDataset.load(folder)

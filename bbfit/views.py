@@ -19,9 +19,8 @@ from bbfit.checks import MissingFileError, check_folder, fail
 from bbfit.files import read_json
 from bbfit.geometry.camera import Camera
 from bbfit.images import premultiply, read_rgba
-from bbfit.layout import Frame, cameras_of, read_frames, split_views
+from bbfit.layout import REQUEST_FILE, Frame, cameras_of, read_frames, split_views
 
-REQUEST_FILE = "views.json"
 CACHE_BYTES = 1 << 30
 """Decoded pictures that a dataset keeps in memory at most, in bytes; the ones used longest ago go first."""
 

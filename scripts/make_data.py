@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from trimesh.visual.material import PBRMaterial
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.render import render_views
+from bbfit.blender.views_folder import render_views
 from bbfit.files import write_bytes
 
 Array = NDArray[np.float64]

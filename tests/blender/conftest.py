@@ -14,7 +14,7 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.render import render_views
+from bbfit.blender.views_folder import render_views
 
 FORMATS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".fbx", ".usd", ".usda", ".usdc", ".usdz", ".blend")
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # (x, y, z) -> (x, -z, y)

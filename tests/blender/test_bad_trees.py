@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from bbfit.blender import render, sources
+from bbfit.blender import sources, views_folder
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.render import render_views
 from bbfit.blender.sources import check_tree, fingerprint
+from bbfit.blender.views_folder import render_views
 from bbfit.checks import InputError, MissingFileError
 
 from .conftest import FORMATS, SMALL, run_in_blender
@@ -228,7 +228,7 @@ def test_without_blender(thing_glb: Path, tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_importing_loads_no_blender() -> None:
-    assert render.__name__ in __import__("sys").modules and "bpy" not in __import__("sys").modules
+    assert views_folder.__name__ in __import__("sys").modules and "bpy" not in __import__("sys").modules
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ import torch
 import trimesh
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.render import render_views
 from bbfit.blender.sources import UP_AXIS
+from bbfit.blender.views_folder import render_views
 from bbfit.files import read_json
 from bbfit.images import read_rgba
 from bbfit.views import ViewDataset

@@ -18,7 +18,7 @@ import trimesh
 
 from bbfit.blender import processes
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.render import BlenderError, render_views
+from bbfit.blender.views_folder import BlenderError, render_views
 from bbfit.checks import InputError
 from bbfit.files import read_json
 from bbfit.images import read_rgba
@@ -30,7 +30,7 @@ CONFIG = ViewsConfig(**SMALL)
 _RENDER = """
 import sys
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.render import render_views
+from bbfit.blender.views_folder import render_views
 tree, out, samples, size, limit = sys.argv[1:]
 if int(limit):
     import resource

@@ -23,11 +23,10 @@ from bbfit.files import output_folder, read_json, write_json
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, camera_to_nerf
 from bbfit.geometry.orbit import Orbit
 from bbfit.images import read_rgba
-from bbfit.layout import SINGLE_FILE, TEST_FILE, TRAIN_FILE, split_views, write_transforms
+from bbfit.layout import REQUEST_FILE, SINGLE_FILE, TEST_FILE, TRAIN_FILE, split_views, write_transforms
 
-__all__ = ["REQUEST_FILE", "BlenderError", "render_views"]
+__all__ = ["BlenderError", "render_views"]
 
-REQUEST_FILE = "views.json"
 # What may differ between two starts on one folder: it changes how long the pictures take, not what they show.
 _FREE = ("workers", "device")
 # Cycles' pixel filter (Blackman-Harris, width 1.5, of which Cycles makes 3) spreads a surface 1.5 pixels about a pixel's centre: what keeps
