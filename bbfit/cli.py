@@ -26,7 +26,7 @@ _out, _err = Console(), Console(stderr=True)
 
 
 def _run(
-    tree: Annotated[Path | None, tyro.conf.Positional] = None,
+    tree: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[TREE]")] = None,
     /,
     out: Path = Path("runs/tree"),
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
@@ -53,7 +53,7 @@ def _run(
 
 
 def _views(
-    tree: Annotated[Path, tyro.conf.Positional],
+    tree: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TREE")],
     /,
     out: Path,
     config: Annotated[ViewsConfig, tyro.conf.arg(name="")] = ViewsConfig(),  # noqa: B008
@@ -73,7 +73,7 @@ def _views(
 
 
 def _fit(
-    views: Annotated[Path, tyro.conf.Positional],
+    views: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIEWS")],
     /,
     out: Path,
     config: Annotated[FitConfig, tyro.conf.arg(name="")] = FitConfig(),  # noqa: B008
@@ -97,8 +97,8 @@ def _fit(
 
 
 def _evaluate(
-    cloud: Annotated[Path, tyro.conf.Positional],
-    views: Annotated[Path, tyro.conf.Positional],
+    cloud: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLOUD")],
+    views: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIEWS")],
     /,
     out: Path | None = None,
 ) -> None:
@@ -131,7 +131,7 @@ def _evaluate(
 
 
 def _export(
-    cloud: Annotated[Path, tyro.conf.Positional],
+    cloud: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLOUD")],
     /,
     out: Path,
     config: Annotated[ExportConfig, tyro.conf.arg(name="")] = ExportConfig(),  # noqa: B008

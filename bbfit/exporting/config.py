@@ -18,11 +18,11 @@ class ExportConfig:
     alpha: Alpha = "blend"
     """Blend by alpha (smooth edges, drawn back to front), or mask: draw where alpha reaches the cutoff (needs no sorting)."""
     alpha_cutoff: float = 0.5
-    """Least alpha that is drawn with ``mask``, in (0, 1]."""
+    """Least alpha that is drawn with mask, in (0, 1]."""
     padding: int = 8
     """Texels kept free around each texture in the atlas, at least 1; with 8 the mip levels 1 to 3 never mix two textures."""
     up: Up = "auto"
-    """Up axis of an OBJ file's coordinates. ``auto``: that of the tree's own file where the views tell it (.ply, .stl and .blend are Z up),
+    """Up axis of an OBJ file's coordinates. auto: that of the tree's own file where the views tell it (.ply, .stl and .blend are Z up),
     else y. A GLB is Y up, as glTF demands."""
 
     def __post_init__(self) -> None:

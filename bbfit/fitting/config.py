@@ -9,7 +9,7 @@ from bbfit.checks import check_choice, check_count, check_range
 
 Preset = Literal["default", "thesis"]
 Sides = Literal["one", "two", "pair"]
-Bounds = Literal["none", "thesis", "silhouette"]
+Bounds = Literal["viewport", "thesis", "silhouette"]
 Loss = Literal["l1", "l2"]
 Schedule = Literal["cosine", "growth"]
 
@@ -24,7 +24,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
     },
     # Thesis, section 4.4 and 5.
     "thesis": {
-        "bounds": "none",
+        "bounds": "viewport",
         "ssim_weight": 0.0,
         "steps": 10_000,
         "views_per_step": 1,
@@ -36,17 +36,17 @@ _PRESETS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How to fit. A field left at ``None`` takes the preset's value."""
+    """How to fit. A field left at None takes the preset's value."""
 
     preset: Preset = "default"
-    """``thesis`` repeats the thesis's schedule: 10,000 steps of one random view, Adam at 0.01 growing by a tenth, no bounds."""
+    """thesis repeats the thesis's schedule: 10,000 steps of one random view, Adam at 0.01 growing by a tenth, no bounds."""
     billboards: int = 4
     """Number N of upright billboards, at k*180/N degrees through the tree's axis."""
     sides: Sides = "one"
-    """``one`` texture for both sides; ``two``, each seen from its own side; or the thesis's ``pair`` of rectangles a hair apart."""
+    """one texture for both sides; two, each seen from its own side; or the thesis's pair of rectangles a hair apart."""
     bounds: Bounds | None = None
-    """Rectangles that cover the viewport (``none``), the silhouette in the facing view (``thesis``) or the silhouettes in all
-    training views (``silhouette``). Preset: silhouette; thesis: none."""
+    """Rectangles that cover the viewport (viewport), the silhouette in the facing view (thesis) or the silhouettes in all
+    training views (silhouette). Preset: silhouette; thesis: viewport."""
     texel_density: float = 1.0
     """Texels per pixel where the tree's axis is seen face on."""
     loss: Loss = "l2"
@@ -60,7 +60,7 @@ class FitConfig:
     learning_rate: float | None = None
     """Adam's initial rate. Preset: 0.05; thesis: 0.01."""
     schedule: Schedule | None = None
-    """``cosine`` decay to zero, or the thesis's ``growth`` by (1 + 0.1 / steps) a step. Preset: cosine; thesis: growth."""
+    """cosine decay to zero, or the thesis's growth by (1 + 0.1 / steps) a step. Preset: cosine; thesis: growth."""
     seed: int = 0
     """Seeds the start textures and the order of views."""
     device: str = "cpu"
@@ -72,7 +72,7 @@ class FitConfig:
         check_choice("preset", self.preset, ("default", "thesis"))
         check_count("billboards", self.billboards)
         check_choice("sides", self.sides, ("one", "two", "pair"))
-        check_choice("bounds", self.bounds, (None, "none", "thesis", "silhouette"))
+        check_choice("bounds", self.bounds, (None, "viewport", "thesis", "silhouette"))
         check_range("texel_density", self.texel_density, 0, 16, open_low=True)
         check_choice("loss", self.loss, ("l1", "l2"))
         check_choice("schedule", self.schedule, (None, "cosine", "growth"))

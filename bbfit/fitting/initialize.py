@@ -39,7 +39,7 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
         sides=sides,
         gap=PAIR_GAP * float(camera.width / focal / 2),
     )
-    if config.bounds != "none":
+    if config.bounds != "viewport":
         if config.bounds == "thesis":
             bounds = facing_view_bounds(planes, views, pairs=sides == "pair")
         else:

@@ -163,16 +163,17 @@ def test_folder_with_other_content_is_refused(thing_glb: Path, unbroken: Path, t
 
 
 class Fragile(processes.Blender):
-    """A worker that is killed as soon as it has been handed its second frame, for the first ``deaths`` workers."""
+    """A worker that is killed just before it is handed its second frame, for the first ``deaths`` workers."""
 
     deaths = 0
 
     def send(self, request: dict[str, Any]) -> None:
-        super().send(request)
         self.handed = getattr(self, "handed", -2) + 1  # the job, then frames
         if self.handed == 1 and Fragile.deaths > 0:
             Fragile.deaths -= 1
             os.kill(self.pid, signal.SIGKILL)
+            self._process.wait()  # or it might finish the frame first
+        super().send(request)
 
 
 def test_crashed_worker_is_replaced(thing_glb: Path, unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

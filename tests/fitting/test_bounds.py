@@ -92,7 +92,7 @@ def test_silhouette_bounds_are_tight(views: ViewDataset) -> None:
 
 
 def test_bounds_save_texels_and_keep_their_density(views: ViewDataset) -> None:
-    whole = start_cloud(views.train, FitConfig(bounds="none"))
+    whole = start_cloud(views.train, FitConfig(bounds="viewport"))
     part = start_cloud(views.train, FitConfig(bounds="silhouette"))
     assert len(part.texels) < len(whole.texels)
     for cloud in (whole, part):
@@ -102,7 +102,7 @@ def test_bounds_save_texels_and_keep_their_density(views: ViewDataset) -> None:
 
 
 def test_unbounded_billboards_fill_the_viewport_of_a_facing_camera(views: ViewDataset) -> None:
-    cloud = start_cloud(views.train, FitConfig(billboards=4, bounds="none"))
+    cloud = start_cloud(views.train, FitConfig(billboards=4, bounds="viewport"))
     camera = views.train.cameras.to(torch.float32)
     size = torch.tensor([camera.width, camera.height])
     assert cloud.texture_sizes.tolist() == [[camera.height, camera.width]] * 4
@@ -115,7 +115,7 @@ def test_unbounded_billboards_fill_the_viewport_of_a_facing_camera(views: ViewDa
 
 
 def test_pairs_stand_a_hair_apart_along_the_normal(views: ViewDataset) -> None:
-    cloud = start_cloud(views.train, FitConfig(billboards=2, sides="pair", bounds="none"))
+    cloud = start_cloud(views.train, FitConfig(billboards=2, sides="pair", bounds="viewport"))
     between = ((cloud.centers[0::2] - cloud.centers[1::2]) * cloud.normals[0::2]).sum(-1)
     assert len(cloud) == 4 and cloud.vertex_count == 16
     assert (between > 0).all() and (between < 5e-3 * cloud.half_extents[0, 0]).all()
