@@ -5,9 +5,12 @@ Exit codes: 0 done, 2 bad input, 1 a failure of ours, 130 stopped from the keybo
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import io
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -38,7 +41,7 @@ def _run(
     Killed and started again, it goes on where it stopped. What stands and has unchanged inputs is not done again.
 
     Args:
-        tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usdc .usdz .blend) or a folder of views; left out, a small tree that comes
+        tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend) or a folder of views; left out, a small tree that comes
             with bbfit.
         out: Folder for the results.
         views: How the tree is rendered.
@@ -61,7 +64,7 @@ def _views(
     """Render views of a tree with Blender, in the NeRF-synthetic layout.
 
     Args:
-        tree: The tree's file (.glb .gltf .obj .ply .stl .fbx .usd .usdc .usdz .blend).
+        tree: The tree's file (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
         out: Folder for the views; one that holds a part of them is completed.
         config: How the tree is rendered.
     """
@@ -107,24 +110,28 @@ def _evaluate(
     Args:
         cloud: A .safetensors file written by bbfit fit.
         views: Folder of views.
-        out: File for the measures as JSON; left out, metrics.json beside the cloud.
+        out: File for the measures as JSON; left out, metrics.json beside the cloud, which replaces the one of its run.
     """
+    from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
+    from bbfit.files import output_folder
     from bbfit.geometry.cloud import BillboardCloud
     from bbfit.pipeline import original_tree
     from bbfit.reporting.tables import report_table
     from bbfit.views import ViewDataset
 
     billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
+    out, earlier = out or cloud.with_name("metrics.json"), cloud.with_name("metrics.json")
+    output_folder("out", out.parent)
     with _progress() as tell:
         report = evaluate(
             billboards,
             dataset.test,
             original=original_tree(dataset),
             model_bytes=model.stat().st_size if (model := cloud.with_name("model.glb")).is_file() else None,
+            seconds=Report.load(earlier).seconds if earlier.is_file() else None,
             on_view=lambda done, total: tell("evaluate", done, total),
         )
-    out = out or cloud.with_name("metrics.json")
     report.save(out)
     _out.print(report_table(report))
     _out.print(f"measures in {out}", soft_wrap=True)
@@ -150,18 +157,32 @@ def _export(
         _out.print(f"{path}  {path.stat().st_size:,} bytes")
 
 
-_COMMANDS: dict[str, Callable[..., Any]] = {"run": _run, "views": _views, "fit": _fit, "evaluate": _evaluate, "export": _export}
+def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """The same command line, but parsing it only returns what to do."""
+
+    @functools.wraps(command)
+    def bind(*args: Any, **options: Any) -> Callable[[], None]:
+        return functools.partial(command, *args, **options)
+
+    return bind
+
+
+_COMMANDS: dict[str, Callable[..., Any]] = {
+    "run": _later(_run),
+    "views": _later(_views),
+    "fit": _later(_fit),
+    "evaluate": _later(_evaluate),
+    "export": _later(_export),
+}
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
+    if list(sys.argv[1:] if args is None else args) == ["--version"]:
+        _out.print(f"bbfit {version('bbfit')}", highlight=False)
+        return 0
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            _COMMANDS,
-            prog="bbfit",
-            description="Compress a 3D tree into a handful of textured planes that look like it from every side.",
-            args=args,
-        )
+        _parse(args)()
     except BrokenPipeError:  # the reader of our output, such as head, has seen enough
         sys.stdout = None
         return 0
@@ -172,6 +193,27 @@ def main(args: Sequence[str] | None = None) -> int:
         _err.print("bbfit: stopped; the same command goes on from here")
         return 130
     return 0
+
+
+def _parse(args: Sequence[str] | None) -> Callable[[], None]:
+    """What the arguments ask for; bad values raise :class:`InputError`, unknown options end the process with exit code 2."""
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.extras.subcommand_cli_from_dict(
+                _COMMANDS,
+                prog="bbfit",
+                description="Compress a 3D tree into a handful of textured planes that look like it from every side.",
+                args=args,
+            )
+    except SystemExit as ending:
+        error: BaseException | None = ending
+        while error is not None and not isinstance(error, InputError):
+            error = error.__cause__ or error.__context__
+        if error is not None:
+            raise error from None
+        sys.stderr.write(complaint.getvalue())
+        raise
 
 
 def _show(result: RunResult) -> None:
@@ -185,7 +227,7 @@ def _show(result: RunResult) -> None:
     )
 
 
-@contextmanager
+@contextlib.contextmanager
 def _progress() -> Iterator[Progress]:
     """One bar a stage, with rate and time left, on standard error."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn

@@ -13,17 +13,27 @@ from torch import Tensor
 
 from bbfit.checks import fail
 
+PART = ".part"
+"""Ending of the temporary names, which start with a dot."""
+
 
 def write_bytes(path: str | Path, data: bytes) -> None:
     """Write ``data`` to ``path`` atomically; on any failure the old file stays as it was.
 
     Raises
     ------
-    OSError
-        if the disk is full or the folder is not writable; the partial file is removed.
+    InputError
+        if the disk is full or the folder is missing or not writable; the partial file is removed.
     """
     path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    try:
+        _replace(path, data)
+    except OSError as error:
+        fail("out", f"{path} cannot be written ({error.strerror})", "free the disk or choose another place, then start again")
+
+
+def _replace(path: Path, data: bytes) -> None:
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=PART)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
@@ -65,6 +75,8 @@ def output_folder(name: str, path: str | Path) -> Path:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass
+        for leftover in path.glob(f".*{PART}"):  # of a process that was killed while it wrote
+            leftover.unlink(missing_ok=True)
     except (FileExistsError, NotADirectoryError):
         fail(name, f"a part of {path} is a file, not a folder", "choose another output folder")
     except OSError as error:

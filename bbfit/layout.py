@@ -22,6 +22,9 @@ from bbfit.geometry.camera import Camera, camera_from_nerf, camera_to_nerf, pinh
 TRAIN_FILE, TEST_FILE, SINGLE_FILE = "transforms_train.json", "transforms_test.json", "transforms.json"
 REQUEST_FILE = "views.json"
 """What ``bbfit views`` notes beside the transforms: what was asked, and what was found of the tree."""
+CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "ORTHOGRAPHIC")
+"""Values of ``camera_model`` that are read; with OPENCV the distortion coefficients must be zero."""
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 TEST_SHARE = 0.25
 # How far from orthonormal a camera's axes may be: files in the wild carry four decimals.
 RIGID_TOLERANCE = 1e-3
@@ -77,13 +80,19 @@ class Frame:
 def read_frames(folder: Path) -> tuple[list[Frame], list[Frame] | None]:
     """Training and test frames of a views folder; ``None`` for the test frames where the folder names none.
 
-    ``transforms.json`` alone (nerfstudio) and a training file alone are read as one list.
+    ``transforms.json`` alone (nerfstudio) is split by the ``test_filenames`` in it; without those, it and a training file alone are
+    read as one list.
     """
     for name in (TRAIN_FILE, SINGLE_FILE):
         if (folder / name).is_file():
             train = _read_file(folder / name)
-            test = _read_file(folder / TEST_FILE) if (folder / TEST_FILE).is_file() else None
-            return train, test
+            if (folder / TEST_FILE).is_file():
+                return train, _read_file(folder / TEST_FILE)
+            held_out = train[0].header.get("test_filenames") if train else None
+            if not isinstance(held_out, list) or not held_out:
+                return train, None
+            test = [frame for frame in train if frame.header["file_path"] in held_out]
+            return [frame for frame in train if frame not in test], test
     raise MissingFileError(f"views: {folder} has no {TRAIN_FILE} or {SINGLE_FILE}; give a folder that bbfit views wrote")
 
 
@@ -131,6 +140,8 @@ def cameras_of(frames: list[Frame], width: int, height: int) -> Camera:
 
 def _intrinsics(frame: Frame, width: int, height: int) -> torch.Tensor:
     header = frame.header
+    if header.get("camera_model", "OPENCV") not in CAMERA_MODELS or any(header.get(name) for name in _DISTORTION):
+        fail("views", f"{frame.image.parent.parent}: the pictures are distorted by their lens", "undistort them and their transforms first")
     try:
         if "fl_x" in header:
             scale_x, scale_y = width / float(header.get("w", width)), height / float(header.get("h", height))

@@ -136,8 +136,12 @@ class _Record:
         except InputError:
             earlier = {}  # a damaged record only costs the skipping
         stages = earlier.get("stages") if isinstance(earlier, dict) else None
-        self.stages: dict[str, dict[str, Any]] = stages if isinstance(stages, dict) else {}
-        resolved = {"views": asdict(config.views), "fit": asdict(config.fit.resolve()), "export": asdict(config.export)}
+        self.stages = {name: stage for name, stage in stages.items() if _is_stage(stage)} if isinstance(stages, dict) else {}
+        resolved = {
+            "views": None if source.is_dir() else asdict(config.views),
+            "fit": asdict(config.fit.resolve()),
+            "export": asdict(config.export),
+        }
         self._head = {
             "source": str(source.resolve()),
             "config": json.loads(json.dumps(resolved, default=str)),
@@ -154,7 +158,7 @@ class _Record:
     def stands(self, stage: str, inputs: str) -> bool:
         """Whether a stage was done with these inputs and nobody touched what it wrote."""
         done = self.stages.get(stage)
-        if not isinstance(done, dict) or done.get("inputs") != inputs or not isinstance(done.get("outputs"), dict):
+        if done is None or done["inputs"] != inputs:
             return False
         if any(_hash_file(self.folder / name) != digest for name, digest in done["outputs"].items()):
             return False
@@ -168,10 +172,24 @@ class _Record:
         write_json(self.folder / RECORD_FILE, self._head | {"stages": self.stages})
 
 
+def _is_stage(entry: Any) -> bool:
+    """Whether an entry of ``run.json`` is whole."""
+    kinds = {"inputs": str, "outputs": dict, "seconds": int | float}
+    return isinstance(entry, dict) and all(isinstance(entry.get(name), kind) for name, kind in kinds.items())
+
+
 def _render(tree: Path, record: _Record, config: ViewsConfig, tell: Progress) -> ViewDataset:
     from bbfit.blender.views_folder import render_views
 
-    folder = render_views(tree, record.folder / "views", config, on_progress=lambda done, total: tell("views", done, total))
+    standing: list[int] = []
+
+    def on_progress(done: int, total: int) -> None:
+        standing.append(done)
+        tell("views", done, total)
+
+    folder = render_views(tree, record.folder / "views", config, on_progress=on_progress)
+    if standing[0] == config.count:
+        record.skipped.append("views")
     views = ViewDataset.load(folder)
     seconds = views.request.get("seconds")
     record.done("views", views.fingerprint, [], float(seconds) if isinstance(seconds, int | float) else 0.0)
@@ -187,11 +205,13 @@ def _fit(views: ViewDataset, record: _Record, config: FitConfig, tell: Progress)
     def on_step(step: Step) -> None:
         tell("fit", step.index, step.total, f"loss {step.loss:.5f}")
 
-    result = fit(views, config, checkpoint=record.folder / "fit.checkpoint", on_step=on_step)
+    checkpoint = record.folder / "fit.checkpoint"
+    result = fit(views, config, checkpoint=checkpoint, on_step=on_step)
     result.cloud.save(path)
     write_bytes(record.folder / "loss.csv", _loss_table(result.losses))
     loss_plot(result.losses, record.folder / "loss.png")
     record.done("fit", inputs, [path.name, "loss.csv", "loss.png"], result.seconds)
+    checkpoint.unlink(missing_ok=True)
     return result.cloud
 
 

@@ -25,6 +25,10 @@ CACHE_BYTES = 1 << 30
 """Decoded pictures that a dataset keeps in memory at most, in bytes; the ones used longest ago go first."""
 
 
+LEAST_PIXELS = 11
+"""Least width and height of a picture: that of the window of the structural similarity."""
+
+
 class _Cache:
     """Decoded pictures, least recently used out first; safe to use from several threads."""
 
@@ -136,6 +140,8 @@ class ViewDataset:
         if not train or not test:
             fail("views", f"{folder} has {len(train)} training and {len(test or [])} test views", "at least one of each is needed")
         width, height = _common_size([*train, *test])
+        if min(width, height) < LEAST_PIXELS:
+            fail("views", f"{folder} has pictures of {width}x{height} pixels", f"give at least {LEAST_PIXELS}x{LEAST_PIXELS}")
         cache = _Cache(cache_bytes)
 
         def view_set(frames: list[Frame]) -> ViewSet:
@@ -146,13 +152,13 @@ class ViewDataset:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 over the cameras and the pictures' bytes: equal for equal views, wherever they lie."""
+        """SHA-256 over the cameras and the pictures' pixels: equal for equal views, wherever they lie and however they were packed."""
         digest = sha256()
         for views in (self.train, self.test):
             digest.update(repr((views.cameras.width, views.cameras.height, views.cameras.orthographic)).encode())
             digest.update(views.cameras.world_to_camera.numpy().tobytes() + views.cameras.intrinsics.numpy().tobytes())
-            for path in views.paths:
-                digest.update(sha256(path.read_bytes()).digest())
+            for index in range(len(views)):
+                digest.update(sha256(views.image(index).numpy().tobytes()).digest())
         return digest.hexdigest()
 
 

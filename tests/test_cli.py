@@ -87,6 +87,7 @@ def test_export(fitted: Path, tmp_path: Path, name: str, capsys: pytest.CaptureF
         (["run", "{tmp}/tree.docx", "--out", "{tmp}/o"], ".glb"),
         (["views", "{tmp}/none.glb", "--out", "{tmp}/o"], "none.glb"),
         (["evaluate", "{tmp}/none.safetensors", "{views}"], "none.safetensors"),
+        (["evaluate", "{cloud}", "{views}", "--out", "{cloud}/metrics.json"], "{cloud}"),
         (["evaluate", "{tmp}/tree.docx", "{views}"], "tree.docx"),
         (["export", "{cloud}", "--out", "{tmp}/model.stl"], ".glb or .obj"),
         (["export", "{cloud}", "--out", "{tmp}/nowhere/model.glb"], "nowhere"),
@@ -99,8 +100,19 @@ def test_bad_input_is_one_line_and_exit_code_2(
     (tmp_path / "empty.glb").touch()
     (tmp_path / "tree.docx").write_text("not a tree")
     places = {"tmp": tmp_path, "views": views_folder, "cloud": fitted / "cloud.safetensors"}
-    assert says in refused([part.format(**places) for part in arguments], capsys)
+    assert says.format(**places) in refused([part.format(**places) for part in arguments], capsys)
     assert not (tmp_path / "o" / "cloud.safetensors").exists()
+
+
+@pytest.mark.parametrize("option", ["--fit.billboards", "--views.count", "--export.padding"])
+def test_a_bad_value_in_a_stage_of_a_run_is_one_line(option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused(["run", str(tmp_path / "tree.glb"), "--out", str(tmp_path / "out"), option, "0"], capsys)
+    assert option.rpartition(".")[2] in line and "at least" in line
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("bbfit ")
 
 
 def test_a_view_without_content_is_named(views_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -137,7 +149,11 @@ def test_a_disk_that_fills_up_leaves_the_earlier_model(fitted: Path, tmp_path: P
     environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
     result = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit, env=environment)
     assert result.returncode == 2, result.stderr
-    assert result.stderr.startswith("bbfit: ") and len(result.stderr.strip().splitlines()) == 1
+    assert (
+        result.stderr.startswith("bbfit: ")
+        and "model.glb cannot be written" in result.stderr
+        and len(result.stderr.strip().splitlines()) == 1
+    )
     assert model.read_bytes() == b"earlier" and [path.name for path in tmp_path.iterdir()] == ["model.glb"]
 
 

@@ -78,8 +78,9 @@ def test_only_what_depends_on_a_change_is_done_again(views_folder: Path, tmp_pat
     assert (tmp_path / "model.obj").read_text() != "spoilt"
     other = dataclasses.replace(masked, fit=dataclasses.replace(CONFIG.fit, seed=1))
     assert run(views_folder, tmp_path, other).skipped == ()
-    (tmp_path / "run.json").write_text("{")
-    assert run(views_folder, tmp_path, other).skipped == ()
+    for damage in ("{", '{"stages": {"fit": {"inputs": 3}, "evaluate": 5, "old": {"x": 1}}}'):
+        (tmp_path / "run.json").write_text(damage)
+        assert run(views_folder, tmp_path, other).skipped == ()
 
 
 def test_a_killed_run_goes_on_to_the_same_result(views_folder: Path, tmp_path: Path, done: RunResult) -> None:
@@ -96,6 +97,17 @@ def test_a_killed_run_goes_on_to_the_same_result(views_folder: Path, tmp_path: P
     assert torch.equal(result.cloud.texels, done.cloud.texels)
     for name in ("cloud.safetensors", "loss.csv", *MODELS):
         assert (tmp_path / name).read_bytes() == (done.folder / name).read_bytes()
+
+
+def test_a_fit_whose_result_cannot_be_saved_is_not_lost(views_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "cloud.safetensors").mkdir()
+    with pytest.raises(InputError, match=r"cloud\.safetensors cannot be written"):
+        run(views_folder, tmp_path, CONFIG)
+    (tmp_path / "cloud.safetensors").rmdir()
+    told = []
+    run(views_folder, tmp_path, CONFIG, on_progress=lambda stage, *rest: told.append(stage))
+    assert "fit" not in told
+    assert not (tmp_path / "fit.checkpoint").exists()
 
 
 def test_bad_views_leave_earlier_results_as_they_were(views_folder: Path, tmp_path: Path, done: RunResult) -> None:
@@ -145,7 +157,7 @@ def test_from_a_tree_to_a_model(tmp_path: Path) -> None:
     assert low[0] < 0 < high[0] and low[2] < 0 < high[2]
 
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*") if path.name not in ("run.json",)}
-    assert run(None, tmp_path, config).skipped == ("fit", "export", "evaluate")
+    assert run(None, tmp_path, config).skipped == ("views", "fit", "export", "evaluate")
     assert {path: path.stat().st_mtime_ns for path in before} == before
     with pytest.raises(InputError, match="size 48"):
         run(None, tmp_path, dataclasses.replace(config, views=dataclasses.replace(config.views, size=64)))

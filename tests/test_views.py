@@ -85,6 +85,16 @@ def test_one_file_without_split_gives_a_seeded_quarter(folder: Path) -> None:
     assert first.test.paths == again.test.paths != other.test.paths
 
 
+def test_nerfstudio_split_is_kept(folder: Path) -> None:
+    train, test = (json.loads((folder / f"transforms_{name}.json").read_text()) for name in ("train", "test"))
+    (folder / "transforms_train.json").unlink()
+    (folder / "transforms_test.json").unlink()
+    names = {"test_filenames": [frame["file_path"] for frame in train["frames"][:2]]}
+    (folder / "transforms.json").write_text(json.dumps(train | names | {"frames": train["frames"] + test["frames"]}))
+    views = ViewDataset.load(folder)
+    assert [f"./images/{name}" for name in views.test.names] == names["test_filenames"] and len(views.train) == 14
+
+
 def test_pictures_in_memory_stay_within_the_bound(views_folder: Path) -> None:
     one = 48 * 40 * 4
     views = ViewDataset.load(views_folder, cache_bytes=3 * one)
@@ -96,6 +106,9 @@ def test_pictures_in_memory_stay_within_the_bound(views_folder: Path) -> None:
 
 def test_fingerprint_follows_content_not_place(views_folder: Path, folder: Path) -> None:
     before = ViewDataset.load(views_folder).fingerprint
+    assert ViewDataset.load(folder).fingerprint == before
+    for path in (folder / "images").iterdir():  # the same pixels in another file
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     assert ViewDataset.load(folder).fingerprint == before
     edit(folder, lambda content: content["frames"][0]["transform_matrix"][0].__setitem__(3, 9.0), ("train",))
     assert ViewDataset.load(folder).fingerprint != before
@@ -160,6 +173,8 @@ def test_bad_pictures_are_named(folder: Path, spoil: Callable[[Path], None], say
         (lambda content: [content.pop(key) for key in ("fl_x", "camera_angle_x")], "camera_angle_x"),
         (lambda content: content.update(fl_x="wide"), "fl_x"),
         (lambda content: content.update(frames=[]), "0 training"),
+        (lambda content: content.update(k1=0.1), "distorted"),
+        (lambda content: content["frames"][3].update(camera_model="OPENCV_FISHEYE"), "distorted"),
     ],
 )
 def test_bad_transforms_are_named(folder: Path, change: Callable[[dict], None], says: str) -> None:
@@ -175,6 +190,10 @@ def test_folders_that_are_no_views(folder: Path, tmp_path: Path) -> None:
         ViewDataset.load(folder / "transforms_train.json")
     with pytest.raises(MissingFileError, match=r"no transforms_train\.json"):
         ViewDataset.load(tmp_path)
+    for path in (folder / "images").iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:8])
+    with pytest.raises(InputError, match="at least 11x11"):
+        ViewDataset.load(folder)
     (folder / "transforms_train.json").write_text('{"frames": [')
     with pytest.raises(InputError, match="not valid JSON"):
         ViewDataset.load(folder)

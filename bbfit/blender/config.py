@@ -58,8 +58,8 @@ class ViewsConfig:
         check_count("count", self.count, 2)
         if self.count < len(self.elevations):
             fail("count", f"expected at least one view for each of {len(self.elevations)} rings, got {self.count}")
-        check_count("size", self.size, 8)
-        check_range("size", self.size, 8, 16384)
+        check_count("size", self.size, 11)
+        check_range("size", self.size, 11, 16384)
         check_range("fov_degrees", self.fov_degrees, 1, 170)
         check_count("samples", self.samples)
         check_range("sun_strength", self.sun_strength, 0, 1e6)

@@ -16,6 +16,7 @@ import os
 import queue
 import sys
 import threading
+import traceback
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -57,6 +58,10 @@ def main() -> NoReturn:
             answer("done", frame=frame["frame"])
     except Refused as refusal:
         answer("refused", reason=refusal.args)
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+        os._exit(1)
     os._exit(0)  # an ordinary exit would wait for the listening thread
 
 

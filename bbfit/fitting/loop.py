@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bbfit.checks import fail
+from bbfit.checks import InputTypeError, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
@@ -81,7 +81,8 @@ def fit(
     views : training views from around the tree.
     config : the preset ``default`` when left out.
     checkpoint : file to keep the state in every ``config.checkpoint_every`` steps. If it holds the state of a fit of the same views by
-        the same configuration, that fit goes on, and ends with the same result as an unbroken one. It is removed at the end.
+        the same configuration, that fit goes on, and ends with the same result as an unbroken one. The caller removes the file once
+        the result is safe.
     on_step : called after every step.
 
     Raises
@@ -89,6 +90,8 @@ def fit(
     InputError
         if a view cannot be read or is empty, or the device is not there.
     """
+    if not isinstance(views, ViewDataset):
+        raise InputTypeError(f"views: expected a ViewDataset, got {views!r}; ViewDataset.load(folder) reads one")
     config = (config or FitConfig()).resolve()
     assert config.steps is not None and config.views_per_step is not None
     device = _device(config.device)
@@ -124,10 +127,8 @@ def fit(
         state.seconds = time.perf_counter() - begun
         if on_step is not None:
             on_step(Step(index + 1, config.steps, state.losses[-1], rate))
-        if checkpoint is not None and (index + 1) % config.checkpoint_every == 0 and index + 1 < config.steps:
+        if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
             _save(checkpoint, mark, state)
-    if checkpoint is not None:
-        checkpoint.unlink(missing_ok=True)
     cloud = start.with_texels(texels.detach())
     # No view determines the colour of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
     bled = [bleed_colour(side).reshape(-1, 4) for texture in cloud.textures() for side in texture]

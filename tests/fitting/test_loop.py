@@ -92,7 +92,8 @@ def test_a_killed_fit_goes_on_to_the_same_result(views: ViewDataset, tmp_path: P
     resumed = fit(views, config, checkpoint=state, on_step=lambda step: seen.append(step.index))
     assert seen == [1, 2, 3, 4, 5, 6, 7, 8, 7, 8, 9, 10, 11]
     assert same(whole, resumed)
-    assert not state.exists()
+    again = fit(views, config, checkpoint=state, on_step=lambda step: pytest.fail("there was nothing left to do"))
+    assert same(whole, again)
 
 
 @pytest.mark.parametrize("spoil", ["other configuration", "cut short"])
