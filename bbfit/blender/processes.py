@@ -32,7 +32,7 @@ def require_bpy() -> None:
         fail(
             "Blender",
             "its module bpy is not installed",
-            'run pip install "bbfit[blender]" with Python 3.11, or give a folder of views instead of a tree',
+            'install bbfit with its extra, pip install "bbfit[blender]" (".[blender]" in its source folder), on Python 3.11, or give a folder of views',
         )
 
 
