@@ -32,7 +32,8 @@ def require_bpy() -> None:
         fail(
             "Blender",
             "its module bpy is not installed",
-            'install bbfit with its extra, pip install "bbfit[blender]" (".[blender]" in its source folder), on Python 3.11, or give a folder of views',
+            'install bbfit with its extra, pip install "bbfit[blender]" (".[blender]" in its source folder), on Python 3.11, '
+            "or give a folder of views",
         )
 
 

@@ -222,7 +222,9 @@ def test_unusable_panorama_and_device(thing_glb: Path, tmp_path: Path) -> None:
 def test_without_blender(thing_glb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     find: Callable[..., Any] = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "bpy" else find(name, *rest))
-    with pytest.raises(InputError, match=r'bpy is not installed; install bbfit with its extra, pip install "bbfit\[blender\]".*Python 3\.11'):
+    with pytest.raises(
+        InputError, match=r'bpy is not installed; install bbfit with its extra, pip install "bbfit\[blender\]".*Python 3\.11'
+    ):
         render_views(thing_glb, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
