@@ -198,7 +198,7 @@ def _render(tree: Path, record: _Record, config: ViewsConfig, tell: Progress) ->
 
 def _fit(views: ViewDataset, record: _Record, config: FitConfig, tell: Progress) -> BillboardCloud:
     config, path = config.resolve(), record.folder / "cloud.safetensors"
-    inputs = _hash("fit", {**asdict(config), "checkpoint_every": None}, views.fingerprint)
+    inputs = _hash("fit", {**asdict(config), "checkpoint_every": None}, views.train.fingerprint)
     if record.stands("fit", inputs):
         return BillboardCloud.load(path)
 

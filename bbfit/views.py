@@ -94,6 +94,15 @@ class ViewSet:
         """Several pictures as the renderer would draw them: premultiplied RGBA in [0, 1], [B, H, W, 4]."""
         return premultiply(self.images(indices).to(dtype) / 255)
 
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over the cameras and the pictures' pixels: equal for equal views, wherever they lie and however they were packed."""
+        digest = sha256(repr((self.cameras.width, self.cameras.height, self.cameras.orthographic)).encode())
+        digest.update(self.cameras.world_to_camera.numpy().tobytes() + self.cameras.intrinsics.numpy().tobytes())
+        for index in range(len(self)):
+            digest.update(sha256(self.image(index).numpy().tobytes()).digest())
+        return digest.hexdigest()
+
     def check(self) -> None:
         """Decode every picture once, so that a bad one is found now and not in the middle of long work."""
         with ThreadPoolExecutor() as pool:
@@ -152,14 +161,8 @@ class ViewDataset:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 over the cameras and the pictures' pixels: equal for equal views, wherever they lie and however they were packed."""
-        digest = sha256()
-        for views in (self.train, self.test):
-            digest.update(repr((views.cameras.width, views.cameras.height, views.cameras.orthographic)).encode())
-            digest.update(views.cameras.world_to_camera.numpy().tobytes() + views.cameras.intrinsics.numpy().tobytes())
-            for index in range(len(views)):
-                digest.update(sha256(views.image(index).numpy().tobytes()).digest())
-        return digest.hexdigest()
+        """SHA-256 over both splits' fingerprints."""
+        return sha256((self.train.fingerprint + self.test.fingerprint).encode()).hexdigest()
 
 
 def _common_size(frames: list[Frame]) -> tuple[int, int]:

@@ -39,6 +39,7 @@ class Refused(Exception):
 
 def main() -> NoReturn:
     """Serve one parent until it hangs up."""
+    sys.excepthook = _die
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what C code prints
     requests: queue.Queue[dict[str, Any]] = queue.Queue()
@@ -58,11 +59,14 @@ def main() -> NoReturn:
             answer("done", frame=frame["frame"])
     except Refused as refusal:
         answer("refused", reason=refusal.args)
-    except BaseException:
-        traceback.print_exc()
-        sys.stderr.flush()
-        os._exit(1)
     os._exit(0)  # an ordinary exit would wait for the listening thread
+
+
+def _die(*error: Any) -> None:
+    """Say what went wrong and end at once; an ordinary end would trip over the listening thread and bury the message."""
+    traceback.print_exception(*error)
+    sys.stderr.flush()
+    os._exit(1)
 
 
 def _listen(requests: queue.Queue[dict[str, Any]]) -> None:

@@ -97,7 +97,7 @@ def fit(
     device = _device(config.device)
     views.train.check()
     start = start_cloud(views.train, config).to(device)
-    mark = sha256(json.dumps([1, asdict(config), views.fingerprint], sort_keys=True).encode()).hexdigest()
+    mark = sha256(json.dumps([1, asdict(config), views.train.fingerprint], sort_keys=True).encode()).hexdigest()
     checkpoint = Path(checkpoint) if checkpoint is not None else None
     state = _load(checkpoint, mark, device) if checkpoint is not None else None
     if state is None:

@@ -240,7 +240,7 @@ def test_importing_loads_no_blender() -> None:
         ({"count": 2, "elevations": (0.0, 10.0, 20.0)}, "count: expected at least one view for each of 3 rings"),
         ({"elevations": ()}, "elevations: expected one or more angles"),
         ({"elevations": (91.0,)}, "elevations: expected a value in"),
-        ({"size": 0}, "size: expected at least 8"),
+        ({"size": 0}, "size: expected at least 11"),
         ({"size": 64.0}, "size: expected a whole number"),
         ({"fov_degrees": 180.0}, "fov_degrees: expected"),
         ({"samples": 0}, "samples: expected at least 1"),

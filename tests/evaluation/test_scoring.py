@@ -122,7 +122,7 @@ def test_bad_input(views: ViewDataset, tmp_path: Path) -> None:
         evaluate(cloud.with_texels(torch.full_like(cloud.texels, torch.nan)), views.test)
     with pytest.raises(InputError, match="no held-out view"):
         evaluate(cloud, replace(views.test, paths=()))
-    with pytest.raises(InputError, match=r"12 x 10 pixels are too small"):
+    with pytest.raises(InputError, match=r"12x10 pixels; give at least 11x11"):
         evaluate(cloud, write_views(tmp_path, cloud, count=4, width=12, height=10).test)
     with pytest.raises(InputError, match="original vertices: expected at least 0"):
         OriginalTree(vertices=-1)
