@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +25,23 @@ def write_bytes(path: str | Path, data: bytes) -> None:
     InputError
         if the disk is full or the folder is missing or not writable; the partial file is removed.
     """
+    write_pieces(path, (data,))
+
+
+def write_pieces(path: str | Path, pieces: Iterable[bytes]) -> None:
+    """Write a file as :func:`write_bytes` does, one piece after the other, so that it need not fit into memory."""
     path = Path(path)
     try:
-        _replace(path, data)
+        _replace(path, pieces)
     except OSError as error:
         fail("out", f"{path} cannot be written ({error.strerror})", "free the disk or choose another place, then start again")
 
 
-def _replace(path: Path, data: bytes) -> None:
+def _replace(path: Path, pieces: Iterable[bytes]) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=PART)
     try:
         with os.fdopen(handle, "wb") as file:
-            file.write(data)
+            file.writelines(pieces)
             file.flush()
             os.fsync(file.fileno())
         Path(temporary).chmod(0o644)
@@ -55,7 +60,7 @@ def read_json(name: str, path: Path) -> Any:
     """Read a JSON file, with an :class:`~bbfit.checks.InputError` that names it when it is damaged."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also numbers too long and lists too deep to be read
         fail(name, f"{path} is not valid JSON ({error})", "remove the file or restore it")
 
 

@@ -22,7 +22,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in MODULES}
 # Lowest first. A module imports from the groups before its own and from its own package, never from another name of its group.
 GROUPS = (
     ("checks",),
-    ("files",),
+    ("files", "model_files"),
     ("geometry",),
     ("layout",),
     ("images",),

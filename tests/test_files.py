@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import torch
 from safetensors import safe_open
 
 from bbfit.checks import InputError
-from bbfit.files import output_folder, read_json, write_bytes, write_json, write_tensors
+from bbfit.files import output_folder, read_json, write_bytes, write_json, write_pieces, write_tensors
 
 
 def names(folder: Path) -> list[str]:
@@ -40,6 +41,20 @@ def test_a_failure_leaves_the_old_file_and_no_part(
     with pytest.raises(InputError if isinstance(error, OSError) else type(error)):
         write_bytes(path, b"new")
     assert path.read_bytes() == b"old" and names(tmp_path) == ["a.bin"]
+
+
+def test_pieces_make_one_file_or_none(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    write_pieces(path, (bytes([value]) * 3 for value in (1, 2)))
+    assert path.read_bytes() == b"\1\1\1\2\2\2"
+
+    def breaking_off() -> Iterator[bytes]:
+        yield b"new"
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_pieces(path, breaking_off())
+    assert path.read_bytes() == b"\1\1\1\2\2\2" and names(tmp_path) == ["a.bin"]
 
 
 def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
 
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.quads import Quads
+from bbfit.model_files import glb_of_scene
 
-# Numbers that glTF 2.0 borrows from OpenGL (specification, sections 5.11 and 5.26).
-_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
+# Numbers that glTF 2.0 borrows from OpenGL (specification, section 5.26).
 _SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}  # linear, trilinear, clamped to the edge
 
 
@@ -49,12 +48,11 @@ def glb_bytes(quads: Quads, config: ExportConfig) -> bytes:
             process=False,
         )
         scene.add_geometry(mesh, node_name=name, geom_name=name)
-    return trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=_complete)
+    return glb_of_scene(scene, _complete)
 
 
 def _complete(tree: dict[str, Any]) -> None:
     """Add to trimesh's glTF what it has no means to say."""
-    tree["asset"]["generator"] = _generator()
     tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), "KHR_materials_unlit"})
     for material in tree["materials"]:
         material["extensions"] = {"KHR_materials_unlit": {}}
@@ -65,16 +63,3 @@ def _complete(tree: dict[str, Any]) -> None:
     tree["textures"] = [{"source": 0, "sampler": 0, "name": "atlas"}]
     for material in tree["materials"]:
         material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
-    for mesh in tree["meshes"]:
-        mesh.pop("extras", None)
-        for primitive in mesh["primitives"]:
-            for accessor in primitive["attributes"].values():
-                tree["bufferViews"][tree["accessors"][accessor]["bufferView"]]["target"] = _ARRAY_BUFFER
-            tree["bufferViews"][tree["accessors"][primitive["indices"]]["bufferView"]]["target"] = _ELEMENT_ARRAY_BUFFER
-
-
-def _generator() -> str:
-    try:
-        return f"bbfit {version('bbfit')}"
-    except PackageNotFoundError:  # used from a folder that was never installed
-        return "bbfit"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bbfit.checks import check_folder, fail
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.obj import mtl_bytes, obj_bytes
@@ -12,8 +11,7 @@ from bbfit.exporting.quads import cloud_quads
 from bbfit.files import write_bytes
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png
-
-SUFFIXES = (".glb", ".obj")
+from bbfit.model_files import check_model_path
 
 
 def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None = None) -> list[Path]:
@@ -32,13 +30,9 @@ def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None 
     MissingFileError, OSError
         if the folder does not exist or cannot be written to; files that were there stay as they were.
     """
-    path, config = Path(path), config or ExportConfig()
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        fail("model file", f"{path} ends in {path.suffix or 'nothing'}", f"choose an ending of {' or '.join(SUFFIXES)}")
-    check_folder("model file's folder", path.parent)
+    path, config = check_model_path("model file", path), config or ExportConfig()
     quads = cloud_quads(cloud, config.padding)
-    if suffix == ".glb":
+    if path.suffix.lower() == ".glb":
         contents = {path: glb_bytes(quads, config)}
     else:
         material, texture = path.with_suffix(".mtl"), path.with_suffix(".png")

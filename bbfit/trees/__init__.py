@@ -1,0 +1,1 @@
+"""The built-in tree generator, after Weber and Penn 1995."""

@@ -1,0 +1,37 @@
+"""What a grown tree is made of: triangles by material, as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Material:
+    """A plain surface: colour and roughness, no texture."""
+
+    name: str
+    """Name in the file, such as ``bark`` or ``leaf_0``."""
+    color: tuple[float, float, float]
+    """Linear RGB reflectance in [0, 1], as glTF's ``baseColorFactor``."""
+    roughness: float
+    """Roughness in [0, 1], as glTF's ``roughnessFactor``."""
+    double_sided: bool
+    """Whether the back of a triangle is seen, with its normal turned over, as that of a leaf is."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """The triangles of one material; Y up, metres, the foot of the trunk at the origin."""
+
+    material: Material
+    vertices: NDArray[np.float32]
+    """Positions, [n, 3]."""
+    normals: NDArray[np.float32]
+    """Unit normals, [n, 3], on the side from which a triangle's corners run counter-clockwise."""
+    uvs: NDArray[np.float32]
+    """Texture coordinates, [n, 2], v counted upwards."""
+    faces: NDArray[np.int32]
+    """Corners of the triangles, [m, 3], as indices into the part's own vertices."""

@@ -1,0 +1,147 @@
+"""A grown tree before it has a surface: stems as curves, leaves as frames.
+
+Here z is up and lengths are metres; an array of frames [..., 3, 3] holds local axes in its columns, the third of which runs along the stem
+or leaf. Nothing here knows of triangles: how finely stems are drawn changes nothing about the tree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bbfit.trees.species import Species
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Stems:
+    """All stems of one level, S of them, clones after the stems that they split from."""
+
+    level: int
+    """0 is the trunk's."""
+    nodes: Array
+    """Ends of the curve's segments, [S, nCurveRes + 1, 3]; a clone's before its first node are those of the stem it comes from."""
+    frames: Array
+    """Local axes there, [S, nCurveRes + 1, 3, 3]."""
+    first: Indices
+    """The node that a stem begins at, [S]; 0 but for clones."""
+    length: Array
+    """Metres from node 0 to the tip, [S]."""
+    radius: Array
+    """Radius at node 0 without flare and lobes, metres, [S]."""
+    parent: Indices
+    """The stem that it grows from, [S]: one of the level before, or for a clone one of its own level; -1 for the trunk."""
+    offset: Array
+    """Where on that stem, as a share of that stem's length, [S]."""
+    root: Indices
+    """The stem that a clone was split from in the first place, [S]; of any other, itself."""
+
+    def __len__(self) -> int:
+        return len(self.length)
+
+    @property
+    def resolution(self) -> int:
+        """Segments of the curve: nCurveRes."""
+        return self.nodes.shape[1] - 1
+
+    def at(self, stems: Indices, shares: Array) -> tuple[Array, Array]:
+        """Points [K, 3] and frames [K, 3, 3] of K stems at shares [K] of their length."""
+        last = self.resolution - 1
+        segment = np.clip((shares * self.resolution).astype(np.int64), 0, last)
+        u = (shares * self.resolution - segment)[:, None]
+        begin, end = self.nodes[stems, segment], self.nodes[stems, segment + 1]
+        step = (self.length[stems] / self.resolution)[:, None]
+        out, into = self.frames[stems, segment, :, 2] * step, self.frames[stems, segment + 1, :, 2] * step
+        # The cubic Hermite curve and its derivative.
+        points = (2 * u**3 - 3 * u**2 + 1) * begin + (u**3 - 2 * u**2 + u) * out + (3 * u**2 - 2 * u**3) * end + (u**3 - u**2) * into
+        slopes = (6 * u**2 - 6 * u) * (begin - end) + (3 * u**2 - 4 * u + 1) * out + (3 * u**2 - 2 * u) * into
+        z = unit(slopes)
+        x = self.frames[stems, segment + 1, :, 0]
+        x = unit(x - z * dot(x, z))
+        return points, np.stack([x, cross(z, x), z], -1)
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """All leaves, L of them; they sit on the stems of the last level."""
+
+    parent: Indices
+    """The stem, [L]."""
+    offset: Array
+    """Where on it, as a share of its length, [L]."""
+    frames: Array
+    """Local axes, [L, 3, 3]: across the blade, its upper side's normal, from the stalk to the tip."""
+    length: float
+    """From stalk to tip, metres."""
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """A grown tree before it has a surface."""
+
+    species: Species
+    scale: float
+    """The tree's own Scale ± ScaleV, metres (section 4.3)."""
+    levels: tuple[Stems, ...]
+    """Trunk, branches, twigs: as many as the species has Levels."""
+    leaves: Leaves
+    """What grows on the last of them."""
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Scalar product over the last axis, which is kept, [..., 1]."""
+    return (a * b).sum(-1, keepdims=True)
+
+
+def unit(vectors: Array) -> Array:
+    """Vectors scaled to length one, [..., 3]."""
+    return vectors / np.sqrt(dot(vectors, vectors))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Vector product of [..., 3] and [..., 3]; several times as fast as numpy's."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
+
+
+def rotation_x(angles: Array) -> Array:
+    """Rotations about the x axis, [K, 3, 3], by K angles in radians."""
+    return _rotation(angles, 0)
+
+
+def rotation_y(angles: Array) -> Array:
+    """Rotations about the y axis, [K, 3, 3], by K angles in radians."""
+    return _rotation(angles, 1)
+
+
+def rotation_z(angles: Array) -> Array:
+    """Rotations about the z axis, [K, 3, 3], by K angles in radians."""
+    return _rotation(angles, 2)
+
+
+def _rotation(angles: Array, axis: int) -> Array:
+    after, last = (axis + 1) % 3, (axis + 2) % 3
+    matrices = np.zeros((len(angles), 3, 3))
+    matrices[:, axis, axis] = 1
+    matrices[:, after, after] = matrices[:, last, last] = np.cos(angles)
+    matrices[:, last, after] = np.sin(angles)
+    matrices[:, after, last] = -matrices[:, last, after]
+    return matrices
+
+
+def rotation_about(axes: Array, angles: Array) -> Array:
+    """Rotations [K, 3, 3] about K axes [K, 3] of any length (Rodrigues' formula); about an axis of no length, no rotation."""
+    length = np.sqrt(dot(axes, axes))
+    axes = axes / np.where(length > 1e-12, length, 1)
+    sine, rest = np.where(length > 1e-12, np.sin(angles)[:, None], 0), np.where(length > 1e-12, 1 - np.cos(angles)[:, None], 0)
+    matrices = rest[..., None] * axes[:, :, None] * axes[:, None, :]
+    matrices += np.where(length > 1e-12, np.cos(angles)[:, None], 1)[..., None] * np.eye(3)
+    for one, two, three in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        matrices[:, two, one] += sine[:, 0] * axes[:, three]
+        matrices[:, one, two] -= sine[:, 0] * axes[:, three]
+    return matrices

@@ -1,0 +1,320 @@
+"""The figures that make a species: read from JSON, checked, and named after the keys of Weber and Penn.
+
+Names and meanings are those of J. Weber and J. Penn, "Creation and Rendering of Realistic Trees", SIGGRAPH 1995; numbers such as 4.3
+below are the paper's sections. Terms that the paper lacks are those of the Blender add-on tree-gen (github.com/friggog/tree-gen),
+described in its README.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import MISSING, Field, dataclass, fields
+from difflib import get_close_matches
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from bbfit.checks import InputError, InputTypeError, check_count, check_file, check_range, fail
+from bbfit.files import read_json
+
+LEVELS = 4
+"""Most levels of stems, and the length of every list of figures by level."""
+
+PerLevel = tuple[float, float, float, float]
+PerLevelWhole = tuple[int, int, int, int]
+Vector = tuple[float, float, float]
+Rgb = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Species:
+    """One species' figures. Angles are degrees; a field that ends in ``_v`` is how far the one before it varies at random, up or down.
+
+    A file's key is the field's name in capitalised words, with an ``n`` before it for figures by level (``curve_res`` is ``nCurveRes``,
+    ``leaf_scale_x`` is ``LeafScaleX``). Figures by level are for the trunk, the branches, the twigs and the stems on these.
+
+    Raises
+    ------
+    InputError
+        for a value out of its range, or of the wrong type; the message starts with the file's key.
+    """
+
+    name: str
+    """Name in the file, such as ``quaking_aspen``."""
+
+    shape: int
+    """How the branches' length changes up the tree, 0 to 8 (4.3): 0 conical, 1 spherical, 2 hemispherical, 3 cylindrical, 4 tapered
+    cylindrical, 5 flame, 6 inverse conical, 7 tend flame, 8 as the pruning envelope."""
+    scale: float
+    """Size of the tree in metres, in (0, 1000]: a trunk of length 1 is as long (4.3)."""
+    scale_v: float
+    """Metres, in [0, scale)."""
+    levels: int
+    """Levels of stems, 1 to 4; leaves sit on the last (section 3)."""
+    ratio: float
+    """The trunk's radius over its length, in (0, 1] (4.4)."""
+    ratio_power: float
+    """How much thinner a stem is than its parent, in [0, 10]: their ratio of lengths to this power (4.4)."""
+    flare: float
+    """How far the trunk widens at its foot, in [0, 10]: 1 doubles the radius (4.4)."""
+    base_splits: int
+    """Clones into which the trunk splits at the end of its first segment, -10 to 10 (4.2); negative: a random number up to as many."""
+    lobes: int = 0
+    """Bulges around the trunk's cross-section, 0 to 100 (4.4)."""
+    lobe_depth: float = 0.0
+    """Height of the bulges over the trunk's radius, in [0, 1) (4.4)."""
+
+    base_size: PerLevel
+    """Share of a stem, from its foot, that bears nothing, in [0, 1) (4.3; by level as in tree-gen)."""
+    down_angle: PerLevel
+    """Angle between a stem and its parent, in [-180, 180] (4.3). The entry after the last level's is the leaves'; so it is below."""
+    down_angle_v: PerLevel
+    """In [-180, 180]; negative: the angle changes evenly along the parent instead of at random (4.3)."""
+    rotate: PerLevel
+    """Turn about the parent from one stem to the next, in [-360, 360]; below 0, they stand on its left and right in turn, that
+    far from the side to which a positive ``curve`` bends it (4.3)."""
+    rotate_v: PerLevel
+    """In [-360, 360]."""
+    branches: PerLevelWhole
+    """Most stems of a level that one parent bears, 0 to 10000 (4.3). A tree has one trunk: the first entry is 1, or 0, and not used."""
+    length: PerLevel
+    """Length over that of the parent, for the trunk over the scale, in [0, 100], above 0 in the levels that grow (4.3)."""
+    length_v: PerLevel
+    """In [0, 100], at most the length itself in the levels that grow."""
+    taper: PerLevel
+    """How the radius falls off, in [0, 3]: 0 not at all, 1 to a point, 2 to a round end, 3 as a row of spheres (4.4)."""
+    seg_splits: PerLevel
+    """Clones into which a stem splits at the end of each segment, on average, in [0, 10] (4.2)."""
+    split_angle: PerLevel
+    """Angle between clones, in [0, 180] (4.2)."""
+    split_angle_v: PerLevel
+    """In [0, 180]."""
+    curve_res: PerLevelWhole
+    """Segments of a stem, 0 to 100, at least 1 in the levels that grow (4.1)."""
+    curve: PerLevel
+    """Turn from a stem's foot to its tip, in [-360, 360] (4.1)."""
+    curve_back: PerLevel
+    """Where not 0, the turn of the stem's upper half, and ``curve`` that of the lower, in [-360, 360] (4.1)."""
+    curve_v: PerLevel
+    """In [-720, 720], shared out among the segments; negative: the stem is a helix of this angle (4.1)."""
+    bend_v: PerLevel
+    """Greatest random turn to the side from foot to tip, in [-360, 360], shared out among the segments (tree-gen)."""
+    branch_dist: PerLevel
+    """How stems stand on their parent, in [0, 20]: 0 one by one, 1 in pairs, n in whorls of n + 1 (tree-gen)."""
+    radius_mod: PerLevel
+    """Factor on a level's radii, in (0, 100] (tree-gen)."""
+
+    leaves: int
+    """Most leaves that a stem of the last level bears, -10000 to 10000; negative: as many in a fan at its tip (4.5)."""
+    leaf_shape: int
+    """0 default, 1 ovate, 2 linear, 3 cordate, 4 maple, 5 palmate, 6 spiky oak, 7 rounded oak, 8 elliptic, 9 rectangle, 10 triangle
+    (tree-gen)."""
+    leaf_scale: float
+    """Length of a leaf in metres, in (0, 10] (4.5)."""
+    leaf_scale_x: float
+    """Width of a leaf over its length, in (0, 10] (4.5)."""
+    leaf_bend: float
+    """How far leaves turn to the light, in [0, 1]: up and away from the trunk (4.9)."""
+
+    tropism: Vector
+    """Pull on the stems along x, y and z, each in [-20, 20], with z up in the figures; the z part acts from the third level on, and is all
+    that the paper has (4.8)."""
+    prune_ratio: float
+    """How fully branches are cut to the envelope, in [0, 1] (4.6)."""
+    prune_width: float
+    """Radius of the envelope over the tree's height, in [0, 10] (4.6)."""
+    prune_width_peak: float
+    """Where the envelope is widest, as a share of its height from its foot, in (0, 1) (4.6)."""
+    prune_power_low: float
+    """Curvature of the envelope below its widest place, in [0, 100]: below 1 convex, above 1 concave (4.6)."""
+    prune_power_high: float
+    """The same above it."""
+
+    bark_color: Rgb = (0.12, 0.09, 0.065)
+    """Linear RGB reflectance, each in [0, 1]."""
+    leaf_colors: tuple[Rgb, ...] = ((0.09, 0.2, 0.03), (0.13, 0.25, 0.035), (0.17, 0.29, 0.045))
+    """One to 16 tones of the leaves, each linear RGB reflectance in [0, 1]."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise InputTypeError(f"name: expected a text, got {self.name!r}")
+        for key, field in figure_keys().items():
+            object.__setattr__(self, field.name, _read(key, field, getattr(self, field.name)))
+        if self.scale_v >= self.scale:
+            fail("ScaleV", f"expected less than Scale, which is {self.scale:g}, got {self.scale_v:g}")
+        if self.branches[0] > 1:
+            fail("nBranches[0]", f"expected 0 or 1, got {self.branches[0]}", "a tree has one trunk")
+        for level in range(self.levels):
+            check_count(f"nCurveRes[{level}]", self.curve_res[level])
+            check_range(f"nLength[{level}]", self.length[level], 0, _BOUNDS["length"][1], open_low=True)
+            if self.length_v[level] > self.length[level]:
+                wanted = f"at most nLength[{level}], which is {self.length[level]:g}"
+                fail(f"nLengthV[{level}]", f"expected {wanted}, got {self.length_v[level]:g}")
+
+
+# Lowest and highest value by field; by level the same for all.
+_BOUNDS: dict[str, tuple[float, float]] = {
+    "shape": (0, 8),
+    "scale": (0, 1000),
+    "scale_v": (0, 1000),
+    "levels": (1, LEVELS),
+    "ratio": (0, 1),
+    "ratio_power": (0, 10),
+    "flare": (0, 10),
+    "base_splits": (-10, 10),
+    "lobes": (0, 100),
+    "lobe_depth": (0, 1),
+    "base_size": (0, 1),
+    "down_angle": (-180, 180),
+    "down_angle_v": (-180, 180),
+    "rotate": (-360, 360),
+    "rotate_v": (-360, 360),
+    "branches": (0, 10_000),
+    "length": (0, 100),
+    "length_v": (0, 100),
+    "taper": (0, 3),
+    "seg_splits": (0, 10),
+    "split_angle": (0, 180),
+    "split_angle_v": (0, 180),
+    "curve_res": (0, 100),
+    "curve": (-360, 360),
+    "curve_back": (-360, 360),
+    "curve_v": (-720, 720),
+    "bend_v": (-360, 360),
+    "branch_dist": (0, 20),
+    "radius_mod": (0, 100),
+    "leaves": (-10_000, 10_000),
+    "leaf_shape": (0, 10),
+    "leaf_scale": (0, 10),
+    "leaf_scale_x": (0, 10),
+    "leaf_bend": (0, 1),
+    "tropism": (-20, 20),
+    "prune_ratio": (0, 1),
+    "prune_width": (0, 10),
+    "prune_width_peak": (0, 1),
+    "prune_power_low": (0, 100),
+    "prune_power_high": (0, 100),
+    "bark_color": (0, 1),
+    "leaf_colors": (0, 1),
+}
+_MORE_THAN_LOW = {"scale", "ratio", "radius_mod", "leaf_scale", "leaf_scale_x", "prune_width_peak"}
+_LESS_THAN_HIGH = {"lobe_depth", "base_size", "prune_width_peak"}
+_MOST_COLORS = 16
+
+
+def figure_keys() -> dict[str, Field[Any]]:
+    """The keys of a species in a file, in the order of the fields, and the field of :class:`Species` that each is read into."""
+    found = {}
+    for field in fields(Species):
+        if field.name != "name":
+            words = "".join(word.capitalize() for word in field.name.split("_"))
+            found["n" * (field.type in ("PerLevel", "PerLevelWhole")) + words] = field
+    return found
+
+
+def _read(key: str, field: Field[Any], value: Any) -> Any:
+    """``value`` as the type of ``field``, every number of it within the field's bounds."""
+    if field.type in ("int", "float"):
+        return _number(key, field, value)
+    if field.name == "leaf_colors":
+        colors = _items(key, value, range(1, _MOST_COLORS + 1), "colours")
+        return tuple(tuple(_numbers(f"{key}[{index}]", field, color, 3)) for index, color in enumerate(colors))
+    return tuple(_numbers(key, field, value, LEVELS if key[0] == "n" else 3))
+
+
+def _numbers(key: str, field: Field[Any], value: Any, count: int) -> Iterable[float]:
+    items = _items(key, value, range(count, count + 1), "numbers")
+    return (_number(f"{key}[{index}]", field, item) for index, item in enumerate(items))
+
+
+def _items(key: str, value: Any, counts: range, what: str) -> list[Any] | tuple[Any, ...]:
+    wanted = f"{counts[0]} {what}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} {what}"
+    if not isinstance(value, list | tuple):
+        raise InputTypeError(f"{key}: expected a list of {wanted}, got {value!r}")
+    if len(value) not in counts:
+        fail(key, f"expected {wanted}, got {len(value)}")
+    return value
+
+
+def _number(key: str, field: Field[Any], value: Any) -> float:
+    """``value`` within the field's bounds, as an ``int`` where the field takes whole numbers and else as a ``float``."""
+    low, high = _BOUNDS[field.name]
+    check_range(key, value, low, high, open_low=field.name in _MORE_THAN_LOW)
+    if field.name in _LESS_THAN_HIGH and value == high:
+        fail(key, f"expected less than {high:g}, got {value!r}")
+    if field.type not in ("int", "PerLevelWhole"):
+        return float(value)
+    if value != int(value):
+        fail(key, f"expected a whole number, got {value!r}")
+    return int(value)
+
+
+def figures_file() -> Path:
+    """The file with the figures of the known species, as a start for one's own."""
+    return Path(str(files("bbfit.trees") / "species.json"))
+
+
+def known_species(path: str | Path | None = None) -> tuple[str, ...]:
+    """Names of the species in the packaged figures, or in the file ``path`` of the same layout."""
+    return tuple(_entries(path)[1])
+
+
+def load_species(name: str | None, path: str | Path | None = None) -> Species:
+    """Load the species ``name`` from the packaged figures, or from a file of the same layout.
+
+    ``name`` may be ``None`` where the file holds one species only.
+
+    Raises
+    ------
+    InputError
+        for an unknown name; for a file that is missing, empty, not JSON or of another layout; and for missing, unknown or unusable
+        figures, which it names.
+    """
+    if name is not None and not isinstance(name, str):
+        raise InputTypeError(f"species: expected a name, got {name!r}")
+    path, entries = _entries(path)
+    if name is None and len(entries) == 1:
+        name = next(iter(entries))
+    if name is None:
+        fail("species", f"{path} holds {len(entries)} species", f"name one of {', '.join(entries)}")
+    if name not in entries:
+        fail("species", f"expected one of {', '.join(entries)}, got {name!r}", _suggestion(name, entries))
+    try:
+        return _species(name, entries[name])
+    except InputError as error:
+        raise type(error)(f"species_file: {path}: {name}: {error}") from error
+
+
+def _entries(path: str | Path | None) -> tuple[Path, dict[str, dict[str, Any]]]:
+    """The file's place and its species as they stand in it."""
+    path = check_file("species_file", figures_file() if path is None else path)
+    content = read_json("species_file", path)
+    layout = 'expected {"name": {"Shape": 7, ...}, ...}'
+    if not isinstance(content, dict):
+        fail("species_file", f"{path} is not an object of species", layout)
+    entries = {name: entry for name, entry in content.items() if not name.startswith("_")}
+    if not entries:
+        fail("species_file", f"{path} holds no species", layout)
+    for name, entry in entries.items():
+        if not isinstance(entry, dict):
+            fail("species_file", f"{name} in {path} is not a species but {type(entry).__name__}", layout)
+    return path, entries
+
+
+def _species(name: str, entry: dict[str, Any]) -> Species:
+    expected = figure_keys()
+    figures = {key: value for key, value in entry.items() if not key.startswith("_")}
+    suggestions = {key: _suggestion(key, expected) for key in figures if key not in expected}
+    unknown = [f"{key} ({suggestion})" if suggestion else key for key, suggestion in suggestions.items()]
+    missing = [key for key, field in expected.items() if key not in figures and field.default is MISSING]
+    problems = [f"{what} {', '.join(found)}" for what, found in (("unknown", unknown), ("missing", missing)) if found]
+    if problems:
+        fail("keys", "; ".join(problems))
+    return Species(name=name, **{expected[key].name: value for key, value in figures.items()})
+
+
+def _suggestion(word: str, known: Iterable[str]) -> str:
+    """``did you mean X?``, or nothing where no known word is close."""
+    by_spelling = {"".join(filter(str.isalnum, name.lower())): name for name in known}
+    close = get_close_matches("".join(filter(str.isalnum, word.lower())), by_spelling, 1, 0.7)
+    return f"did you mean {by_spelling[close[0]]}?" if close else ""
