@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from bbfit.geometry.orbit import Orbit
     from bbfit.pipeline import RunConfig, run
     from bbfit.rendering.dispatch import render
+    from bbfit.trees.config import GrowConfig
+    from bbfit.trees.growth import grow
+    from bbfit.trees.species import Species, load_species
+    from bbfit.trees.tree_file import write_tree
     from bbfit.views import ViewDataset
 
 # Names are imported when they are first used, so that `bbfit --help` need not wait for torch.
@@ -30,18 +34,23 @@ _HOMES = {
     "ExportConfig": "bbfit.exporting.config",
     "FitConfig": "bbfit.fitting.config",
     "FitResult": "bbfit.fitting.loop",
+    "GrowConfig": "bbfit.trees.config",
     "InputError": "bbfit.checks",
     "Orbit": "bbfit.geometry.orbit",
     "Report": "bbfit.evaluation.report",
     "RunConfig": "bbfit.pipeline",
+    "Species": "bbfit.trees.species",
     "ViewDataset": "bbfit.views",
     "ViewsConfig": "bbfit.blender.config",
     "evaluate": "bbfit.evaluation.scoring",
     "export": "bbfit.exporting.model",
     "fit": "bbfit.fitting.loop",
+    "grow": "bbfit.trees.growth",
+    "load_species": "bbfit.trees.species",
     "render": "bbfit.rendering.dispatch",
     "render_views": "bbfit.blender.views_folder",
     "run": "bbfit.pipeline",
+    "write_tree": "bbfit.trees.tree_file",
 }
 
 __version__ = version("bbfit")
@@ -51,18 +60,23 @@ __all__ = [
     "ExportConfig",
     "FitConfig",
     "FitResult",
+    "GrowConfig",
     "InputError",
     "Orbit",
     "Report",
     "RunConfig",
+    "Species",
     "ViewDataset",
     "ViewsConfig",
     "evaluate",
     "export",
     "fit",
+    "grow",
+    "load_species",
     "render",
     "render_views",
     "run",
+    "write_tree",
 ]
 
 

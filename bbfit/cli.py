@@ -18,9 +18,10 @@ import tyro
 from rich.console import Console
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.checks import InputError
+from bbfit.checks import InputError, fail
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
+from bbfit.trees.config import GrowConfig
 
 if TYPE_CHECKING:
     from bbfit.pipeline import Progress, RunResult
@@ -32,18 +33,21 @@ def _run(
     tree: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[TREE]")] = None,
     /,
     out: Path = Path("runs/tree"),
+    species: str | None = None,
+    grow: Annotated[GrowConfig, tyro.conf.arg(name="")] = GrowConfig(detail=0.5),  # noqa: B008
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
-    """Do everything: render a tree, fit billboards to the views, write the models, score them on held-out views.
+    """Do everything: grow a tree or take yours, render it, fit billboards to the views, write the models, score them on held-out views.
 
     Killed and started again, it goes on where it stopped. What stands and has unchanged inputs is not done again.
 
     Args:
-        tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend) or a folder of views; left out, a small tree that comes
-            with bbfit.
+        tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend) or a folder of views; left out, one is grown.
         out: Folder for the results.
+        species: What to grow, a quaking aspen if left out; `bbfit grow --list` names them.
+        grow: How a tree is grown.
         views: How the tree is rendered.
         fit: How the billboards are fitted.
         export: How the models are written.
@@ -51,8 +55,46 @@ def _run(
     from bbfit.pipeline import RunConfig, run
 
     with _progress() as tell:
-        result = run(tree, out, RunConfig(views, fit, export), on_progress=tell)
+        result = run(tree, out, RunConfig(species=species, grow=grow, views=views, fit=fit, export=export), on_progress=tell)
     _show(result)
+
+
+def _grow(
+    species: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SPECIES]")] = None,
+    /,
+    out: Path | None = None,
+    list: tyro.conf.FlagCreatePairsOff[bool] = False,
+    config: Annotated[GrowConfig, tyro.conf.arg(name="")] = GrowConfig(),  # noqa: B008
+) -> None:
+    """Grow a tree of a species, after Weber and Penn 1995. The same seed gives the same file.
+
+    Args:
+        species: What to grow; may be left out where --species-file holds one species only.
+        out: The tree's file, ending in .glb, or in .obj (its .mtl comes beside it).
+        list: Name the species and where their figures are, and grow nothing.
+        config: How it is grown.
+    """
+    from bbfit.model_files import check_model_path
+    from bbfit.trees.growth import grow
+    from bbfit.trees.species import figures_file, known_species, load_species
+
+    if list:
+        from bbfit.reporting.tables import species_table
+
+        _out.print(species_table([load_species(name, config.species_file) for name in known_species(config.species_file)]))
+        _out.print(f"figures in {config.species_file or figures_file()}", soft_wrap=True, highlight=False)
+        return
+    from bbfit.trees.tree_file import write_tree
+
+    figures = load_species(species, config.species_file)
+    if out is None:
+        fail("out", "no file is named to write the tree to", f"say for example --out {figures.name}.glb")
+    check_model_path("tree", out)
+    scene = grow(figures, seed=config.seed, detail=config.detail, leaves=config.leaves, max_vertices=config.max_vertices)
+    paths = write_tree(scene, out)
+    _out.print(f"{figures.name}: {sum(len(mesh.vertices) for mesh in scene.geometry.values()):,} vertices")
+    for path in paths:
+        _out.print(f"{path}  {path.stat().st_size:,} bytes", soft_wrap=True)
 
 
 def _views(
@@ -169,6 +211,7 @@ def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
 
 _COMMANDS: dict[str, Callable[..., Any]] = {
     "run": _later(_run),
+    "grow": _later(_grow),
     "views": _later(_views),
     "fit": _later(_fit),
     "evaluate": _later(_evaluate),

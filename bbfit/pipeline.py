@@ -1,4 +1,4 @@
-"""The main job: tree -> views -> fit -> export -> evaluate, every stage done once and only again when its inputs change."""
+"""The main job: grow -> views -> fit -> export -> evaluate, every stage done once and only again when its inputs change."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import time
 from dataclasses import asdict, dataclass, field, replace
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, Protocol
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.checks import InputError, check_file
+from bbfit.checks import InputError, check_file, fail
 from bbfit.evaluation.report import Report
 from bbfit.evaluation.scoring import OriginalTree, evaluate
 from bbfit.exporting.config import ExportConfig
@@ -25,18 +24,26 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.reporting.plots import comparison_picture, loss_plot
+from bbfit.trees.config import GrowConfig
+from bbfit.trees.growth import grow
+from bbfit.trees.species import Species, load_species
+from bbfit.trees.tree_file import write_tree
 from bbfit.views import ViewDataset
 
 RECORD_FILE = "run.json"
 # Raise a stage's number when its results change for the same inputs, so that old results are made anew.
-_STAGE_VERSIONS = {"fit": 1, "export": 1, "evaluate": 1}
+_STAGE_VERSIONS = {"grow": 1, "fit": 1, "export": 1, "evaluate": 1}
 _PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headless", "bpy", "trimesh", "xatlas", "scikit-image")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunConfig:
     """Options of every stage."""
 
+    species: str | None = None
+    """What to grow when no tree is given: a quaking aspen if left open, or the one species in ``grow.species_file``."""
+    grow: GrowConfig = field(default_factory=lambda: GrowConfig(detail=0.5))
+    """Growing a tree, at moderate detail."""
     views: ViewsConfig = field(default_factory=ViewsConfig)
     """Rendering the tree."""
     fit: FitConfig = field(default_factory=FitConfig)
@@ -75,13 +82,13 @@ def run(
 ) -> RunResult:
     """Turn a tree, or views of one, into a measured billboard cloud with its model files.
 
-    Writes ``views/`` (from a tree), ``cloud.safetensors``, ``model.glb``, ``model.obj/.mtl/.png``, ``metrics.json``,
-    ``comparison.png``, ``loss.png``, ``loss.csv`` and ``run.json`` (resolved configuration, versions, seeds, seconds). A stage whose
-    results stand unchanged and whose inputs are the same is skipped; a killed run goes on where it stopped.
+    Writes ``tree.glb`` (when none is given), ``views/`` (from a tree), ``cloud.safetensors``, ``model.glb``, ``model.obj/.mtl/.png``,
+    ``metrics.json``, ``comparison.png``, ``loss.png``, ``loss.csv`` and ``run.json`` (resolved configuration, versions, seeds, seconds).
+    A stage whose results stand unchanged and whose inputs are the same is skipped; a killed run goes on where it stopped.
 
     Parameters
     ----------
-    source : a tree's file, a folder of views, or ``None`` for the small tree that comes with bbfit.
+    source : a tree's file, a folder of views, or ``None`` to grow a tree.
     out : the run's folder, made if need be.
     on_progress : told how far each stage is.
 
@@ -93,16 +100,20 @@ def run(
     config = config or RunConfig()
     tell = on_progress or (lambda stage, done, total, note="": None)
     if source is None:
-        with as_file(files("bbfit.data") / "tree.glb") as tree:
-            return run(tree, out, config, on_progress=on_progress)
-    source = Path(source)
-    if not source.is_dir():
-        check_file("tree", source)
-    record = _Record(output_folder("out", out), source, config)
-    if source.is_dir():
-        views = ViewDataset.load(source, seed=config.fit.seed)
+        species = load_species(config.species or (None if config.grow.species_file else "quaking_aspen"), config.grow.species_file)
+        record = _Record(output_folder("out", out), species, config)
+        views = _render(_grow(species, record, config.grow, tell), record, config.views, tell)
     else:
-        views = _render(source, record, config.views, tell)
+        source = Path(source)
+        if config.species is not None or config.grow != RunConfig().grow:
+            fail("run", f"{source} is given, so that no tree is grown", "leave out the species and the options of growing one")
+        if not source.is_dir():
+            check_file("tree", source)
+        record = _Record(output_folder("out", out), source, config)
+        if source.is_dir():
+            views = ViewDataset.load(source, seed=config.fit.seed)
+        else:
+            views = _render(source, record, config.views, tell)
     views.train.check()
     views.test.check()
     cloud = _fit(views, record, config.fit, tell)
@@ -128,7 +139,7 @@ def export_config(views: ViewDataset, config: ExportConfig) -> ExportConfig:
 class _Record:
     """``run.json``: which stage was done with which inputs, what it wrote, how long it took."""
 
-    def __init__(self, folder: Path, source: Path, config: RunConfig) -> None:
+    def __init__(self, folder: Path, source: Path | Species, config: RunConfig) -> None:
         self.folder, self.skipped = folder, list[str]()
         path = folder / RECORD_FILE
         try:
@@ -137,15 +148,18 @@ class _Record:
             earlier = {}  # a damaged record only costs the skipping
         stages = earlier.get("stages") if isinstance(earlier, dict) else None
         self.stages = {name: stage for name, stage in stages.items() if _is_stage(stage)} if isinstance(stages, dict) else {}
+        grown = asdict(source) if isinstance(source, Species) else None
         resolved = {
-            "views": None if source.is_dir() else asdict(config.views),
+            "species": grown,
+            "grow": asdict(config.grow) if grown else None,
+            "views": None if isinstance(source, Path) and source.is_dir() else asdict(config.views),
             "fit": asdict(config.fit.resolve()),
             "export": asdict(config.export),
         }
         self._head = {
-            "source": str(source.resolve()),
+            "source": source.name if isinstance(source, Species) else str(source.resolve()),
             "config": json.loads(json.dumps(resolved, default=str)),
-            "seeds": {"views": config.views.seed, "fit": config.fit.seed},
+            "seeds": ({"grow": config.grow.seed} if grown else {}) | {"views": config.views.seed, "fit": config.fit.seed},
             "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
             "machine": platform.platform(),
         }
@@ -176,6 +190,22 @@ def _is_stage(entry: Any) -> bool:
     """Whether an entry of ``run.json`` is whole."""
     kinds = {"inputs": str, "outputs": dict, "seconds": int | float}
     return isinstance(entry, dict) and all(isinstance(entry.get(name), kind) for name, kind in kinds.items())
+
+
+def _grow(species: Species, record: _Record, config: GrowConfig, tell: Progress) -> Path:
+    path = record.folder / "tree.glb"
+    inputs = _hash("grow", asdict(species), config.seed, config.detail, config.leaves)
+    if not record.stands("grow", inputs):
+        earlier = record.stages.get("grow")
+        if earlier is not None and earlier["inputs"] != inputs and (record.folder / "views").exists():
+            fail("out", f"{record.folder} holds the views of another tree", "choose another folder for this one")
+        tell("grow", 0, 1)
+        begun = time.perf_counter()
+        scene = grow(species, seed=config.seed, detail=config.detail, leaves=config.leaves, max_vertices=config.max_vertices)
+        write_tree(scene, path)
+        record.done("grow", inputs, [path.name], time.perf_counter() - begun)
+        tell("grow", 1, 1)
+    return path
 
 
 def _render(tree: Path, record: _Record, config: ViewsConfig, tell: Progress) -> ViewDataset:

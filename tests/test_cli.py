@@ -13,10 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
+import bbfit
 from bbfit.cli import main
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import write_png
+from bbfit.trees.species import figures_file, known_species
 
 QUICK = ["--billboards", "2", "--steps", "3"]
 
@@ -38,7 +41,7 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["views"], ["fit"], ["evaluate"], ["export"]])
+@pytest.mark.parametrize("command", [[], ["run"], ["grow"], ["views"], ["fit"], ["evaluate"], ["export"]])
 def test_help_shows_defaults_and_needs_no_torch(command: list[str]) -> None:
     script = (
         "import sys; from bbfit.cli import main\n"
@@ -108,6 +111,54 @@ def test_bad_input_is_one_line_and_exit_code_2(
 def test_a_bad_value_in_a_stage_of_a_run_is_one_line(option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = refused(["run", str(tmp_path / "tree.glb"), "--out", str(tmp_path / "out"), option, "0"], capsys)
     assert option.rpartition(".")[2] in line and "at least" in line
+
+
+def test_grow_writes_what_the_function_makes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--seed", "4", "--detail", "0.3", "--leaves", "0.05"]
+    for name in ("acer.glb", "acer.obj"):
+        assert main(["grow", "acer", "--out", str(tmp_path / name), *options]) == 0
+    assert "vertices" in capsys.readouterr().out
+    bbfit.write_tree(bbfit.grow("acer", seed=4, detail=0.3, leaves=0.05), tmp_path / "same.glb")
+    assert (tmp_path / "same.glb").read_bytes() == (tmp_path / "acer.glb").read_bytes()
+    assert (tmp_path / "acer.mtl").is_file()
+
+
+def test_grow_takes_a_species_of_ones_own(tmp_path: Path) -> None:
+    figures = json.loads(figures_file().read_text())["apple"]
+    (tmp_path / "own.json").write_text(json.dumps({"pear": figures | {"Leaves": 0}}))
+    assert main(["grow", "--species-file", str(tmp_path / "own.json"), "--out", str(tmp_path / "pear.glb"), "--detail", "0.2"]) == 0
+    assert set(trimesh.load(tmp_path / "pear.glb").geometry) == {"bark"}
+
+
+def test_grow_lists_the_species(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["grow", "--list"]) == 0
+    said = capsys.readouterr().out
+    assert all(name in said for name in known_species()) and "13 ± 3" in said and "species.json" in said.replace("\n", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["grow", "willow", "--out", "{tmp}/t.glb"], "weeping_willow"),
+        (["grow", "acer"], "--out acer.glb"),
+        (["grow", "acer", "--out", "{tmp}/t.stl"], ".glb or .obj"),
+        (["grow", "acer", "--out", "{tmp}/none/t.glb"], "does not exist"),
+        (["grow", "acer", "--out", "{tmp}/t.glb", "--detail", "0"], "detail"),
+        (["grow", "acer", "--out", "{tmp}/t.glb", "--leaves", "1.5"], "leaves"),
+        (["grow", "acer", "--out", "{tmp}/t.glb", "--max-vertices", "1000"], "the limit is 1,000"),
+        (["grow", "--species-file", "{tmp}/none.json", "--out", "{tmp}/t.glb"], "none.json"),
+        (["grow", "--species-file", "{tmp}/bad.json", "--out", "{tmp}/t.glb"], "nCurveRes"),
+        (["run", "--species", "willow", "--out", "{tmp}/o"], "weeping_willow"),
+        (["run", "{tmp}/t.glb", "--seed", "3", "--out", "{tmp}/o"], "no tree is grown"),
+    ],
+)
+def test_a_tree_that_cannot_be_grown_is_one_line(
+    arguments: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figures = json.loads(figures_file().read_text())["apple"]
+    (tmp_path / "bad.json").write_text(json.dumps({"pear": figures | {"nCurveRes": [0, 1, 1, 1]}}))
+    assert says in refused([part.format(tmp=tmp_path) for part in arguments], capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.json"]
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

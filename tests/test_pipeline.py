@@ -19,6 +19,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import read_rgba
 from bbfit.pipeline import RunConfig, RunResult, run
 
+TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
 CONFIG = RunConfig(fit=FitConfig(billboards=2, steps=20, checkpoint_every=5))
 FILES = ("cloud.safetensors", "comparison.png", "loss.csv", "loss.png", "metrics.json", "run.json")
 MODELS = ("model.glb", "model.mtl", "model.obj", "model.png")
@@ -140,9 +141,9 @@ def test_out_must_be_a_folder_that_can_be_written(views_folder: Path, tmp_path: 
 
 def test_from_a_tree_to_a_model(tmp_path: Path) -> None:
     """The whole job with Blender, on the tree that comes with bbfit; a second run does nothing."""
-    config = RunConfig(ViewsConfig(count=8, size=48, samples=2, denoise=False), FitConfig(billboards=2, steps=10))
+    config = RunConfig(views=ViewsConfig(count=8, size=48, samples=2, denoise=False), fit=FitConfig(billboards=2, steps=10))
     told = []
-    run(None, tmp_path, config, on_progress=lambda stage, done, total, note="": told.append((stage, done, total)))
+    run(TREE, tmp_path, config, on_progress=lambda stage, done, total, note="": told.append((stage, done, total)))
     assert [event for event in told if event[0] == "views"] == [("views", done, 8) for done in range(9)]
     assert {"views/views.json", "views/images/0007.png"} <= {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")}
     metrics = json.loads((tmp_path / "metrics.json").read_text())
@@ -157,10 +158,10 @@ def test_from_a_tree_to_a_model(tmp_path: Path) -> None:
     assert low[0] < 0 < high[0] and low[2] < 0 < high[2]
 
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*") if path.name not in ("run.json",)}
-    assert run(None, tmp_path, config).skipped == ("views", "fit", "export", "evaluate")
+    assert run(TREE, tmp_path, config).skipped == ("views", "fit", "export", "evaluate")
     assert {path: path.stat().st_mtime_ns for path in before} == before
     with pytest.raises(InputError, match="size 48"):
-        run(None, tmp_path, dataclasses.replace(config, views=dataclasses.replace(config.views, size=64)))
+        run(TREE, tmp_path, dataclasses.replace(config, views=dataclasses.replace(config.views, size=64)))
 
 
 def test_an_obj_of_a_z_up_tree_is_z_up(views_folder: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ class ViewsConfig:
 
     count: int = 90
     """Pictures in all, shared out over the rings as evenly as possible; a random quarter becomes the test views."""
-    size: int = 512
+    size: int = 384
     """Width and height of a picture in pixels."""
     elevations: tuple[float, ...] = (0.0,)
     """Height of each ring of cameras as an angle above the horizon, in degrees."""

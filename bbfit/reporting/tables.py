@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from bbfit.evaluation.report import Cost, Report
+from bbfit.trees.species import Species
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 _UP, _DOWN, _ONE = "↑", "↓", "→ 1"
+
+
+def species_table(species: Sequence[Species]) -> Table:
+    """A ``rich`` table of species that can be grown: name, height and levels of stems."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("species")
+    table.add_column("height, m", justify="right")
+    table.add_column("levels of stems", justify="right")
+    for one in species:
+        table.add_row(one.name, f"{one.scale:g} ± {one.scale_v:g}", str(one.levels))
+    return table
 
 
 def report_table(report: Report, title: str = "Held-out views") -> Table:

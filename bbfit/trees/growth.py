@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bbfit.checks import check_count, check_range, fail
+from bbfit.checks import fail
+from bbfit.trees.config import VERTEX_LIMIT, GrowConfig
 from bbfit.trees.leaf_shapes import leaf_shape
 from bbfit.trees.mesh import count_vertices, tree_parts
 from bbfit.trees.species import Species, load_species
@@ -16,34 +15,8 @@ from bbfit.trees.weber_penn import grow_skeleton
 if TYPE_CHECKING:
     import trimesh
 
-VERTEX_LIMIT = 20_000_000
-"""Most vertices that a tree may have unless asked otherwise; a willow has half as many."""
 # Vertices of the plainest stem there is: a cone on a triangle, whose seam is there twice.
 _LEAST_STEM = 5
-
-
-@dataclass(frozen=True)
-class GrowConfig:
-    """Which tree is grown, and how finely."""
-
-    species: str = "quaking_aspen"
-    """What to grow; `bbfit grow --list` names them."""
-    species_file: Path | None = None
-    """Your own figures, laid out like those that come with bbfit."""
-    seed: int = 0
-    """Another seed, another tree of the kind."""
-    detail: float = 1.0
-    """Factor on the rings along stems and on the corners of each ring, in (0, 10]; the bark's vertices go by its square."""
-    leaves: float = 1.0
-    """Share of the leaves that is kept, in [0, 1]; those grow so that the area of all stays."""
-    max_vertices: int = VERTEX_LIMIT
-    """Refuse to grow a tree of more vertices than this."""
-
-    def __post_init__(self) -> None:
-        check_count("seed", self.seed, 0)
-        check_range("detail", self.detail, 0, 10, open_low=True)
-        check_range("leaves", self.leaves, 0, 1)
-        check_count("max_vertices", self.max_vertices)
 
 
 def grow(
@@ -82,17 +55,17 @@ def grow(
     def count(level: int, number: int) -> None:
         least = number * (corners if level == species.levels else _LEAST_STEM)
         if least > max_vertices:
-            _refuse(species, config, f"at least {least:,}")
+            _refuse(species, config, f"at least {least:,} vertices")
 
     skeleton = grow_skeleton(species, seed, count, leaves=leaves)
     if (vertices := count_vertices(skeleton, detail)) > max_vertices:
-        _refuse(species, config, f"{vertices:,}, {corners * len(skeleton.leaves.parent):,} of them in leaves")
+        _refuse(species, config, f"{vertices:,} vertices, {corners * len(skeleton.leaves.parent):,} of them in leaves,")
     return scene_of(tree_parts(skeleton, seed, detail=detail), name=species.name)
 
 
 def _refuse(species: Species, config: GrowConfig, vertices: str) -> None:
     fail(
         species.name,
-        f"would have {vertices} vertices at detail {config.detail:g} and leaves {config.leaves:g}; the limit is {config.max_vertices:,}",
+        f"would have {vertices} at detail {config.detail:g} and leaves {config.leaves:g}; the limit is {config.max_vertices:,}",
         "lower detail (fewer rings and corners on stems) or leaves (fewer, larger leaves), or raise max_vertices",
     )

@@ -35,5 +35,5 @@ def test_script_makes_the_tree() -> None:
         np.testing.assert_array_equal(mesh.faces, made.geometry[name].faces)
         np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-5)
     low, high = stored.bounds
-    assert low[1] == 0 and 5 < high[1] < 7 and (low[[0, 2]] < 0).all() and (high[[0, 2]] > 0).all()
+    assert low[1] == 0 and 3.5 <= high[1] <= 4.5 and (low[[0, 2]] < 0).all() and (high[[0, 2]] > 0).all()
     assert 10_000 <= sum(len(mesh.faces) for mesh in stored.geometry.values()) <= 20_000

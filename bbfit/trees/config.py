@@ -1,0 +1,33 @@
+"""How a tree is grown: which of its kind, how finely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from bbfit.checks import check_count, check_range
+
+VERTEX_LIMIT = 20_000_000
+"""Most vertices that a tree may have unless asked otherwise; a willow has half as many."""
+
+
+@dataclass(frozen=True)
+class GrowConfig:
+    """How a tree is grown."""
+
+    seed: int = 0
+    """Another seed, another tree of the kind."""
+    detail: float = 1.0
+    """Factor on the rings along stems and on the corners of each ring, in (0, 10]; the bark's vertices go by its square."""
+    leaves: float = 1.0
+    """Share of the leaves that is kept, in [0, 1]; those grow so that the area of all stays."""
+    max_vertices: int = VERTEX_LIMIT
+    """Refuse to grow a tree of more vertices than this."""
+    species_file: Path | None = None
+    """Species of your own, laid out like those that come with bbfit (`bbfit grow --list` says where they are)."""
+
+    def __post_init__(self) -> None:
+        check_count("seed", self.seed, 0)
+        check_range("detail", self.detail, 0, 10, open_low=True)
+        check_range("leaves", self.leaves, 0, 1)
+        check_count("max_vertices", self.max_vertices)
