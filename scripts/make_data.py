@@ -26,6 +26,8 @@ def make_tree(seed: int) -> trimesh.Scene:
         scale=4.0,
         scale_v=0.5,
         branches=(1, 14, 9, 0),
+        base_size=(0.3, 0.02, 0.02, 0.02),
+        down_angle_v=(0, -10, 20, 30),
         curve_res=(4, 5, 3, 0),
         leaves=16,
         leaf_scale=0.24,

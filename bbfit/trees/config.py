@@ -18,9 +18,9 @@ class GrowConfig:
     seed: int = 0
     """Another seed, another tree of the kind."""
     detail: float = 1.0
-    """Factor on the rings along stems and on the corners of each ring, in (0, 10]; the bark's vertices go by its square."""
+    """Factor on the rings along stems and on the corners of each ring, in [0.1, 10]; the bark's vertices go by its square."""
     leaves: float = 1.0
-    """Share of the leaves that is kept, in [0, 1]; those grow so that the area of all stays."""
+    """Share of the leaves that grow, in [0, 1]; those are larger, so that the area of all stays."""
     max_vertices: int = VERTEX_LIMIT
     """Refuse to grow a tree of more vertices than this."""
     species_file: Path | None = None
@@ -28,6 +28,6 @@ class GrowConfig:
 
     def __post_init__(self) -> None:
         check_count("seed", self.seed, 0)
-        check_range("detail", self.detail, 0, 10, open_low=True)
+        check_range("detail", self.detail, 0.1, 10)
         check_range("leaves", self.leaves, 0, 1)
         check_count("max_vertices", self.max_vertices)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
-from bbfit.checks import fail
+from bbfit.checks import InputTypeError, fail
 from bbfit.trees.config import VERTEX_LIMIT, GrowConfig
-from bbfit.trees.leaf_shapes import leaf_shape
-from bbfit.trees.mesh import count_vertices, tree_parts
+from bbfit.trees.mesh import count_vertices, leaf_vertices, stem_vertices, tree_parts
 from bbfit.trees.species import Species, load_species
 from bbfit.trees.tree_file import scene_of
 from bbfit.trees.weber_penn import grow_skeleton
 
 if TYPE_CHECKING:
     import trimesh
-
-# Vertices of the plainest stem there is: a cone on a triangle, whose seam is there twice.
-_LEAST_STEM = 5
 
 
 def grow(
@@ -33,8 +29,8 @@ def grow(
     ----------
     species : one of :func:`~bbfit.trees.species.known_species`, or figures from :func:`~bbfit.trees.species.load_species`.
     seed : at least 0; another seed, another tree of the kind.
-    detail : factor on the rings along stems and on the corners of each ring, in (0, 10]; it changes neither the stems nor the leaves.
-    leaves : share of the leaves that is kept, in [0, 1]; those grow so that the area of all stays.
+    detail : factor on the rings along stems and on the corners of each ring, in [0.1, 10]; it changes neither the stems nor the leaves.
+    leaves : share of the leaves that grow, in [0, 1]; those are larger, so that the area of all stays.
     max_vertices : most vertices that the tree may have.
 
     Returns
@@ -48,22 +44,27 @@ def grow(
         for an unknown species, a value out of range, or a tree of too many vertices.
     """
     config = GrowConfig(seed=seed, detail=detail, leaves=leaves, max_vertices=max_vertices)
-    if isinstance(species, str):
-        species = load_species(species)
-    corners = len(leaf_shape(species.leaf_shape).points)
+    figures = load_species(species) if isinstance(species, str) else species
+    if not isinstance(figures, Species):
+        raise InputTypeError(f"species: expected a name or a Species, got {species!r}")
 
     def count(level: int, number: int) -> None:
-        least = number * (corners if level == species.levels else _LEAST_STEM)
-        if least > max_vertices:
-            _refuse(species, config, f"at least {least:,} vertices")
+        if level < figures.levels:
+            # Clones have fewer, and some stems are cut: a first look that keeps memory within bounds, not the count.
+            vertices, limit = stem_vertices(level, figures.curve_res[level], number, detail), 2 * max_vertices
+        else:
+            vertices, limit = leaf_vertices(figures, number), max_vertices
+        if vertices > limit:
+            _refuse(figures, config, f"about {vertices:,} vertices in {number:,} {'stems' if level < figures.levels else 'leaves'} alone")
 
-    skeleton = grow_skeleton(species, seed, count, leaves=leaves)
+    skeleton = grow_skeleton(figures, seed, count, leaves=leaves)
     if (vertices := count_vertices(skeleton, detail)) > max_vertices:
-        _refuse(species, config, f"{vertices:,} vertices, {corners * len(skeleton.leaves.parent):,} of them in leaves,")
-    return scene_of(tree_parts(skeleton, seed, detail=detail), name=species.name)
+        in_leaves = leaf_vertices(figures, len(skeleton.leaves.parent))
+        _refuse(figures, config, f"{vertices:,} vertices, {in_leaves:,} of them in leaves,")
+    return scene_of(tree_parts(skeleton, seed, detail=detail), name=figures.name)
 
 
-def _refuse(species: Species, config: GrowConfig, vertices: str) -> None:
+def _refuse(species: Species, config: GrowConfig, vertices: str) -> NoReturn:
     fail(
         species.name,
         f"would have {vertices} at detail {config.detail:g} and leaves {config.leaves:g}; the limit is {config.max_vertices:,}",

@@ -11,6 +11,7 @@ from bbfit.trees.formulas import stem_radius
 from bbfit.trees.leaf_shapes import leaf_shape
 from bbfit.trees.parts import Material, Part
 from bbfit.trees.skeleton import Array, Indices, Skeleton, Stems, cross, dot, unit
+from bbfit.trees.species import Species
 
 # By level, at detail 1: rings for each segment of a stem's curve, and corners of a ring.
 _RINGS = (8, 4, 3, 3)
@@ -48,11 +49,21 @@ class _Lines:
 
 def count_vertices(skeleton: Skeleton, detail: float) -> int:
     """Vertices of the mesh that :func:`tree_parts` makes."""
-    total = len(skeleton.leaves.parent) * len(leaf_shape(skeleton.species.leaf_shape).points)
+    total = leaf_vertices(skeleton.species, len(skeleton.leaves.parent))
     for stems in skeleton.levels:
-        for node, stems_there in enumerate(np.bincount(stems.first).tolist()):
-            total += stems_there * (_pieces(stems.level, stems.resolution - node, detail) * (_sides(stems.level, detail) + 1) + 1)
+        for node, alike in enumerate(np.bincount(stems.first).tolist()):
+            total += stem_vertices(stems.level, stems.resolution - node, alike, detail)
     return total
+
+
+def stem_vertices(level: int, segments: int, stems: int, detail: float) -> int:
+    """Vertices of so many stems of a level, each of so many segments."""
+    return stems * (_pieces(level, segments, detail) * (_sides(level, detail) + 1) + 1)
+
+
+def leaf_vertices(species: Species, leaves: int) -> int:
+    """Vertices of so many leaves."""
+    return leaves * len(leaf_shape(species.leaf_shape).points)
 
 
 def tree_parts(skeleton: Skeleton, seed: int, *, detail: float) -> list[Part]:
@@ -166,13 +177,15 @@ def _tubes(
     outwards = across * right[:, rings, None] + along * up[:, rings, None]  # [S, R, sides + 1, 3]
     wave = 1 + depth * np.sin(lobes * angles)
     vertices = points[:, rings, None] + (radius[:, rings, None] * wave)[..., None] * outwards
+    if level == 0:
+        vertices[..., 2] = np.maximum(vertices[..., 2], 0)  # the foot stands on the ground, however the trunk leans
     normals = outwards - slope[:, rings, None, None] * axes[:, rings, None]
     if lobes:
         sideways = across * up[:, rings, None] - along * right[:, rings, None]
         normals = normals - (depth * lobes * np.cos(lobes * angles) / wave)[:, None] * sideways
     count = len(chosen)
     turns = np.broadcast_to(np.arange(sides + 1) / sides, (count, len(shares) - 1, sides + 1))
-    around = 2 * np.pi * base
+    around = 2 * np.pi * np.maximum(base, _LEAST_RADIUS * skeleton.scale)
     uvs = np.stack([turns, np.broadcast_to((shares * length / around)[:, rings, None], turns.shape)], -1)
     tips = np.stack([np.full(count, 0.5), (length / around)[:, 0]], -1)
     return (

@@ -109,6 +109,11 @@ def cross(a: Array, b: Array) -> Array:
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
 
 
+def arctan2(y: Array, x: Array) -> Array:
+    """Angles of (x, y), the same to the bit wherever the arrays lie in memory: numpy takes another routine for some strided ones."""
+    return np.arctan2(np.ascontiguousarray(y), np.ascontiguousarray(x))
+
+
 def rotation_x(angles: Array) -> Array:
     """Rotations about the x axis, [K, 3, 3], by K angles in radians."""
     return _rotation(angles, 0)

@@ -46,7 +46,7 @@ class Species:
     """How the branches' length changes up the tree, 0 to 8 (4.3): 0 conical, 1 spherical, 2 hemispherical, 3 cylindrical, 4 tapered
     cylindrical, 5 flame, 6 inverse conical, 7 tend flame, 8 as the pruning envelope."""
     scale: float
-    """Size of the tree in metres, in (0, 1000]: a trunk of length 1 is as long (4.3)."""
+    """Size of the tree in metres, in [0.1, 1000]: a trunk of length 1 is as long (4.3)."""
     scale_v: float
     """Metres, in [0, scale)."""
     levels: int
@@ -110,9 +110,9 @@ class Species:
     """0 default, 1 ovate, 2 linear, 3 cordate, 4 maple, 5 palmate, 6 spiky oak, 7 rounded oak, 8 elliptic, 9 rectangle, 10 triangle
     (tree-gen)."""
     leaf_scale: float
-    """Length of a leaf in metres, in (0, 10] (4.5)."""
+    """Length of a leaf in metres, in [0.01, 10] (4.5)."""
     leaf_scale_x: float
-    """Width of a leaf over its length, in (0, 10] (4.5)."""
+    """Width of a leaf over its length, in [0.05, 10] (4.5)."""
     leaf_bend: float
     """How far leaves turn to the light, in [0, 1]: up and away from the trunk (4.9)."""
 
@@ -144,6 +144,8 @@ class Species:
             fail("ScaleV", f"expected less than Scale, which is {self.scale:g}, got {self.scale_v:g}")
         if self.branches[0] > 1:
             fail("nBranches[0]", f"expected 0 or 1, got {self.branches[0]}", "a tree has one trunk")
+        if self.base_splits and self.curve_res[0] < 2:
+            fail("nCurveRes[0]", "expected at least 2 for a trunk with BaseSplits, which are at the end of its first segment, got 1")
         for level in range(self.levels):
             check_count(f"nCurveRes[{level}]", self.curve_res[level])
             check_range(f"nLength[{level}]", self.length[level], 0, _BOUNDS["length"][1], open_low=True)
@@ -155,7 +157,7 @@ class Species:
 # Lowest and highest value by field; by level the same for all.
 _BOUNDS: dict[str, tuple[float, float]] = {
     "shape": (0, 8),
-    "scale": (0, 1000),
+    "scale": (0.1, 1000),
     "scale_v": (0, 1000),
     "levels": (1, LEVELS),
     "ratio": (0, 1),
@@ -185,8 +187,8 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "radius_mod": (0, 100),
     "leaves": (-10_000, 10_000),
     "leaf_shape": (0, 10),
-    "leaf_scale": (0, 10),
-    "leaf_scale_x": (0, 10),
+    "leaf_scale": (0.01, 10),
+    "leaf_scale_x": (0.05, 10),
     "leaf_bend": (0, 1),
     "tropism": (-20, 20),
     "prune_ratio": (0, 1),
@@ -197,7 +199,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "bark_color": (0, 1),
     "leaf_colors": (0, 1),
 }
-_MORE_THAN_LOW = {"scale", "ratio", "radius_mod", "leaf_scale", "leaf_scale_x", "prune_width_peak"}
+_MORE_THAN_LOW = {"ratio", "radius_mod", "prune_width_peak"}
 _LESS_THAN_HIGH = {"lobe_depth", "base_size", "prune_width_peak"}
 _MOST_COLORS = 16
 

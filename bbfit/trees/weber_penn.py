@@ -10,6 +10,7 @@ Where the paper leaves a choice, or the figures go beyond it:
 - nSegSplits counts the splits that a stem and its clones share, beyond the stem's bare part. In the paper every clone splits at the full
   rate, with which an acer's 1.5 would multiply its stems by 2.5 in every segment.
 - A trunk's clone bears branches as densely as the trunk; of any other stem, it and its clones share what nBranches gives it.
+- A stem that hangs splits as one that stands: declination is counted from the vertical, up or down.
 - A trunk leans at most 75 degrees, and stems stop above the ground as they do at the pruning envelope.
 - Scale ± ScaleV is the height of the tree, to which it is scaled when it has grown. In the paper it is the length of the trunk, and the
   height then depends on how the trunk bends and how far the topmost branches rise above it.
@@ -19,6 +20,8 @@ Where the paper leaves a choice, or the figures go beyond it:
 - nRotate below 0 puts children on the left and the right in turn, that far from the side that positive nCurve bends their parent to: from
   below, for a branch.
 - nBendV turns a stem sideways, about its y axis, by up to nBendV / nCurveRes either way a segment, as nCurveV does about its x axis.
+- LeafBend turns a leaf upwards about its own x axis, as a stalk bends. Section 4.9 turns it about a horizontal axis, which at the figures'
+  0.6 lays all leaves flat.
 - nBranchDist gathers children into whorls of 1 + nBranchDist.
 """
 
@@ -37,6 +40,7 @@ from bbfit.trees.skeleton import (
     Leaves,
     Skeleton,
     Stems,
+    arctan2,
     cross,
     dot,
     rotation_about,
@@ -47,7 +51,7 @@ from bbfit.trees.skeleton import (
 from bbfit.trees.species import Species
 
 Count = Callable[[int, int], None]
-"""Told a level and how many stems it is about to have; the level after the last stands for the leaves that are kept. Raises to stop."""
+"""Told a level and how many stems it is about to have; the level after the last stands for the leaves. Raises to stop."""
 
 # Stems shorter than this share of the tree's scale are left out; where the envelope cuts (section 4.6) there are many such stubs.
 _LEAST_LENGTH = 2e-3
@@ -55,6 +59,8 @@ _LEAST_LENGTH = 2e-3
 _SHORTENINGS = np.arange(0.95, 0.02, -0.05)
 # How far above the ground stems stop, as a share of the tree's scale.
 _CLEARANCE = 0.03
+# How much of the way towards the tropism a stem turns in one segment at most, so that stems which split stay apart.
+_MOST_PULL = 0.8
 _STEEPEST = np.radians(75)
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -77,7 +83,7 @@ def grow_skeleton(species: Species, seed: int, count: Count, *, leaves: float = 
     ----------
     seed : any whole number of at least 0.
     count : asked before memory for a level's stems, or for the leaves, is taken.
-    leaves : share of the leaves that is kept, 0 to 1; those are larger, so that the area of all stays (section 4.5's quality).
+    leaves : section 4.5's quality: share of the leaves that grow, 0 to 1; those are larger, so that the area of all stays.
     """
     levels: list[Stems] = []
     for level in range(species.levels):
@@ -110,9 +116,8 @@ def _children(species: Species, levels: list[Stems], random: np.random.Generator
     elif level > 2:
         many *= 1 - 0.5 * stems.offset[stems.root]
     many = many * _shares(species, stems)
-    numbers = _whole(many, random)
-    count(level, int(numbers.sum()))
-    parent, offset, turn = _along(species, stems, numbers, level, 1 + species.branch_dist[level], random)
+    count(level, round(many.sum()))
+    parent, offset, turn = _along(species, stems, _whole(many, random), level, 1 + species.branch_dist[level], random)
     points, frames = _bud_frames(species, stems, parent, offset, turn, level, random)
     share = species.length[level] + random.uniform(-1, 1, len(parent)) * species.length_v[level]
     if level == 1:
@@ -126,14 +131,11 @@ def _leaves(species: Species, levels: list[Stems], share: float, random: np.rand
     """Where the leaves are (section 4.5) and how they turn to the light (section 4.9)."""
     stems, level = levels[-1], min(len(levels), 3)
     place = stems.offset[stems.root] if len(levels) > 1 else np.ones(len(stems))
-    numbers = _whole(abs(species.leaves) * shape_ratio(TAPERED_CYLINDRICAL, place, species) * _shares(species, stems), random)
-    total = int(numbers.sum())
-    count(len(levels), round(total * share))
-    parent, offset, turn = _along(species, stems, numbers, level, 1.0, random)
-    kept = np.sort(random.permutation(total)[: round(total * share)])
-    parent, offset, turn = parent[kept], offset[kept], turn[kept]
+    many = share * abs(species.leaves) * shape_ratio(TAPERED_CYLINDRICAL, place, species) * _shares(species, stems)
+    count(len(levels), round(many.sum()))
+    parent, offset, turn = _along(species, stems, _whole(many, random), level, 1.0, random)
     if species.leaves < 0:  # a fan at the tip, as wide as the down angle
-        fan = np.radians(species.down_angle[level] * (offset - 0.5) + species.down_angle_v[level] * random.uniform(-1, 1, len(kept)))
+        fan = np.radians(species.down_angle[level] * (offset - 0.5) + species.down_angle_v[level] * random.uniform(-1, 1, len(offset)))
         offset = np.ones_like(offset)
         points, frames = stems.at(parent, offset)
         frames = frames @ rotation_y(fan)
@@ -145,14 +147,11 @@ def _leaves(species: Species, levels: list[Stems], share: float, random: np.rand
 
 
 def _facing_light(frames: Array, points: Array, bend: float) -> Array:
-    """Leaves turned outwards, then upwards, each by a share of the angle that is missing."""
+    """Leaves turned about the vertical to face outwards, then pitched to face upwards, each by a share of the angle that is missing."""
     normals = frames[:, :, 1]
-    around = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(normals[:, 1], normals[:, 0])
+    around = arctan2(points[:, 1], points[:, 0]) - arctan2(normals[:, 1], normals[:, 0])
     frames = rotation_z(bend * ((around + np.pi) % (2 * np.pi) - np.pi)) @ frames
-    normals = frames[:, :, 1]
-    axis = cross(normals, _UP)
-    tilt = np.arctan2(np.hypot(normals[:, 0], normals[:, 1]), normals[:, 2])
-    return rotation_about(axis, bend * tilt) @ frames
+    return frames @ rotation_x(bend * arctan2(frames[:, 2, 2], frames[:, 2, 1]))
 
 
 def _shares(species: Species, stems: Stems) -> Array:
@@ -234,7 +233,8 @@ def _grow(species: Species, level: int, buds: _Buds, random: np.random.Generator
             parent = np.concatenate([parent, source])
             offset = np.concatenate([offset, np.full(len(source), segment / resolution)])
             split = copies[stem]
-            declination = np.degrees(np.arccos(np.clip(frames[:, segment, 2, 2], -1, 1)))
+            axes = np.abs(frames[:, segment, 2])
+            declination = np.degrees(arctan2(np.hypot(axes[:, 0], axes[:, 1]), axes[:, 2]))
             angle = species.split_angle[level] + random.uniform(-1, 1, len(stem)) * species.split_angle_v[level]
             angle = np.radians(np.where(split > 0, np.maximum(angle - declination, 0), 0))
             pitch = pitch + angle
@@ -245,29 +245,34 @@ def _grow(species: Species, level: int, buds: _Buds, random: np.random.Generator
                 vertical = np.zeros(len(stem))
             else:
                 spin = np.zeros(len(stem))
-                spread = 20 + 0.75 * (30 + np.abs(declination - 90)) * random.uniform(0, 1, len(stem)) ** 2
+                spread = 20 + 0.75 * (30 + (90 - declination)) * random.uniform(0, 1, len(stem)) ** 2
                 vertical = np.where(member > 0, np.radians(spread) * random.choice([-1, 1], len(stem)), 0)
         here = frames[:, segment]
         if helix:
-            axis = buds.frames[root][:, :, 2]
-            turned = rotation_about(axis, np.full(len(nodes), 2 * np.pi / resolution)) @ here
+            here = rotation_about(buds.frames[root][:, :, 2], np.full(len(nodes), 2 * np.pi / resolution)) @ here
+            yaw = np.zeros(len(nodes))
         else:
-            if back == 0:
-                pitch += curve / resolution
-            else:
-                pitch += (curve if segment < resolution / 2 else back) / (resolution / 2)
+            pitch += _curvature(curve, back, segment, resolution)
             pitch += np.radians(species.curve_v[level]) / resolution * random.uniform(-1, 1, len(nodes))
             yaw = np.radians(species.bend_v[level]) / resolution * random.uniform(-1, 1, len(nodes))
-            turned = rotation_z(vertical) @ here @ rotation_z(spin) @ rotation_x(pitch) @ rotation_y(yaw)
+        turned = rotation_z(vertical) @ here @ rotation_z(spin) @ rotation_x(pitch) @ rotation_y(yaw)
         turned = _attracted(turned, species.tropism if level >= 2 else (*species.tropism[:2], 0.0), resolution)
         if level == 0:
-            declination = np.arctan2(np.hypot(turned[:, 0, 2], turned[:, 1, 2]), turned[:, 2, 2])
+            declination = arctan2(np.hypot(turned[:, 0, 2], turned[:, 1, 2]), turned[:, 2, 2])
             turned = rotation_about(cross(turned[:, :, 2], _UP), np.maximum(declination - _STEEPEST, 0)) @ turned
         frames[:, segment + 1] = turned
-        nodes[:, segment + 1] = nodes[:, segment] + _chord(here[:, :, 2], turned[:, :, 2]) / resolution
+        nodes[:, segment + 1] = nodes[:, segment] + _chord(frames[:, segment, :, 2], turned[:, :, 2]) / resolution
     length = buds.length[root]
     nodes = buds.points[root][:, None] + length[:, None, None] * nodes
     return Stems(level, nodes, frames, first, length, np.zeros(len(nodes)), parent, offset, root)
+
+
+def _curvature(curve: float, back: float, segment: int, resolution: int) -> float:
+    """The turn of a segment without its random part: all alike, or ``curve`` over the first half of the stem and ``back`` over the rest."""
+    if back == 0:
+        return curve / resolution
+    half = (resolution + 1) // 2
+    return curve / half if segment < half else back / (resolution - half)
 
 
 def _clones(species: Species, level: int, node: int, root: Indices, random: np.random.Generator) -> Indices:
@@ -291,9 +296,9 @@ def _attracted(frames: Array, tropism: tuple[float, float, float], resolution: i
         return frames
     towards = np.array(tropism) / strength
     axis = cross(frames[:, :, 2], towards)
-    angle = np.arctan2(np.sqrt(dot(axis, axis)), dot(frames[:, :, 2], towards))[:, 0]
+    angle = arctan2(np.sqrt(dot(axis, axis)), dot(frames[:, :, 2], towards))[:, 0]
     pull = angle if towards[2] >= 0 else np.pi - angle
-    return rotation_about(axis, np.minimum(strength * pull / resolution, angle)) @ frames
+    return rotation_about(axis, np.minimum(strength * pull / resolution, _MOST_PULL * angle)) @ frames
 
 
 def _chord(begin: Array, end: Array) -> Array:
@@ -306,20 +311,23 @@ def _chord(begin: Array, end: Array) -> Array:
 
 def _pruned(species: Species, scale: float, stems: Stems) -> Stems:
     """Stems cut back at the pruning envelope and above the ground; a trunk, whose foot is outside, at the envelope's side and top."""
-    bare = species.base_size[0] * scale if stems.level == 0 else 0.0
     if species.prune_ratio > 0:
-        stems = _shortened(stems, lambda points: in_envelope(species, scale, points) | (points[..., 2] < bare), species.prune_ratio)
-    if stems.level > 0:
-        stems = _shortened(stems, lambda points: points[..., 2] > _CLEARANCE * scale, 1.0)
+        bare = species.base_size[0] * scale if stems.level == 0 else -1.0
+        stems = _shortened(stems, lambda points: in_envelope(species, scale, points) | (points[..., 2] <= bare), species.prune_ratio)
+    if stems.level > 0:  # those that begin below the clearance may not sink further
+        stems = _shortened(stems, lambda points: points[..., 2] > np.minimum(_CLEARANCE * scale, 0.9 * points[:, :1, 2]), 1.0)
     return stems
 
 
 def _shortened(stems: Stems, inside: Callable[[Array], NDArray[np.bool_]], ratio: float) -> Stems:
-    """Stems shortened until they and their clones lie inside, as section 4.6 does; by a share ``ratio`` of what that takes."""
+    """Stems shortened until they and their clones lie inside, as section 4.6 does; by a share ``ratio`` of what that takes.
+
+    Those whose foot is outside get a length of 0, but for the trunk.
+    """
     share = np.ones(len(stems))
     base = stems.nodes[:, :1]
     outside = np.arange(len(stems))
-    for tried in (1.0, *_SHORTENINGS, 0.0):
+    for tried in (1.0, *_SHORTENINGS, *([0.0] if stems.level > 0 else [])):
         points = base[outside] + tried * (stems.nodes[outside] - base[outside])
         roots = np.unique(stems.root[outside[~inside(points).all(1)]])
         share[outside] = tried
@@ -331,12 +339,13 @@ def _shortened(stems: Stems, inside: Callable[[Array], NDArray[np.bool_]], ratio
 
 
 def _to_height(skeleton: Skeleton) -> Skeleton:
-    """The tree scaled until its highest point, leaves included, is as high as its scale says."""
+    """The tree scaled until its highest point, leaves of LeafScale included, is as high as its scale says."""
     leaves, last = skeleton.leaves, skeleton.levels[-1]
-    factor = skeleton.scale / max(float(stems.nodes[..., 2].max(initial=0)) for stems in skeleton.levels)
+    bare = factor = skeleton.scale / max(float(stems.nodes[..., 2].max(initial=0)) for stems in skeleton.levels)
     if len(leaves.parent):
-        feet, tips = last.at(leaves.parent, leaves.offset)[0][:, 2], leaves.length * leaves.frames[:, 2, 2]
-        factor = min(factor, float(((skeleton.scale - tips) / feet).min()))
+        feet, tips = last.at(leaves.parent, leaves.offset)[0][:, 2], skeleton.species.leaf_scale * leaves.frames[:, 2, 2]
+        factor = min(bare, float(((skeleton.scale - tips) / feet).min()))
+    factor = max(factor, bare / 2)  # a tree smaller than its leaves
     levels = (
         replace(stems, nodes=factor * stems.nodes, length=factor * stems.length, radius=factor * stems.radius) for stems in skeleton.levels
     )

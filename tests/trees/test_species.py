@@ -137,7 +137,7 @@ def test_lists_of_another_length_are_refused(key: str) -> None:
     [
         ("Shape", 8, 9, "Shape: expected a value in [0, 8], got 9"),
         ("Shape", 7.0, 7.5, "Shape: expected a whole number, got 7.5"),
-        ("Scale", 1000, 0, "Scale: expected a value in (0, 1000], got 0"),
+        ("Scale", 1000, 0, "Scale: expected a value in [0.1, 1000], got 0"),
         ("ScaleV", 12.9, 13, "ScaleV: expected less than Scale, which is 13, got 13"),
         ("Levels", 1, 0, "Levels: expected a value in [1, 4], got 0"),
         ("Levels", 2, 4, "nCurveRes[3]: expected at least 1, got 0"),
