@@ -7,11 +7,12 @@ import os
 import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
-
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from bbfit.checks import fail
+
+if TYPE_CHECKING:  # growing a tree need not wait for torch
+    from torch import Tensor
 
 PART = ".part"
 """Ending of the temporary names, which start with a dot."""
