@@ -43,7 +43,7 @@ ONLY_IN = {
     "bpy": {"blender/worker.py"},
     "cv2": {"images.py", "fitting/bounds.py"},
     "xatlas": {"exporting/atlas.py"},
-    "warp": {"rendering/fused.py"},
+    "warp": {"rendering/kernels.py", "rendering/fused.py", "fitting/adam.py", "fitting/fused_ssim.py", "fitting/ssim_kernels.py"},
     "ray": {"sweep.py"},
 }
 NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib")

@@ -6,26 +6,29 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 from bbfit.checks import check_choice, check_count, check_range
+from bbfit.rendering.dispatch import Backend
 
 Preset = Literal["default", "thesis"]
 Sides = Literal["one", "two", "pair"]
 Bounds = Literal["viewport", "thesis", "silhouette"]
-Loss = Literal["l1", "l2"]
+Loss = Literal["l1", "l2", "backgrounds"]
 Schedule = Literal["cosine", "growth"]
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "default": {
         "bounds": "silhouette",
-        "ssim_weight": 0.005,
+        "loss": "backgrounds",
+        "levels": 4,
         "steps": 300,
         "views_per_step": 2,
-        "learning_rate": 0.05,
+        "learning_rate": 0.15,
         "schedule": "cosine",
     },
     # Thesis, section 4.4 and 5.
     "thesis": {
         "bounds": "viewport",
-        "ssim_weight": 0.0,
+        "loss": "l2",
+        "levels": 1,
         "steps": 10_000,
         "views_per_step": 1,
         "learning_rate": 0.01,
@@ -39,7 +42,7 @@ class FitConfig:
     """How to fit. A field left at None takes the preset's value."""
 
     preset: Preset = "default"
-    """thesis repeats the thesis's schedule: 10,000 steps of one random view, Adam at 0.01 growing by a tenth, no bounds."""
+    """thesis repeats the thesis's schedule: 10,000 steps of one random view, Adam at 0.01 growing by a tenth, no bounds, L2."""
     billboards: int = 4
     """Number N of upright billboards, at k*180/N degrees through the tree's axis."""
     sides: Sides = "one"
@@ -49,20 +52,26 @@ class FitConfig:
     training views (silhouette). Preset: silhouette; thesis: viewport."""
     texel_density: float = 1.0
     """Texels per pixel where the tree's axis is seen face on."""
-    loss: Loss = "l2"
-    """Absolute or squared difference of premultiplied RGBA, summed over channels and averaged over pixels."""
-    ssim_weight: float | None = None
-    """Weight of 1 - SSIM beside the loss. Preset: 0.005; thesis: 0."""
+    loss: Loss | None = None
+    """Absolute (l1) or squared (l2) difference of premultiplied RGBA, summed over channels and averaged over pixels, or the squared
+    difference over random backgrounds in expectation (backgrounds). Preset: backgrounds; thesis: l2."""
+    ssim_weight: float = 0.0
+    """Weight of 1 - SSIM beside the loss."""
+    levels: int | None = None
+    """Resolutions of views and textures, coarse to fine, sides doubling from each to the next; the steps are shared out evenly.
+    Preset: 4; thesis: 1."""
     steps: int | None = None
     """Optimiser steps. Preset: 300; thesis: 10000."""
     views_per_step: int | None = None
-    """Training views in every step. Preset: 2; thesis: 1."""
+    """Training views in every step at full resolution; twice as many at each coarser level. Preset: 2; thesis: 1."""
     learning_rate: float | None = None
-    """Adam's initial rate. Preset: 0.05; thesis: 0.01."""
+    """Adam's initial rate. Preset: 0.15; thesis: 0.01."""
     schedule: Schedule | None = None
     """cosine decay to zero, or the thesis's growth by (1 + 0.1 / steps) a step. Preset: cosine; thesis: growth."""
     seed: int = 0
     """Seeds the start textures and the order of views."""
+    backend: Backend = "auto"
+    """The renderer to fit through: fused kernels, or the reference, which is many times slower; auto takes the kernels."""
     device: str = "cpu"
     """Torch device to fit on, such as cpu or cuda."""
     checkpoint_every: int = 250
@@ -74,12 +83,14 @@ class FitConfig:
         check_choice("sides", self.sides, ("one", "two", "pair"))
         check_choice("bounds", self.bounds, (None, "viewport", "thesis", "silhouette"))
         check_range("texel_density", self.texel_density, 0, 16, open_low=True)
-        check_choice("loss", self.loss, ("l1", "l2"))
+        check_choice("loss", self.loss, (None, "l1", "l2", "backgrounds"))
         check_choice("schedule", self.schedule, (None, "cosine", "growth"))
         check_count("seed", self.seed, 0)
         check_count("checkpoint_every", self.checkpoint_every)
-        if self.ssim_weight is not None:
-            check_range("ssim_weight", self.ssim_weight, 0, 1)
+        check_range("ssim_weight", self.ssim_weight, 0, 1)
+        check_choice("backend", self.backend, ("auto", "reference", "fused"))
+        if self.levels is not None:
+            check_count("levels", self.levels)
         if self.steps is not None:
             check_count("steps", self.steps)
         if self.views_per_step is not None:

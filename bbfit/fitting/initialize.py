@@ -45,8 +45,14 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
         else:
             bounds = silhouette_bounds(planes, views)
         planes = bounded(planes, bounds, density)
-    generator = torch.Generator().manual_seed(config.seed)
-    return planes.to(torch.float32).with_texels(torch.rand(len(planes.texels), 4, generator=generator))
+    return random_textures(planes.to(torch.float32), planes.texture_sizes, config.seed)
+
+
+def random_textures(cloud: BillboardCloud, sizes: Tensor, seed: int) -> BillboardCloud:
+    """The same rectangles with random textures of the given sizes, int64 [N, 2]."""
+    count = int((sizes.prod(-1) * (1 + cloud.two_sided.long())).sum())
+    texels = torch.rand(count, 4, generator=torch.Generator().manual_seed(seed))
+    return replace(cloud, texture_sizes=sizes, texels=texels)
 
 
 def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_metre: Tensor) -> BillboardCloud:

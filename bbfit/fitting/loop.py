@@ -17,11 +17,12 @@ from torch import Tensor
 from bbfit.checks import InputTypeError, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.config import FitConfig
-from bbfit.fitting.initialize import start_cloud
-from bbfit.fitting.losses import image_loss
+from bbfit.fitting.initialize import random_textures, start_cloud
+from bbfit.fitting.levels import LEAST_SIDE, Targets, resize_textures, shrunk_sizes
+from bbfit.fitting.steps import make_stepper
+from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import bleed_colour
-from bbfit.rendering.dispatch import render
 from bbfit.views import ViewDataset
 
 
@@ -54,14 +55,12 @@ class FitResult:
 
 
 @dataclass
-class _State:
-    """Everything that changes from step to step; what a checkpoint holds."""
+class _Progress:
+    """What a checkpoint holds: the losses of the steps done, and the stepper's tensors after the last of them."""
 
-    texels: Tensor
-    first_moment: Tensor
-    second_moment: Tensor
     losses: list[float]
-    seconds: float = 0.0
+    tensors: dict[str, Tensor]
+    seconds: float
 
 
 def fit(
@@ -74,7 +73,8 @@ def fit(
     """Fit a billboard cloud to the training views; the test views are not looked at.
 
     Each step draws some training views, renders the cloud from their cameras, and lets Adam (Kingma and Ba 2015) move the texels down
-    the gradient of the loss; texels are kept in [0, 1]. At the end transparent texels get their neighbours' colour.
+    the gradient of the loss; texels are kept in [0, 1]. Views and textures start coarse and are refined level by level. At the end
+    transparent texels get their neighbours' colour.
 
     Parameters
     ----------
@@ -95,44 +95,57 @@ def fit(
     config = (config or FitConfig()).resolve()
     assert config.steps is not None and config.views_per_step is not None
     device = _device(config.device)
+    begun = time.perf_counter()
     views.train.check()
-    start = start_cloud(views.train, config).to(device)
-    mark = sha256(json.dumps([1, asdict(config), views.train.fingerprint], sort_keys=True).encode()).hexdigest()
+    start = start_cloud(views.train, config)
+    mark = sha256(json.dumps([2, asdict(config), views.train.fingerprint], sort_keys=True).encode()).hexdigest()
     checkpoint = Path(checkpoint) if checkpoint is not None else None
-    state = _load(checkpoint, mark, device) if checkpoint is not None else None
-    if state is None:
-        state = _State(start.texels.clone(), torch.zeros_like(start.texels), torch.zeros_like(start.texels), [])
+    done = (_load(checkpoint, mark) if checkpoint is not None else None) or _Progress([], {}, 0.0)
+    begun -= done.seconds
 
-    texels = state.texels.requires_grad_()
-    adam = torch.optim.Adam([texels], fused=True)
-    adam.state[texels] = {
-        "step": torch.tensor(float(len(state.losses)), device=device),
-        "exp_avg": state.first_moment,
-        "exp_avg_sq": state.second_moment,
-    }
-    begun = time.perf_counter() - state.seconds
-    for index in range(len(state.losses), config.steps):
-        rate = learning_rate(config, index)
-        adam.param_groups[0]["lr"] = rate
-        chosen = draw_views(config, len(views.train), index)
-        target = views.train.targets(chosen).to(device)
-        image = render(start.with_texels(texels), views.train.cameras[chosen].to(device))
-        loss = image_loss(image, target, config.loss, config.ssim_weight or 0.0)
-        adam.zero_grad()
-        loss.backward()
-        adam.step()
-        with torch.no_grad():
-            texels.clamp_(0, 1)
-        state.losses.append(loss.item())
-        state.seconds = time.perf_counter() - begun
-        if on_step is not None:
-            on_step(Step(index + 1, config.steps, state.losses[-1], rate))
-        if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
-            _save(checkpoint, mark, state)
-    cloud = start.with_texels(texels.detach())
+    losses, fitted = done.losses, None  # type: list[float], BillboardCloud | None
+    for level in levels_of(config, views.train.cameras):
+        if len(losses) > level.end:
+            continue  # the checkpoint is of a later level
+        sizes = shrunk_sizes(start, level.halvings)
+        cloud = random_textures(start, sizes, config.seed) if fitted is None else resize_textures(fitted, sizes)
+        stepper = make_stepper(cloud.to(device), Targets.at(views.train, level.halvings), config)
+        if done.tensors and len(losses) > level.begin:
+            stepper.restore(done.tensors, len(losses) - level.begin)
+        for index in range(len(losses), level.end):
+            rate = learning_rate(config, index)
+            loss = stepper.step(draw_views(config, len(views.train), index, level.halvings), rate)
+            losses.append(float(loss))
+            if on_step is not None:
+                on_step(Step(index + 1, config.steps, losses[-1], rate))
+            if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
+                _save(checkpoint, mark, _Progress(losses, stepper.tensors(), time.perf_counter() - begun))
+        fitted = cloud.with_texels(stepper.texels.detach().cpu())
+    assert fitted is not None
     # No view determines the colour of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
-    bled = [bleed_colour(side).reshape(-1, 4) for texture in cloud.textures() for side in texture]
-    return FitResult(cloud.with_texels(torch.cat(bled)).to("cpu"), state.losses, config, state.seconds)
+    bled = [bleed_colour(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
+    return FitResult(fitted.with_texels(torch.cat(bled)), losses, config, time.perf_counter() - begun)
+
+
+@dataclass(frozen=True)
+class Level:
+    """Steps that are taken at one resolution."""
+
+    halvings: int
+    """How often the sides of views and textures are halved."""
+    begin: int
+    """Steps before the level."""
+    end: int
+    """Steps after the level."""
+
+
+def levels_of(config: FitConfig, cameras: Camera) -> list[Level]:
+    """The levels of a resolved configuration, coarse to fine; levels of very small pictures are left out."""
+    assert config.levels is not None and config.steps is not None
+    side = min(cameras.width, cameras.height)
+    halvings = [h for h in reversed(range(config.levels)) if h == 0 or side >> h >= LEAST_SIDE]
+    edges = [config.steps * i // len(halvings) for i in range(len(halvings) + 1)]
+    return [Level(*level) for level in zip(halvings, edges, edges[1:], strict=False)]
 
 
 def learning_rate(config: FitConfig, index: int) -> float:
@@ -146,16 +159,17 @@ def learning_rate(config: FitConfig, index: int) -> float:
     return config.learning_rate * 0.5 * (1 + math.cos(math.pi * index / config.steps))
 
 
-def draw_views(config: FitConfig, count: int, index: int) -> list[int]:
+def draw_views(config: FitConfig, count: int, index: int, halvings: int = 0) -> list[int]:
     """The training views of step ``index``, of ``count``: a function of the seed and the step alone, so that any step can be resumed.
 
     One view a step is drawn at random with replacement (thesis, algorithm 1); several are dealt from reshuffled decks, so that all
-    views come up equally often.
+    views come up equally often. Every halving of the resolution doubles their number.
     """
     assert config.views_per_step is not None
-    if config.views_per_step == 1:
+    wanted = config.views_per_step << halvings
+    if wanted == 1:
         return np.random.default_rng([config.seed, index]).integers(count, size=1).tolist()
-    batch = min(config.views_per_step, count)
+    batch = min(wanted, count)
     per_deck = count // batch
     deck = np.random.default_rng([config.seed, index // per_deck]).permutation(count)
     return deck[index % per_deck * batch :][:batch].tolist()
@@ -169,18 +183,14 @@ def _device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def _save(path: Path, mark: str, state: _State) -> None:
-    tensors = {
-        "texels": state.texels.detach().cpu(),
-        "first_moment": state.first_moment.cpu(),
-        "second_moment": state.second_moment.cpu(),
-        "losses": torch.tensor(state.losses, dtype=torch.float64),
-    }
-    write_tensors(path, tensors, {"fit": mark, "seconds": repr(state.seconds)})
+def _save(path: Path, mark: str, progress: _Progress) -> None:
+    tensors = {name: tensor.detach().cpu() for name, tensor in progress.tensors.items()}
+    losses = torch.tensor(progress.losses, dtype=torch.float64)
+    write_tensors(path, tensors | {"losses": losses}, {"fit": mark, "seconds": repr(progress.seconds)})
 
 
-def _load(path: Path, mark: str, device: torch.device) -> _State | None:
-    """The state kept in a checkpoint, or ``None`` if there is none for this very fit."""
+def _load(path: Path, mark: str) -> _Progress | None:
+    """What is kept in a checkpoint, or ``None`` if there is none for this very fit."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
@@ -190,12 +200,7 @@ def _load(path: Path, mark: str, device: torch.device) -> _State | None:
             metadata = file.metadata() or {}
             if metadata.get("fit") != mark:
                 return None
-            return _State(
-                file.get_tensor("texels").to(device),
-                file.get_tensor("first_moment").to(device),
-                file.get_tensor("second_moment").to(device),
-                file.get_tensor("losses").tolist(),
-                float(metadata["seconds"]),
-            )
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+            return _Progress(tensors.pop("losses").tolist(), tensors, float(metadata["seconds"]))
     except SafetensorError:
         return None

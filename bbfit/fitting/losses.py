@@ -12,9 +12,16 @@ _SIGMA, _RADIUS = 1.5, 5
 
 
 def image_loss(render: Tensor, target: Tensor, kind: Loss, ssim_weight: float) -> Tensor:
-    """The thesis's L1 or L2 loss (section 4.4), plus ``ssim_weight`` times (1 - SSIM).
+    """The thesis's L1 or L2 loss (section 4.4), or the one over random backgrounds, plus ``ssim_weight`` times (1 - SSIM).
 
-    Both differences are summed over the four channels and averaged over pixels, as the thesis's ``1/p * sum`` does.
+    Differences are summed over the four channels and averaged over pixels, as the thesis's ``1/p * sum`` does.
+
+    ``backgrounds`` is what the squared difference of colours over an opaque background is in expectation, if every channel b of the
+    background is uniform in [0, 1]. With the differences c of premultiplied colour and a of alpha it has a closed form,
+
+        sum over channels of E[(c - a b)^2] = sum of (c^2 - a c) + a^2,
+
+    the L2 loss but for one term: colour that is missing is worth less where alpha is missing with it, since the background shows instead.
 
     Parameters
     ----------
@@ -26,6 +33,8 @@ def image_loss(render: Tensor, target: Tensor, kind: Loss, ssim_weight: float) -
     """
     difference = render - target
     loss = (difference.abs() if kind == "l1" else difference.square()).sum(-1).mean()
+    if kind == "backgrounds":
+        loss = loss - (difference[..., 3] * difference[..., :3].sum(-1)).mean()
     if ssim_weight:
         loss = loss + ssim_weight * (1 - structural_similarity(render, target))
     return loss

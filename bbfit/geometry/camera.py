@@ -80,6 +80,14 @@ class Camera:
         """Move to a device or convert to a dtype."""
         return Camera(self.world_to_camera.to(target), self.intrinsics.to(target), self.width, self.height, self.orthographic)
 
+    def resized(self, width: int, height: int) -> Camera:
+        """The same cameras with a picture of ``width`` x ``height`` pixels that covers the same field of view."""
+        scale = torch.tensor([width / self.width, height / self.height], dtype=self.intrinsics.dtype, device=self.intrinsics.device)
+        intrinsics = self.intrinsics.clone()
+        intrinsics[..., :2, :] *= scale[:, None]
+        intrinsics[..., :2, 2] += (scale - 1) / 2  # pixel centres lie at whole numbers, so the corner is at -1/2
+        return Camera(self.world_to_camera, intrinsics, width, height, self.orthographic)
+
     @property
     def camera_to_world(self) -> Tensor:
         """Rigid transform from camera axes to the world, same shape as ``world_to_camera``."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from bbfit.checks import check_choice
@@ -11,7 +12,7 @@ from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.reference import render_reference
 
-Backend = Literal["auto", "reference"]
+Backend = Literal["auto", "reference", "fused"]
 
 
 def render(cloud: BillboardCloud, camera: Camera, *, backend: Backend = "auto") -> Tensor:
@@ -21,12 +22,17 @@ def render(cloud: BillboardCloud, camera: Camera, *, backend: Backend = "auto") 
     ----------
     cloud : N billboards, N >= 0.
     camera : one camera, or V of them.
-    backend : ``"reference"``, or ``"auto"`` for the fastest one that is there.
+    backend : ``"fused"``, Warp kernels, float32; ``"reference"``, kornia and autograd, any precision; ``"auto"``: the reference for a
+        float64 cloud and the kernels for any other.
 
     Returns
     -------
     Premultiplied RGBA over nothing in [0, 1], [H, W, 4] for one camera and [V, H, W, 4] for a batch, in the cloud's dtype and on its
     device. See :func:`bbfit.rendering.reference.render_reference` for what it means.
     """
-    check_choice("backend", backend, ("auto", "reference"))
-    return render_reference(cloud, camera)
+    check_choice("backend", backend, ("auto", "reference", "fused"))
+    if backend == "reference" or (backend == "auto" and cloud.texels.dtype == torch.float64):
+        return render_reference(cloud, camera)
+    from bbfit.rendering.fused import render_fused  # warp takes a while to start
+
+    return render_fused(cloud, camera).to(cloud.texels.dtype)

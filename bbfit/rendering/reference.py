@@ -37,20 +37,16 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
         image = cloud.texels.new_zeros(views, height, width, 4) + cloud.texels.sum()  # of no texels, so that backward() works
         return image if camera.batched else image[0]
 
-    distance = signed_distance(cloud, cameras).detach()  # [V, N]
-    reach = torch.ones_like(distance)
-    if not cameras.orthographic:
-        reach = (cameras.position[:, None] - cloud.centers.detach()).norm(dim=-1)
-    visible = (distance.abs() > EDGE_ON * reach) & (cloud.half_extents != 0).all(-1)
+    visible = drawable(cloud, cameras)
     drawn, depth = _plane_depth(cloud, cameras, visible)
 
-    identity = torch.eye(3, dtype=distance.dtype, device=distance.device)
+    identity = torch.eye(3, dtype=depth.dtype, device=depth.device)
     # Replacing singular matrices *before* they are inverted keeps every gradient finite.
     matrices = torch.where(visible[..., None, None], texel_to_pixel(cloud, cameras), identity)
     # The margin shifts texel coordinates by one.
     shift = torch.tensor([[1.0, 0, -1], [0, 1, -1], [0, 0, 1]], dtype=matrices.dtype, device=matrices.device)
     matrices = (matrices @ shift).transpose(0, 1)  # [N, V, 3, 3]
-    sources = _facing_textures(cloud, distance >= 0)
+    sources = _facing_textures(cloud, signed_distance(cloud, cameras).detach() >= 0)
     if len({source.shape for source in sources}) == 1:  # one call for all planes: kornia works on batch entries in parallel
         warped = list(_warp(torch.cat(sources), matrices.flatten(0, 1), height, width).split(views))
     else:
@@ -59,6 +55,15 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
     shown = [alpha * mask for alpha, mask in zip(alphas, drawn, strict=True)]
     image = composite(list(colours), shown, list(depth)).permute(0, 2, 3, 1)
     return image if camera.batched else image[0]
+
+
+def drawable(cloud: BillboardCloud, cameras: Camera) -> Tensor:
+    """Which billboards each view can show, bool [V, N]: not those seen edge-on or without an area."""
+    distance = signed_distance(cloud, cameras).detach()
+    reach = torch.ones_like(distance)
+    if not cameras.orthographic:
+        reach = (cameras.position[:, None] - cloud.centers.detach()).norm(dim=-1)
+    return (distance.abs() > EDGE_ON * reach) & (cloud.half_extents.detach() != 0).all(-1)
 
 
 def _warp(sources: Tensor, matrices: Tensor, height: int, width: int) -> Tensor:

@@ -11,7 +11,9 @@ import torch
 
 from bbfit.checks import InputError
 from bbfit.fitting.config import FitConfig
-from bbfit.fitting.loop import FitResult, Step, draw_views, fit, learning_rate
+from bbfit.fitting.initialize import start_cloud
+from bbfit.fitting.levels import LEAST_SIDE
+from bbfit.fitting.loop import FitResult, Step, draw_views, fit, learning_rate, levels_of
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.reference import render_reference
 from bbfit.views import ViewDataset, ViewSet
@@ -35,7 +37,7 @@ def same(a: FitResult, b: FitResult) -> bool:
     return torch.equal(a.cloud.texels, b.cloud.texels) and a.losses == b.losses
 
 
-@pytest.mark.parametrize("loss", ["l1", "l2"])
+@pytest.mark.parametrize("loss", ["l1", "l2", "backgrounds"])
 def test_fit_explains_held_out_views_of_a_cloud_it_can_represent(views: ViewDataset, loss: str) -> None:
     result = fit(views, FitConfig(billboards=2, loss=loss, steps=150))
     # Measured 37.1 dB (l1) and 34.6 dB (l2) on one thread; an even grey scores 9 dB. The two grids of texels differ, so it is not exact.
@@ -53,11 +55,10 @@ def test_thesis_preset_is_the_thesis() -> None:
     assert learning_rate(config, 10_000) == pytest.approx(0.01 * math.exp(0.1), rel=1e-5)
 
 
-def test_one_thesis_step_is_one_adam_step(views: ViewDataset) -> None:
+@pytest.mark.parametrize("backend", ["reference", "fused"])
+def test_one_thesis_step_is_one_adam_step(views: ViewDataset, backend: str) -> None:
     """Adam's first step moves every texel that received gradient by the rate against the gradient's sign."""
-    config = FitConfig(preset="thesis", billboards=2, steps=1)
-    from bbfit.fitting.initialize import start_cloud
-
+    config = FitConfig(preset="thesis", billboards=2, steps=1, backend=backend)
     start = start_cloud(views.train, config)
     texels = start.texels.clone().requires_grad_()
     chosen = draw_views(config.resolve(), len(views.train), 0)
@@ -66,8 +67,31 @@ def test_one_thesis_step_is_one_adam_step(views: ViewDataset) -> None:
     assert texels.grad is not None
     expected = (start.texels - 0.01 * texels.grad / (texels.grad.abs() + 1e-8)).clamp(0, 1)
     fitted, hidden = fit(views, config).cloud.texels, expected[:, 3] < 0.5 / 255
-    torch.testing.assert_close(fitted[~hidden], expected[~hidden], atol=2e-7, rtol=0)
+    # Where a gradient is not far above Adam's epsilon, 1e-8, the step shows its rounding; measured 5e-6 between the renderers.
+    torch.testing.assert_close(fitted[~hidden], expected[~hidden], atol=2e-7 if backend == "reference" else 1e-5, rtol=0)
+    firm = (texels.grad.abs() > 1e-6) & ~hidden[:, None]
+    assert firm.float().mean() > 0.3
+    torch.testing.assert_close(fitted[firm], expected[firm], atol=3e-7, rtol=0)
     assert (fitted[hidden, 3] == 0).all()
+
+
+@pytest.mark.parametrize("config", [FitConfig(billboards=2, steps=24), FitConfig(preset="thesis", billboards=2, steps=24)])
+def test_the_fused_fit_is_the_reference_fit(views: ViewDataset, config: FitConfig) -> None:
+    """After a few steps of either the pictures agree; Adam turns roundings of vanishing gradients into steps, so texels need not."""
+    fused, reference = (fit(views, dataclasses.replace(config, backend=backend)) for backend in ("fused", "reference"))
+    assert fused.losses == pytest.approx(reference.losses, rel=2e-3)
+    pictures = [render_reference(result.cloud, views.test.cameras) for result in (fused, reference)]
+    assert (pictures[0] - pictures[1]).square().mean().sqrt() < 2e-3
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 4, 11, 300])
+def test_levels_share_the_steps(views: ViewDataset, steps: int) -> None:
+    levels = levels_of(FitConfig(steps=steps).resolve(), views.train.cameras)
+    assert levels[0].begin == 0 and levels[-1].end == steps and levels[-1].halvings == 0
+    assert all(a.end == b.begin and a.halvings == b.halvings + 1 for a, b in zip(levels, levels[1:], strict=False))
+    assert max(level.end - level.begin for level in levels) - min(level.end - level.begin for level in levels) <= 1
+    assert min(views.train.cameras.width, views.train.cameras.height) >> levels[0].halvings >= LEAST_SIDE
+    assert len(levels_of(FitConfig(preset="thesis").resolve(), views.train.cameras)) == 1
 
 
 def test_same_seed_same_result_other_seed_another(views: ViewDataset) -> None:

@@ -1,0 +1,135 @@
+"""Adam for texels (Kingma and Ba 2015, algorithm 1) as one pass over memory that skips what it cannot change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from bbfit.rendering.fused import occupancy
+from bbfit.rendering.kernels import BLOCK, FLAGS
+from bbfit.rendering.launching import in_parallel, pieces_of
+
+BETAS, EPSILON = (0.9, 0.999), 1e-8
+# A block without gradient for so many steps rests until it has one again. Its first moment has then shrunk by 0.9^128, so that all that
+# it would still have moved is a hundred-thousandth of a step; both moments are caught up with when it wakes.
+REST_AFTER = 128
+# Blocks that a CPU thread takes at a time, and at least.
+RUN, LEAST_RUNS = 64, 64
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
+texel_block: Any = wp.types.vector(length=4 * BLOCK, dtype=wp.float32)
+"""A block of RGBA texels; wide enough for a CPU's vector units."""
+
+
+@wp.kernel
+def _update_blocks(
+    first: int,
+    run: int,
+    step: int,
+    rate: float,
+    beta1: float,
+    beta2: float,
+    correction: float,
+    epsilon: float,
+    rest_after: int,
+    texels: wp.array(dtype=texel_block),  # type: ignore[valid-type]
+    gradient: wp.array(dtype=texel_block),  # type: ignore[valid-type]
+    first_moment: wp.array(dtype=texel_block),  # type: ignore[valid-type]
+    second_moment: wp.array(dtype=texel_block),  # type: ignore[valid-type]
+    last: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+    occupied: wp.array(dtype=wp.uint8),  # type: ignore[valid-type]
+) -> None:
+    begin = first + wp.tid() * run  # type: ignore[operator]
+    for i in range(begin, wp.min(begin + run, texels.shape[0])):
+        g = gradient[i]
+        idle = step - last[i]
+        moved = wp.dot(g, g) != 0.0
+        if moved or idle <= rest_after:
+            decay1 = beta1
+            decay2 = beta2
+            if moved:
+                gradient[i] = texel_block()
+                last[i] = step
+                if idle > rest_after:
+                    decay1 = wp.pow(beta1, float(idle - rest_after))
+                    decay2 = wp.pow(beta2, float(idle - rest_after))
+            m = first_moment[i] * decay1 + g * (1.0 - beta1)
+            v = second_moment[i] * decay2 + wp.cw_mul(g, g) * (1.0 - beta2)
+            first_moment[i] = m
+            second_moment[i] = v
+            p = texels[i]
+            for c in range(wp.static(4 * BLOCK)):
+                p[c] = wp.clamp(p[c] - rate * m[c] / (wp.sqrt(v[c]) * correction + epsilon), 0.0, 1.0)
+            texels[i] = p
+            opaque = p[3] + p[7] + p[11] + p[15]
+            occupied[i] = wp.where(opaque > 0.0, wp.uint8(1), wp.uint8(0))
+
+
+@dataclass(frozen=True)
+class AdamState:
+    """Texels and what Adam keeps of them, padded to whole blocks; all of it changes in place."""
+
+    texels: Tensor
+    """Float32 [P', 4], P' a multiple of :data:`bbfit.rendering.kernels.BLOCK`."""
+    gradient: Tensor
+    """To be added to before every update, which clears it, [P', 4]."""
+    first_moment: Tensor
+    """[P', 4]."""
+    second_moment: Tensor
+    """[P', 4]."""
+    last: Tensor
+    """Step in which each block last had a gradient, int32 [P' / BLOCK]."""
+    occupied: Tensor
+    """Whether each block has a texel that is not fully transparent, uint8 [P' / BLOCK]."""
+
+    @staticmethod
+    def start(texels: Tensor) -> AdamState:
+        """Before the first step, for texels [P, 4]."""
+        padded = torch.nn.functional.pad(texels.detach(), (0, 0, 0, -len(texels) % BLOCK)).contiguous().clone()
+        never = torch.full((len(padded) // BLOCK,), -(1 << 30), dtype=torch.int32, device=texels.device)
+        zeros = [torch.zeros_like(padded) for _ in range(3)]
+        return AdamState(padded, zeros[0], zeros[1], zeros[2], never, occupancy(padded))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What has to be kept to go on later; the gradient is zero between steps."""
+        return {"texels": self.texels, "first_moment": self.first_moment, "second_moment": self.second_moment, "last": self.last}
+
+    def restored(self, tensors: dict[str, Tensor]) -> AdamState:
+        """The state that :meth:`tensors` are of."""
+        kept = {name: tensor.to(self.texels.device) for name, tensor in tensors.items()}
+        return replace(AdamState.start(kept["texels"]), **kept)
+
+    def update(self, step: int, rate: float) -> None:
+        """Take step number ``step``, from 1, at the given rate; keep the texels in [0, 1].
+
+        The same as ``torch.optim.Adam`` followed by ``clamp_`` up to rounding and :data:`REST_AFTER`.
+        """
+        beta1, beta2 = BETAS
+        run = 1 if self.texels.is_cuda else RUN
+        arguments = [
+            run,
+            step,
+            rate / (1 - beta1**step),
+            beta1,
+            beta2,
+            (1 - beta2**step) ** -0.5,
+            EPSILON,
+            REST_AFTER,
+            *(
+                wp.from_torch(tensor.view(-1, 4 * BLOCK), dtype=texel_block)
+                for tensor in (self.texels, self.gradient, self.first_moment, self.second_moment)
+            ),
+            wp.from_torch(self.last, dtype=wp.int32),
+            wp.from_torch(self.occupied, dtype=wp.uint8),
+        ]
+        runs, device = -(-len(self.last) // run), wp.device_from_torch(self.texels.device)
+        _update_blocks.module.load(device)  # or every thread would compile it
+
+        def launch(begin: int, end: int) -> None:
+            wp.launch(_update_blocks, end - begin, [begin * run, *arguments], device=device)
+
+        in_parallel(launch, [(0, runs)] if self.texels.is_cuda else pieces_of(runs, LEAST_RUNS))

@@ -1,0 +1,74 @@
+"""Coarse to fine: views and textures at a fraction of their resolution (Burt and Adelson 1983 of pictures; here for textures as well)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import premultiply, unpremultiply
+from bbfit.views import ViewSet
+
+LEAST_SIDE = 16
+"""A level whose pictures would be smaller than this in pixels is left out."""
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Training views at one resolution."""
+
+    cameras: Camera
+    """V cameras of that resolution."""
+    views: ViewSet
+    """The views at full resolution."""
+    shrunk: Tensor | None
+    """Premultiplied RGBA, uint8 [V, H, W, 4]; ``None`` at full resolution, where the views themselves are read."""
+
+    @staticmethod
+    def at(views: ViewSet, halvings: int) -> Targets:
+        """The views with sides ``2 ** halvings`` times shorter, every pixel the mean of those that it covers."""
+        if halvings == 0:
+            return Targets(views.cameras, views, None)
+        width, height = (max(1, round(side / 2**halvings)) for side in (views.cameras.width, views.cameras.height))
+
+        def shrink(index: int) -> Tensor:
+            picture = views.targets([index]).permute(0, 3, 1, 2)
+            return (interpolate(picture, (height, width), mode="area") * 255).round().to(torch.uint8).permute(0, 2, 3, 1)
+
+        with ThreadPoolExecutor() as pool:
+            shrunk = torch.cat(list(pool.map(shrink, range(len(views)))))
+        return Targets(views.cameras.resized(width, height), views, shrunk.contiguous())
+
+    def packed(self, indices: Sequence[int]) -> Tensor:
+        """Some of the pictures, uint8 [B, H, W, 4], straight at full resolution and premultiplied otherwise."""
+        return self.views.images(indices) if self.shrunk is None else self.shrunk[list(indices)]
+
+    def pictures(self, indices: Sequence[int]) -> Tensor:
+        """Some of the pictures, premultiplied RGBA in [0, 1], float32 [B, H, W, 4]."""
+        return self.views.targets(indices) if self.shrunk is None else self.shrunk[list(indices)].float() / 255
+
+
+def resize_textures(cloud: BillboardCloud, sizes: Tensor) -> BillboardCloud:
+    """The same rectangles with textures of other sizes, int64 [N, 2], filtered as premultiplied colours.
+
+    The colour of what is fully transparent is filtered as it is, since a fit goes on from it.
+    """
+    textures = []
+    for texture, size in zip(cloud.textures(), sizes.tolist(), strict=True):
+        mode = "area" if size[0] <= texture.shape[1] else "bilinear"
+        both = torch.cat([premultiply(texture), texture], -1).permute(0, 3, 1, 2)
+        both = interpolate(both, size, mode=mode).permute(0, 2, 3, 1)
+        filtered = torch.where(both[..., 3:4] > 1e-3, unpremultiply(both[..., :4]), both[..., 4:])
+        textures.append(filtered.reshape(-1, 4))
+    return replace(cloud, texture_sizes=sizes, texels=torch.cat(textures))
+
+
+def shrunk_sizes(cloud: BillboardCloud, halvings: int) -> Tensor:
+    """Texture sizes with sides ``2 ** halvings`` times shorter, rounded up, int64 [N, 2]."""
+    return -(-cloud.texture_sizes // 2**halvings)

@@ -1,0 +1,38 @@
+"""Starting Warp kernels: on a GPU at once, on a CPU in pieces on all cores, since Warp runs a CPU launch in the calling thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+
+import torch
+
+
+def worker_count() -> int:
+    """Threads that CPU launches are spread over: as many as torch uses (``torch.set_num_threads``, ``OMP_NUM_THREADS``)."""
+    return torch.get_num_threads()
+
+
+def in_parallel(launch: Callable[[int, int], None], pieces: Iterable[tuple[int, int]]) -> None:
+    """Call ``launch(begin, end)`` for every piece on :func:`worker_count` threads; return when all are done, raise what one raised."""
+    pieces = list(pieces)
+    if len(pieces) <= 1 or worker_count() == 1:
+        for begin, end in pieces:
+            launch(begin, end)
+        return
+    for _ in _pool(worker_count()).map(lambda piece: launch(*piece), pieces):
+        pass
+
+
+def pieces_of(count: int, least: int, pieces_a_worker: int = 4) -> list[tuple[int, int]]:
+    """Cut ``range(count)`` into about equal pieces of at least ``least``, a few for each worker so that none idles for long."""
+    number = max(1, min(count // max(least, 1), pieces_a_worker * worker_count()))
+    edges = [count * i // number for i in range(number + 1)]
+    return [(begin, end) for begin, end in pairwise(edges) if end > begin]
+
+
+@cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers, thread_name_prefix="bbfit-launch")
