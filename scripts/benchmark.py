@@ -1,7 +1,20 @@
-"""Measure speed and memory: python scripts/benchmark.py [--out benchmark.json]
+"""Measure speed, memory and quality: python scripts/benchmark.py [--quick] [--json FILE] [--views FOLDER ...] [--only NAME ...]
 
-Every measurement runs in a process of its own, so that its peak memory is its own. Seconds are wall time and count importing bbfit and
-writing the file.
+Every row is measured in one run, and what is compared is measured in turns, so that ratios hold on a machine that is shared. With a GPU
+the rows about steps come once for each device. Rows by name:
+
+grow      a tree grown and written as GLB, in a process of its own; seconds count importing bbfit
+copy      bytes a second of a plain copy in memory (read plus written)
+step      one training step of one view (render, loss, gradient, update) at the default fit's last level, by the reference renderer and by
+          the fused kernels; bound_s is how long the bytes that it must move take at the speed of a copy
+thesis    the same of the thesis preset, whose billboards fill the viewport
+views     steps of more views
+quality   for each folder of views: the thesis preset's 10,000 steps by the fused kernels, what they would take by the reference
+          renderer (a step's time over at least 50 steps, times 10,000), the default preset, and a short default fit of 80 steps
+memory    the peak resident memory of a default fit of 360 views at 1024 x 1024, in a process of its own
+
+``--quick`` takes under a minute and leaves out grow's willow, most numbers of billboards, quality and memory. ``--views`` are the folders
+for quality; without any it takes data/views.
 """
 
 from __future__ import annotations
@@ -10,18 +23,38 @@ import argparse
 import json
 import os
 import platform
+import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+import bbfit
+from bbfit.fitting.adam import REST_AFTER
+from bbfit.fitting.initialize import random_textures, start_cloud
+from bbfit.fitting.levels import Targets, resize_textures, shrunk_sizes
+from bbfit.fitting.steps import FusedStepper, ReferenceStepper, Stepper
+from bbfit.images import write_png
+from bbfit.views import ViewSet
+
+DATA = Path(__file__).resolve().parents[1] / "data"
 TREES = {"quaking_aspen": 0, "weeping_willow": 0}
 """Species that are grown whole, and their seeds."""
+WARM_STEPS = {"default": 160, "thesis": 1200}
+"""Steps at an eighth of the size; half as many at each finer level."""
+Row = dict[str, Any]
 
 
-def measure(script: str, *arguments: str) -> dict[str, Any]:
-    """Seconds and peak resident memory in bytes of a Python script that prints JSON as its last line, with what it prints."""
+def own_process(script: str, *arguments: str) -> Row:
+    """Seconds that a Python script takes, with what it prints as its last line, JSON."""
     begun = time.perf_counter()
     reading, writing = os.pipe()
     process = os.posix_spawn(
@@ -30,35 +63,277 @@ def measure(script: str, *arguments: str) -> dict[str, Any]:
     os.close(writing)
     with os.fdopen(reading) as pipe:
         printed = pipe.read()
-    _, status, usage = os.wait4(process, 0)
+    _, status = os.waitpid(process, 0)
     seconds = time.perf_counter() - begun
     if status:
         raise SystemExit(f"a measurement failed with status {status}")
-    return json.loads(printed.splitlines()[-1]) | {"seconds": round(seconds, 2), "peak_bytes": usage.ru_maxrss * 1024}
+    return json.loads(printed.splitlines()[-1]) | {"seconds": round(seconds, 2)}
 
 
-GROW = """
+PEAK = """
+def peak():  # of this program's memory alone; what getrusage tells may be the parent's
+    return int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0]) * 1024
+"""
+
+GROW = (
+    PEAK
+    + """
 import json, sys, bbfit
 name, seed, path = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 scene = bbfit.grow(name, seed=seed)
 bbfit.write_tree(scene, path)
-print(json.dumps({"vertices": sum(len(mesh.vertices) for mesh in scene.geometry.values())}))
+vertices = sum(len(mesh.vertices) for mesh in scene.geometry.values())
+print(json.dumps({"vertices": vertices, "peak_bytes": peak()}))
 """
+)
+
+FIT = (
+    PEAK
+    + """
+import json, sys, bbfit
+views = bbfit.ViewDataset.load(sys.argv[1])
+result = bbfit.fit(views)
+print(json.dumps({"views": len(views.train) + len(views.test), "fit_s": round(result.seconds, 2), "peak_bytes": peak()}))
+"""
+)
+
+
+def grow(quick: bool) -> list[Row]:
+    """Rows ``grow``."""
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in list(TREES)[: 1 if quick else None]:
+            path = Path(folder) / f"{name}.glb"
+            rows.append({"name": "grow", "species": name} | own_process(GROW, name, str(TREES[name]), str(path)))
+            rows[-1]["file_bytes"] = path.stat().st_size
+    return rows
+
+
+@dataclass(frozen=True)
+class Enlarged:
+    """Stands in for a view set's cache: its pictures at another size."""
+
+    views: ViewSet
+    size: int
+
+    def get(self, path: Path) -> Tensor:
+        """One picture, uint8 [size, size, 4]."""
+        picture = self.views.image(self.views.paths.index(path)).permute(2, 0, 1)[None].float()
+        return interpolate(picture, (self.size, self.size), mode="bilinear")[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
+
+
+def enlarged(views: ViewSet, size: int) -> ViewSet:
+    """The same views in square pictures of another size."""
+    pictures = {path: Enlarged(views, size).get(path) for path in views.paths}
+    return replace(views, cameras=views.cameras.resized(size, size), _cache=pictures)
+
+
+def seconds_of(work: Callable[[], object], device: torch.device) -> float:
+    """Seconds that ``work`` takes; on a GPU, of the device."""
+    if device.type == "cuda":
+        events = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
+        events[0].record()
+        work()
+        events[1].record()
+        torch.cuda.synchronize()
+        return events[0].elapsed_time(events[1]) / 1000
+    begun = time.perf_counter()
+    work()
+    return time.perf_counter() - begun
+
+
+def copy_speed(device: torch.device) -> float:
+    """Bytes a second, read plus written, of copying 64 MiB."""
+    source = torch.rand(1 << 24, device=device)
+    target = torch.empty_like(source)
+    return 2 * 4 * source.numel() / statistics.median(seconds_of(lambda: target.copy_(source), device) for _ in range(15))
+
+
+def warm(views: ViewSet, config: bbfit.FitConfig, device: torch.device) -> FusedStepper:
+    """A fused fit some way into its last level, so that what is empty is empty, as in most steps of a fit."""
+    start = start_cloud(views, config)
+    cloud = random_textures(start, shrunk_sizes(start, 3), 0)
+    for halvings in (3, 2, 1, 0):
+        cloud = resize_textures(cloud, shrunk_sizes(start, halvings))
+        stepper = FusedStepper(cloud.to(device), Targets.at(views, halvings), config)
+        # The thesis's rate is low and its billboards are large: emptying them takes long, but not at an eighth of the size.
+        for index in range(WARM_STEPS[config.preset] >> (3 - halvings)):
+            stepper.step([(5 * index) % len(views)], config.learning_rate or 0.0)
+        cloud = cloud.with_texels(stepper.texels.cpu())
+    return stepper
+
+
+def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torch.device, turns: int, copy: float) -> Row:
+    """A row ``step`` or ``thesis``."""
+    config, targets = config.resolve(), Targets.at(views, 0)
+    fused = warm(views, config, device)
+    start = start_cloud(views, config).to(device)
+    reference = ReferenceStepper(start.with_texels(fused.texels.clone()), targets, config)
+    reference.step([0], 0.01)
+    times: dict[str, list[float]] = {"reference": [], "fused": []}
+    for turn in range(turns):
+        chosen = [turn % len(views)]
+        times["reference"].append(seconds_of(lambda chosen=chosen: reference.step(chosen, 0.01), device))  # type: ignore[misc]
+        for index in range(4):
+            chosen = [(4 * turn + index) % len(views)]
+            times["fused"].append(seconds_of(lambda chosen=chosen: fused.step(chosen, 0.01), device))  # type: ignore[misc]
+    slow, fast = (statistics.median(times[which]) for which in ("reference", "fused"))
+    moved = bytes_of_a_step(fused, views)
+    return {
+        "name": name,
+        "device": device.type,
+        "size": views.cameras.width,
+        "billboards": config.billboards,
+        "texels": len(start.texels),
+        "reference_s": round(slow, 5),
+        "fused_s": round(fast, 5),
+        "ratio": round(slow / fast, 1),
+        "bytes": moved,
+        "bound_s": round(moved / copy, 5),
+        "of_bound": round(moved / copy / fast, 2),
+    }
+
+
+def bytes_of_a_step(stepper: FusedStepper, views: ViewSet) -> int:
+    """Bytes that a step of one view must move: the target once, touched texels read and their gradients added, awake blocks updated."""
+    state, steps = stepper.state, stepper.steps
+    touched = int((state.last == steps).sum()) * 4
+    awake = int((steps - state.last <= REST_AFTER).sum()) * 4
+    pixels = views.cameras.width * views.cameras.height
+    # RGBA in float32 is 16 bytes. Touched texels are read, their gradient is read, written, and cleared; of awake ones three arrays are
+    # read and written; every gradient is looked at.
+    return 4 * pixels + 64 * touched + 96 * awake + 16 * len(state.texels)
+
+
+def steps(quick: bool) -> list[Row]:
+    """Rows ``copy``, ``step``, ``thesis`` and ``views``."""
+    rows: list[Row] = []
+    views = bbfit.ViewDataset.load(DATA / "views").train
+    for device in [torch.device("cpu"), *([torch.device("cuda")] if torch.cuda.is_available() else [])]:
+        copy = copy_speed(device)
+        rows.append({"name": "copy", "device": device.type, "bytes_a_second": round(copy)})
+        for size in (256, 512, 1024):
+            large = enlarged(views, size)
+            turns = 3 if quick else 7
+            density = bbfit.FitConfig(views_per_step=1, levels=1)
+            for count in (4,) if quick else (2, 4, 8, 16):
+                rows.append(step_row(large, replace(density, billboards=count), "step", device=device, turns=turns, copy=copy))
+                show(rows[-1])
+            if not quick or size == 1024:
+                thesis = bbfit.FitConfig(preset="thesis")
+                rows.append(step_row(large, thesis, "thesis", device=device, turns=turns, copy=copy))
+                show(rows[-1])
+        if not quick:
+            rows += views_rows(enlarged(views, 512), device)
+    return rows
+
+
+def views_rows(views: ViewSet, device: torch.device) -> list[Row]:
+    """Rows ``views``: fused steps of more than one view."""
+    rows = []
+    stepper = warm(views, bbfit.FitConfig(levels=1).resolve(), device)
+    for count in (1, 2, 4, 8):
+        chosen = list(range(count))
+        seconds = statistics.median(seconds_of(lambda chosen=chosen: stepper.step(chosen, 0.01), device) for _ in range(20))  # type: ignore[misc]
+        rows.append({"name": "views", "device": device.type, "size": 512, "billboards": 4, "views": count, "fused_s": round(seconds, 5)})
+        show(rows[-1])
+    return rows
+
+
+def quality(folders: list[Path]) -> list[Row]:
+    """Rows ``quality``."""
+    rows = []
+    for folder in folders:
+        views = bbfit.ViewDataset.load(folder)
+        views.train.check()
+        views.test.check()
+        thesis, default = bbfit.FitConfig(preset="thesis"), bbfit.FitConfig()
+        bbfit.fit(views, replace(default, steps=4))  # compiles the kernels
+        slow = reference_step(views.train, thesis)
+        fits = {"thesis": thesis, "default": default, "short": replace(default, steps=80)}
+        row: Row = {
+            "name": "quality",
+            "views": folder.name,
+            "size": views.train.cameras.width,
+            "thesis_reference_s": round(slow * 10_000, 1),
+        }
+        for name, config in fits.items():
+            begun = time.perf_counter()
+            cloud = bbfit.fit(views, config).cloud
+            seconds = time.perf_counter() - begun
+            report = bbfit.evaluate(cloud, views.test)
+            scores = {key: round(value, 4) for key, value in report.to_json()["over_white"].items()}
+            row |= {f"{name}_s": round(seconds, 2), **{f"{name}_{key}": value for key, value in scores.items()}}
+            row[f"{name}_ratio"] = round(slow * 10_000 / seconds, 1)
+        rows.append(row)
+        show(row)
+    return rows
+
+
+def reference_step(views: ViewSet, config: bbfit.FitConfig, steps: int = 50) -> float:
+    """Mean seconds of a step by the reference renderer, over ``steps`` steps after two."""
+    config = config.resolve()
+    stepper: Stepper = ReferenceStepper(start_cloud(views, config), Targets.at(views, 0), config)
+    for index in range(2):
+        stepper.step([index % len(views)], 0.01)
+    begun = time.perf_counter()
+    for index in range(steps):
+        stepper.step([index % len(views)], 0.01)
+    return (time.perf_counter() - begun) / steps
+
+
+def memory() -> list[Row]:
+    """Rows ``memory``."""
+    views = enlarged(bbfit.ViewDataset.load(DATA / "views").train, 1024)
+    with tempfile.TemporaryDirectory() as folder:
+        frames = []
+        for index in range(360):
+            turn = 2 * np.pi * index / 360
+            pose = [
+                [np.cos(turn), 0, np.sin(turn), 20 * np.sin(turn)],
+                [np.sin(turn), 0, -np.cos(turn), -20 * np.cos(turn)],
+                [0, 1, 0, 4],
+                [0, 0, 0, 1],
+            ]
+            frames.append({"file_path": f"{index:03d}", "transform_matrix": pose})
+            if index < len(views):
+                write_png(Path(folder) / f"{index:03d}.png", views.image(index).numpy())
+            else:
+                os.link(Path(folder) / f"{index % len(views):03d}.png", Path(folder) / f"{index:03d}.png")
+        for split, part in {"train": [f for i, f in enumerate(frames) if i % 4], "test": frames[::4]}.items():
+            text = json.dumps({"camera_angle_x": 0.7, "frames": part})
+            (Path(folder) / f"transforms_{split}.json").write_text(text, encoding="utf-8")
+        return [{"name": "memory", "size": 1024} | own_process(FIT, folder)]
+
+
+def show(row: Row) -> None:
+    """Print a row on one line."""
+    print("  ".join(str(value) if key == "name" else f"{key} {value}" for key, value in row.items()), flush=True)
 
 
 def main() -> None:
-    """Measure, print, and write the result where asked."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, help="file for the result as JSON")
-    out = parser.parse_args().out
-    result: dict[str, Any] = {"machine": platform.platform(), "processors": os.cpu_count(), "grow": {}}
-    with tempfile.TemporaryDirectory() as folder:
-        for name, seed in TREES.items():
-            path = Path(folder) / f"{name}.glb"
-            result["grow"][name] = measure(GROW, name, str(seed), str(path)) | {"file_bytes": path.stat().st_size}
-            print(name, result["grow"][name])
-    if out:
-        out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    """Measure, print, and write the rows where asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="under a minute")
+    parser.add_argument("--json", type=Path, help="file for the rows, a JSON list")
+    parser.add_argument("--views", type=Path, nargs="*", help="folders of views for the rows about quality")
+    parser.add_argument("--only", nargs="*", choices=["grow", "steps", "quality", "memory"], help="measure these only")
+    arguments = parser.parse_args()
+    wanted = arguments.only or (["grow", "steps"] if arguments.quick else ["grow", "steps", "quality", "memory"])
+    rows: list[Row] = [
+        {"name": "machine", "platform": platform.platform(), "processors": os.cpu_count(), "threads": torch.get_num_threads()}
+    ]
+    if "steps" in wanted:
+        rows += steps(arguments.quick)
+    if "quality" in wanted:
+        rows += quality(arguments.views or [DATA / "views"])
+    for name, measured in {"grow": lambda: grow(arguments.quick), "memory": memory}.items():
+        if name in wanted:
+            for row in measured():
+                rows.append(row)
+                show(row)
+    if arguments.json:
+        arguments.json.write_text("[\n " + ",\n ".join(map(json.dumps, rows)) + "\n]\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

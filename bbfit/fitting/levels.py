@@ -61,9 +61,9 @@ def resize_textures(cloud: BillboardCloud, sizes: Tensor) -> BillboardCloud:
     """
     textures = []
     for texture, size in zip(cloud.textures(), sizes.tolist(), strict=True):
-        mode = "area" if size[0] <= texture.shape[1] else "bilinear"
+        shrinks = size[0] <= texture.shape[1] and size[1] <= texture.shape[2]
         both = torch.cat([premultiply(texture), texture], -1).permute(0, 3, 1, 2)
-        both = interpolate(both, size, mode=mode).permute(0, 2, 3, 1)
+        both = interpolate(both, size, mode="area" if shrinks else "bilinear").permute(0, 2, 3, 1)
         filtered = torch.where(both[..., 3:4] > 1e-3, unpremultiply(both[..., :4]), both[..., 4:])
         textures.append(filtered.reshape(-1, 4))
     return replace(cloud, texture_sizes=sizes, texels=torch.cat(textures))

@@ -88,27 +88,27 @@ class FusedStepper:
         from bbfit.rendering.projection import project
 
         self._targets, self._config, self._count = targets, config, len(cloud.texels)
-        self._state, self._steps = AdamState.start(cloud.texels), 0
+        self.state, self.steps = AdamState.start(cloud.texels), 0
         self._projection = project(cloud, targets.cameras.to(cloud.texels.device))
 
     @property
     def texels(self) -> Tensor:
         """See :class:`Stepper`."""
-        return self._state.texels[: self._count]
+        return self.state.texels[: self._count]
 
     def tensors(self) -> dict[str, Tensor]:
         """See :class:`Stepper`."""
-        return self._state.tensors()
+        return self.state.tensors()
 
     def restore(self, tensors: dict[str, Tensor], steps: int) -> None:
         """See :class:`Stepper`."""
-        self._state, self._steps = self._state.restored(tensors), steps
+        self.state, self.steps = self.state.restored(tensors), steps
 
     def step(self, chosen: Sequence[int], rate: float) -> Tensor:
         """See :class:`Stepper`."""
         from bbfit.rendering.fused import PixelLoss, differentiate
 
-        state, config, device = self._state, self._config, self._state.texels.device
+        state, config, device = self.state, self._config, self.state.texels.device
         projection = self._projection.take(torch.tensor(chosen, device=device))
         pixels = len(chosen) * projection.width * projection.height
         assert config.loss is not None
@@ -116,8 +116,8 @@ class FusedStepper:
         dissimilarity, of_image = self._dissimilarity(projection, chosen) if config.ssim_weight else (0.0, None)
         sums, _ = differentiate(state.texels, projection, state.gradient, image_gradient=of_image, loss=loss, occupied=state.occupied)
         assert sums is not None
-        self._steps += 1
-        state.update(self._steps, rate)
+        self.steps += 1
+        state.update(self.steps, rate)
         return sums.sum() / pixels + dissimilarity
 
     def _dissimilarity(self, projection: Projection, chosen: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -125,7 +125,7 @@ class FusedStepper:
         from bbfit.fitting.fused_ssim import similarity_and_gradient
         from bbfit.rendering.fused import draw
 
-        image = draw(self._state.texels, projection, self._state.occupied)
+        image = draw(self.state.texels, projection, self.state.occupied)
         weight = self._config.ssim_weight
         similarity, of_image = similarity_and_gradient(image, self._targets.pictures(chosen).to(image.device), -weight)
         assert of_image is not None

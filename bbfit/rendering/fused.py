@@ -8,15 +8,20 @@ from typing import Any
 import torch
 import warp as wp
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.rendering.kernels import BLOCK, NORMS, kernels
+from bbfit.rendering.kernels import BLOCK, NORMS, Plane, kernels
 from bbfit.rendering.launching import in_parallel, pieces_of
 from bbfit.rendering.projection import Projection, project
 
 # Pixels that are worth a CPU thread's while.
-LEAST_PIXELS = 1 << 13
+LEAST_PIXELS = 1 << 14
+# Bands of rows that a picture is cut into at most. Not by the number of threads, which would decide over the order of sums.
+MOST_BANDS = 32
+# Pixels whose texel coordinates fit a CPU's vector registers.
+LANES = 16
 
 
 def render_fused(cloud: BillboardCloud, camera: Camera) -> Tensor:
@@ -58,6 +63,7 @@ class _Drawing(torch.autograd.Function):
         return draw(texels, projection)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         texels, to_texel = ctx.saved_tensors
         of_texels = torch.zeros_like(texels)
@@ -85,8 +91,21 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None)
     if not len(texels) or not views:
         return image
     occupied = occupancy(texels.detach()) if occupied is None else occupied
-    kernel, device, run = kernels(_capacity(projection.count)).draw, wp.device_from_torch(texels.device), _run(projection, texels.device)
-    shared = [run, width, int(projection.orthographic), *_planes(projection), _array(texels, wp.vec4), _array(occupied, wp.uint8)]
+    kernel, device, run = (
+        kernels(_capacity(projection.count), _lanes(texels.device)).draw,
+        wp.device_from_torch(texels.device),
+        _run(projection, texels.device),
+    )
+    packed = _packed_planes(projection)
+    shared = [
+        run,
+        width,
+        int(projection.orthographic),
+        projection.count,
+        _planes(packed),
+        _array(texels, wp.vec4),
+        _array(occupied, wp.uint8),
+    ]
     pieces = -(-width // run)
     outputs = [_array(image, wp.vec4)]
     kernel.module.load(device)  # or every thread would compile it
@@ -94,7 +113,7 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None)
     def launch(begin: int, end: int) -> None:
         wp.launch(kernel, (views, end - begin, pieces), [begin, *shared], outputs, device=device)
 
-    in_parallel(launch, [(0, height)] if texels.is_cuda else pieces_of(height, -(-LEAST_PIXELS // (width * views))))
+    in_parallel(launch, [(0, height)] if texels.is_cuda else pieces_of(height, -(-LEAST_PIXELS // (width * views)), MOST_BANDS))
     return image
 
 
@@ -130,12 +149,13 @@ def differentiate(
         nothing = torch.zeros(0, 0, 0, 4, dtype=torch.float32, device=device)
         target = loss.target if loss else nothing.to(torch.uint8)
         occupied = occupancy(texels.detach()) if occupied is None else occupied
-        run = _run(projection, device)
+        run, packed = _run(projection, device), _packed_planes(projection)
         arguments = [
             run,
             width,
             int(projection.orthographic),
-            *_planes(projection),
+            count,
+            _planes(packed),
             _array(texels, wp.vec4),
             _array(occupied, wp.uint8),
             _array(nothing if image_gradient is None else image_gradient, wp.vec4),
@@ -145,7 +165,7 @@ def differentiate(
             loss.weight if loss else 0.0,
         ]
         outputs = [_array(sums, wp.float32), _array(texel_gradient, wp.vec4), _array(matrices, wp.vec3d)]
-        kernel, pieces = kernels(_capacity(count)).differentiate, -(-width // run)
+        kernel, pieces = kernels(_capacity(count), _lanes(device)).differentiate, -(-width // run)
 
         on = wp.device_from_torch(device)
         kernel.module.load(on)  # or every thread would compile it
@@ -170,7 +190,7 @@ def _schedule(projection: Projection, device: torch.device) -> list[tuple[int, i
         return [(0, views, [[(0, height)]])]
     schedule: list[tuple[int, int, list[list[tuple[int, int]]]]] = []
     for view, apart in enumerate(projection.rows_apart.tolist()):
-        bands = pieces_of(height, max(apart, -(-LEAST_PIXELS // width)))
+        bands = pieces_of(height, max(apart, -(-LEAST_PIXELS // width)), MOST_BANDS)
         if len(bands) > 3:
             schedule.append((view, 1, [bands[0::2], bands[1::2]]))
         elif schedule and len(schedule[-1][2]) == 1:  # views that are not cut up go together
@@ -185,18 +205,26 @@ def _capacity(count: int) -> int:
     return max(4, 1 << (count - 1).bit_length())
 
 
+def _lanes(device: torch.device) -> int:
+    """Pixels that a thread takes at a time."""
+    return 1 if device.type == "cuda" else LANES
+
+
 def _run(projection: Projection, device: torch.device) -> int:
     """Pixels that a thread walks along a row."""
     return 1 if device.type == "cuda" else projection.width
 
 
-def _planes(projection: Projection) -> list[Any]:
-    return [
-        _array(projection.to_texel.detach().contiguous(), wp.mat33),
-        _array(projection.nearness.contiguous(), wp.vec3),
-        _array(projection.textures.contiguous(), wp.vec3i),
-        _array(projection.boxes.contiguous(), wp.vec4i),
-    ]
+def _packed_planes(projection: Projection) -> Tensor:
+    """The memory of an array of :class:`bbfit.rendering.kernels.Plane`, int32 [V, N, 22]."""
+    views, count = projection.boxes.shape[:2]
+    numbers = [projection.to_texel.detach().reshape(views, count, 9), projection.nearness]
+    return torch.cat([*(part.contiguous().view(torch.int32) for part in numbers), projection.textures, projection.boxes], -1)
+
+
+def _planes(packed: Tensor) -> Any:
+    """A Warp view of :func:`_packed_planes`, which must outlive it."""
+    return wp.array(ptr=packed.data_ptr(), shape=packed.shape[0] * packed.shape[1], dtype=Plane, device=wp.device_from_torch(packed.device))
 
 
 def _array(tensor: Tensor, dtype: Any) -> Any:

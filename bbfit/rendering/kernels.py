@@ -24,6 +24,7 @@ TIE = wp.constant(TIE_VALUE)
 BLOCK = 4
 """Consecutive texels whose being empty is known by one byte, and that Adam takes together."""
 BLOCK_BITS = wp.constant(2)
+ROUNDING = wp.constant(5e-7)
 NORMS = {"l1": 1, "l2": 2, "backgrounds": 3}
 """How differences of premultiplied RGBA are measured; see :func:`bbfit.rendering.fused.PixelLoss`."""
 L1, BACKGROUNDS = wp.constant(NORMS["l1"]), wp.constant(NORMS["backgrounds"])
@@ -31,65 +32,39 @@ L1, BACKGROUNDS = wp.constant(NORMS["l1"]), wp.constant(NORMS["backgrounds"])
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
 
-@wp.func
-def locate(box: wp.vec4i, to_texel: wp.mat33, nearness: wp.vec3, texture: wp.vec3i, column: int, row: int, orthographic: int) -> wp.vec3:
-    """Texel coordinates and nearness of a layer at a pixel; nearness 0 where it is not hit."""
-    missed = wp.vec3(0.0, 0.0, 0.0)
-    if column < box[0] or column > box[1] or row < box[2] or row > box[3]:
-        return missed
-    x = float(column)
-    y = float(row)
-    w = to_texel[2, 0] * x + to_texel[2, 1] * y + to_texel[2, 2]
-    near = w
-    if orthographic != 0:
-        near = nearness[0] * x + nearness[1] * y + nearness[2]
-        if near >= 0.0:
-            return missed
-    if w <= 0.0:
-        return missed
-    scale = 1.0 / w
-    u = (to_texel[0, 0] * x + to_texel[0, 1] * y + to_texel[0, 2]) * scale
-    v = (to_texel[1, 0] * x + to_texel[1, 1] * y + to_texel[1, 2]) * scale
-    if u > -1.0 and u < float(texture[2]) and v > -1.0 and v < float(texture[1]):  # false for NaN
-        return wp.vec3(u, v, near)
-    return missed
+# Warp's own indexing multiplies by strides and takes negative indices, which costs more than the rest of a sample.
+@wp.func_native("return texels.data[index];")
+def texel(texels: wp.array(dtype=wp.vec4), index: int) -> wp.vec4: ...
+
+
+@wp.func_native("wp::atomic_add(gradient.data + index, value);")
+def accumulate(gradient: wp.array(dtype=wp.vec4), index: int, value: wp.vec4): ...
+
+
+@wp.func_native("return flags.data[index];")
+def flag(flags: wp.array(dtype=wp.uint8), index: int) -> wp.uint8: ...
 
 
 @wp.func
-def empty(occupied: wp.array(dtype=wp.uint8), texture: wp.vec3i, u: float, v: float) -> bool:
-    """Whether all texels that a sample is made of are known to be transparent."""
-    left = int(wp.floor(u))
-    top = int(wp.floor(v))
-    above = texture[0] + wp.max(top, 0) * texture[2]
-    below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
-    x0 = wp.max(left, 0)
-    x1 = wp.min(left + 1, texture[2] - 1)
-    any_above = occupied[(above + x0) >> BLOCK_BITS] | occupied[(above + x1) >> BLOCK_BITS]
-    any_below = occupied[(below + x0) >> BLOCK_BITS] | occupied[(below + x1) >> BLOCK_BITS]
-    return (any_above | any_below) == wp.uint8(0)
+def fetch(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float) -> wp.vec4:
+    """Bilinear straight RGBA; beyond the outermost texel centres the colour stays and the alpha fades.
 
-
-@wp.func
-def sample(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, u: float, v: float) -> wp.vec4:
-    """Bilinear straight RGBA; beyond the outermost texel centres the colour stays and the alpha fades."""
-    left = int(wp.floor(u))
-    top = int(wp.floor(v))
-    fx = u - float(left)
-    fy = v - float(top)
+    ``left`` and ``top`` are the whole parts of the texel coordinates, at least -1, ``fx`` and ``fy`` the rest.
+    """
     if left >= 0 and left + 1 < texture[2] and top >= 0 and top + 1 < texture[1]:
         i = texture[0] + top * texture[2] + left
         j = i + texture[2]
-        upper = texels[i] + (texels[i + 1] - texels[i]) * fx
-        lower = texels[j] + (texels[j + 1] - texels[j]) * fx
+        upper = texel(texels, i) + (texel(texels, i + 1) - texel(texels, i)) * fx
+        lower = texel(texels, j) + (texel(texels, j + 1) - texel(texels, j)) * fx
         return upper + (lower - upper) * fy
     x0 = wp.max(left, 0)
     x1 = wp.min(left + 1, texture[2] - 1)
     above = texture[0] + wp.max(top, 0) * texture[2]
     below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
-    a = texels[above + x0]
-    b = texels[above + x1]
-    c = texels[below + x0]
-    d = texels[below + x1]
+    a = texel(texels, above + x0)
+    b = texel(texels, above + x1)
+    c = texel(texels, below + x0)
+    d = texel(texels, below + x1)
     upper = a + (b - a) * fx
     lower = c + (d - c) * fx
     mixed = upper + (lower - upper) * fy
@@ -102,12 +77,20 @@ def sample(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, u: float, v: floa
 
 
 @wp.func
-def scatter(gradient: wp.array(dtype=wp.vec4), texture: wp.vec3i, u: float, v: float, g: wp.vec4):
-    """The adjoint of :func:`sample` in the texels."""
-    left = int(wp.floor(u))
-    top = int(wp.floor(v))
-    fx = u - float(left)
-    fy = v - float(top)
+def empty(occupied: wp.array(dtype=wp.uint8), texture: wp.vec3i, left: int, top: int) -> bool:
+    """Whether all texels that a sample is made of are known to be transparent."""
+    above = texture[0] + wp.max(top, 0) * texture[2]
+    below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
+    x0 = wp.max(left, 0)
+    x1 = wp.min(left + 1, texture[2] - 1)
+    any_above = flag(occupied, (above + x0) >> BLOCK_BITS) | flag(occupied, (above + x1) >> BLOCK_BITS)
+    any_below = flag(occupied, (below + x0) >> BLOCK_BITS) | flag(occupied, (below + x1) >> BLOCK_BITS)
+    return (any_above | any_below) == wp.uint8(0)
+
+
+@wp.func
+def scatter(gradient: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float, g: wp.vec4):
+    """The adjoint of :func:`fetch` in the texels."""
     right = g * fx
     a = (g - right) * (1.0 - fy)
     b = right * (1.0 - fy)
@@ -116,10 +99,10 @@ def scatter(gradient: wp.array(dtype=wp.vec4), texture: wp.vec3i, u: float, v: f
     if left >= 0 and left + 1 < texture[2] and top >= 0 and top + 1 < texture[1]:
         i = texture[0] + top * texture[2] + left
         j = i + texture[2]
-        wp.atomic_add(gradient, i, a)
-        wp.atomic_add(gradient, i + 1, b)
-        wp.atomic_add(gradient, j, c)
-        wp.atomic_add(gradient, j + 1, d)
+        accumulate(gradient, i, a)
+        accumulate(gradient, i + 1, b)
+        accumulate(gradient, j, c)
+        accumulate(gradient, j + 1, d)
     else:
         x0 = wp.max(left, 0)
         x1 = wp.min(left + 1, texture[2] - 1)
@@ -129,19 +112,15 @@ def scatter(gradient: wp.array(dtype=wp.vec4), texture: wp.vec3i, u: float, v: f
         in_r = wp.where(left + 1 >= texture[2], 0.0, 1.0)
         in_t = wp.where(top < 0, 0.0, 1.0)
         in_b = wp.where(top + 1 >= texture[1], 0.0, 1.0)
-        wp.atomic_add(gradient, above + x0, wp.vec4(a[0], a[1], a[2], a[3] * in_l * in_t))
-        wp.atomic_add(gradient, above + x1, wp.vec4(b[0], b[1], b[2], b[3] * in_r * in_t))
-        wp.atomic_add(gradient, below + x0, wp.vec4(c[0], c[1], c[2], c[3] * in_l * in_b))
-        wp.atomic_add(gradient, below + x1, wp.vec4(d[0], d[1], d[2], d[3] * in_r * in_b))
+        accumulate(gradient, above + x0, wp.vec4(a[0], a[1], a[2], a[3] * in_l * in_t))
+        accumulate(gradient, above + x1, wp.vec4(b[0], b[1], b[2], b[3] * in_r * in_t))
+        accumulate(gradient, below + x0, wp.vec4(c[0], c[1], c[2], c[3] * in_l * in_b))
+        accumulate(gradient, below + x1, wp.vec4(d[0], d[1], d[2], d[3] * in_r * in_b))
 
 
 @wp.func
-def slope(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, u: float, v: float, g: wp.vec4) -> wp.vec2:
-    """The adjoint of :func:`sample` in the texel coordinates."""
-    left = int(wp.floor(u))
-    top = int(wp.floor(v))
-    fx = u - float(left)
-    fy = v - float(top)
+def slope(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float, g: wp.vec4) -> wp.vec2:
+    """The adjoint of :func:`fetch` in the texel coordinates."""
     x0 = wp.max(left, 0)
     x1 = wp.min(left + 1, texture[2] - 1)
     above = texture[0] + wp.max(top, 0) * texture[2]
@@ -150,10 +129,10 @@ def slope(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, u: float, v: float
     in_r = wp.where(left + 1 >= texture[2], 0.0, 1.0)
     in_t = wp.where(top < 0, 0.0, 1.0)
     in_b = wp.where(top + 1 >= texture[1], 0.0, 1.0)
-    a = texels[above + x0]
-    b = texels[above + x1]
-    c = texels[below + x0]
-    d = texels[below + x1]
+    a = texel(texels, above + x0)
+    b = texel(texels, above + x1)
+    c = texel(texels, below + x0)
+    d = texel(texels, below + x1)
     a[3] = a[3] * in_l * in_t
     b[3] = b[3] * in_r * in_t
     c[3] = c[3] * in_l * in_b
@@ -168,53 +147,99 @@ def slope(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, u: float, v: float
 @wp.func
 def premultiplied(packed: int, straight: int) -> wp.vec4:
     """A pixel of 8-bit RGBA as floats."""
-    scale = 1.0 / 255.0
-    alpha = float((packed >> 24) & 255) * scale
-    if straight != 0:
-        scale *= alpha
-    return wp.vec4(float(packed & 255) * scale, float((packed >> 8) & 255) * scale, float((packed >> 16) & 255) * scale, alpha)
+    alpha = float((packed >> 24) & 255) / 255.0
+    scale = wp.where(straight != 0, alpha, 1.0)
+    red = float(packed & 255) / 255.0
+    green = float((packed >> 8) & 255) / 255.0
+    blue = float((packed >> 16) & 255) / 255.0
+    return wp.vec4(red * scale, green * scale, blue * scale, alpha)
 
 
 @wp.func
 def sign(x: float) -> float:
-    """-1, 0 or 1; Warp's own says 1 of zero."""
-    return wp.where(x > 0.0, 1.0, wp.where(x < 0.0, -1.0, 0.0))
+    """-1, 0 or 1; 0 for what may be rounding of a difference of values in [0, 1]. Warp's own says 1 of zero."""
+    return wp.where(x > ROUNDING, 1.0, wp.where(x < -ROUNDING, -1.0, 0.0))
+
+
+@wp.func
+def reaches(box: wp.vec4i, column: int, row: int, lanes: int) -> bool:
+    """Whether pixels of a row from ``column`` on may lie in a box."""
+    return row >= box[2] and row <= box[3] and column <= box[1] and column + lanes > box[0]
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    __builtin_prefetch(texels.data + index);
+#endif
+""")
+def prefetch(texels: wp.array(dtype=wp.vec4), index: int): ...
+
+
+@wp.struct
+class Plane:
+    """A billboard in a view; see :class:`bbfit.rendering.projection.Projection`."""
+
+    to_texel: wp.mat33
+    nearness: wp.vec3
+    texture: wp.vec3i
+    box: wp.vec4i
 
 
 @cache
-def kernels(capacity: int) -> SimpleNamespace:
-    """The kernels ``draw`` and ``differentiate`` with room for ``capacity`` billboards, a constant that they are compiled with."""
+def kernels(capacity: int, lanes: int) -> SimpleNamespace:
+    """The kernels ``draw`` and ``differentiate`` with room for ``capacity`` billboards, which take ``lanes`` pixels at a time.
+
+    Both are constants that the kernels are compiled with. Texel coordinates are worked out for all lanes at once, in vector registers.
+    """
     floats = wp.types.vector(length=capacity, dtype=wp.float32)
     ints = wp.types.vector(length=capacity, dtype=wp.int32)
+    wide = wp.types.vector(length=lanes, dtype=wp.float32)
+    wide_ints = wp.types.vector(length=lanes, dtype=wp.int32)
+    wides = wp.types.matrix(shape=(capacity, lanes), dtype=wp.float32)
+    wides_ints = wp.types.matrix(shape=(capacity, lanes), dtype=wp.int32)
 
     @wp.struct
-    class Layers:
-        count: int
-        ids: ints
-        u: floats
-        v: floats
-        near: floats
+    class Hits:
+        left: wide_ints
+        top: wide_ints
+        fx: wide
+        fy: wide
+        near: wide
 
     @wp.func
-    def ordered(layers: Layers) -> Layers:
-        """The same, nearest first; equally near ones stay in the order of their indices."""
-        for i in range(1, layers.count):
-            n = layers.ids[i]
-            u = layers.u[i]
-            v = layers.v[i]
-            near = layers.near[i]
-            j = int(i)
-            while j > 0 and layers.near[j - 1] < near - TIE * wp.abs(near):
-                layers.ids[j] = layers.ids[j - 1]
-                layers.u[j] = layers.u[j - 1]
-                layers.v[j] = layers.v[j - 1]
-                layers.near[j] = layers.near[j - 1]
-                j -= 1
-            layers.ids[j] = n
-            layers.u[j] = u
-            layers.v[j] = v
-            layers.near[j] = near
-        return layers
+    def locate(plane: Plane, column: int, row: int, orthographic: int) -> Hits:
+        """Where the pixels from ``column`` on see a plane; ``left`` is -2 where they do not."""
+        hits = Hits()
+        y = float(row)
+        m = plane.to_texel
+        u0 = m[0, 1] * y + m[0, 2]
+        v0 = m[1, 1] * y + m[1, 2]
+        w0 = m[2, 1] * y + m[2, 2]
+        last_u = float(plane.texture[2])
+        last_v = float(plane.texture[1])
+        for c in range(lanes):
+            x = float(column + c)
+            w = m[2, 0] * x + w0
+            scale = 1.0 / w
+            u = (m[0, 0] * x + u0) * scale
+            v = (m[1, 0] * x + v0) * scale
+            hit = w > 0.0 and u > -1.0 and u < last_u and v > -1.0 and v < last_v  # false for NaN
+            u = wp.where(hit, u, -2.0)
+            v = wp.where(hit, v, -2.0)
+            fu = wp.floor(u)
+            fv = wp.floor(v)
+            hits.left[c] = int(fu)
+            hits.top[c] = int(fv)
+            hits.fx[c] = u - fu
+            hits.fy[c] = v - fv
+            hits.near[c] = w
+        if orthographic != 0:
+            for c in range(lanes):
+                near = plane.nearness[0] * float(column + c) + plane.nearness[1] * y + plane.nearness[2]
+                hits.near[c] = near
+                if near >= 0.0:
+                    hits.left[c] = -2
+        return hits
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
     def draw(
@@ -222,10 +247,8 @@ def kernels(capacity: int) -> SimpleNamespace:
         run: int,
         width: int,
         orthographic: int,
-        to_texel: wp.array2d(dtype=wp.mat33),
-        nearness: wp.array2d(dtype=wp.vec3),
-        textures: wp.array2d(dtype=wp.vec3i),
-        boxes: wp.array2d(dtype=wp.vec4i),
+        count: int,
+        planes: wp.array(dtype=Plane),
         texels: wp.array(dtype=wp.vec4),
         occupied: wp.array(dtype=wp.uint8),
         image: wp.array3d(dtype=wp.vec4),
@@ -233,28 +256,74 @@ def kernels(capacity: int) -> SimpleNamespace:
         """Write ``image`` [V, H, W]; launched over views, rows from ``first_row``, runs of pixels."""
         view, row, piece = wp.tid()
         row += first_row
-        layers = Layers()
-        for column in range(piece * run, wp.min(piece * run + run, width)):
-            layers.count = 0
-            for n in range(boxes.shape[1]):
-                hit = locate(boxes[view, n], to_texel[view, n], nearness[view, n], textures[view, n], column, row, orthographic)
-                if hit[2] != 0.0:
-                    if not empty(occupied, textures[view, n], hit[0], hit[1]):
-                        layers.ids[layers.count] = n
-                        layers.u[layers.count] = hit[0]
-                        layers.v[layers.count] = hit[1]
-                        layers.near[layers.count] = hit[2]
-                        layers.count += 1
-            layers = ordered(layers)
-            colour = wp.vec4()
-            through = float(1.0)
-            for i in range(layers.count):
-                if through > 0.0:
-                    s = sample(texels, textures[view, layers.ids[i]], layers.u[i], layers.v[i])
-                    weight = through * s[3]
-                    through -= weight
-                    colour += wp.vec4(s[0] * weight, s[1] * weight, s[2] * weight, weight)
-            image[view, row, column] = colour
+        firsts = ints()
+        heights = ints()
+        widths = ints()
+        left = wides_ints()
+        top = wides_ints()
+        fx = wides()
+        fy = wides()
+        nears = wides()
+        order = ints()
+        near = floats()
+        end = wp.min(piece * run + run, width)
+        for column in range(piece * run, end, lanes):
+            active = 0
+            n = 0
+            while n < count:
+                plane = planes[view * count + n]
+                if reaches(plane.box, column, row, lanes):
+                    hits = locate(plane, column, row, orthographic)
+                    firsts[active] = plane.texture[0]
+                    heights[active] = plane.texture[1]
+                    widths[active] = plane.texture[2]
+                    left[active] = hits.left
+                    top[active] = hits.top
+                    fx[active] = hits.fx
+                    fy[active] = hits.fy
+                    nears[active] = hits.near
+                    for c in range(0, lanes, 4):
+                        if hits.left[c] > -2:
+                            i = (
+                                plane.texture[0]
+                                + wp.min(hits.top[c] + 2, plane.texture[1] - 1) * plane.texture[2]
+                                + wp.max(hits.left[c], 0)
+                            )
+                            prefetch(texels, i)
+                    active += 1
+                n += 1
+            if active > 0:
+                c = 0
+                while c < wp.min(end - column, lanes):
+                    hit = 0
+                    k = 0
+                    while k < active:
+                        if left[k, c] > -2:
+                            if not empty(occupied, wp.vec3i(firsts[k], heights[k], widths[k]), left[k, c], top[k, c]):
+                                place = int(hit)
+                                while place > 0 and near[place - 1] < nears[k, c] - TIE * wp.abs(nears[k, c]):
+                                    near[place] = near[place - 1]
+                                    order[place] = order[place - 1]
+                                    place -= 1
+                                near[place] = nears[k, c]
+                                order[place] = k
+                                hit += 1
+                        k += 1
+                    if hit > 0:
+                        colour = wp.vec4()
+                        through = float(1.0)
+                        i = 0
+                        while i < hit:
+                            if through > 0.0:
+                                k = order[i]
+                                s = fetch(texels, wp.vec3i(firsts[k], heights[k], widths[k]), left[k, c], top[k, c], fx[k, c], fy[k, c])
+                                weight = through * s[3]
+                                through -= weight
+                                colour += wp.vec4(s[0] * weight, s[1] * weight, s[2] * weight, weight)
+                            i += 1
+                        image[view, row, column + c] = colour
+
+                    c += 1
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
     def differentiate(
@@ -263,10 +332,8 @@ def kernels(capacity: int) -> SimpleNamespace:
         run: int,
         width: int,
         orthographic: int,
-        to_texel: wp.array2d(dtype=wp.mat33),
-        nearness: wp.array2d(dtype=wp.vec3),
-        textures: wp.array2d(dtype=wp.vec3i),
-        boxes: wp.array2d(dtype=wp.vec4i),
+        count: int,
+        planes: wp.array(dtype=Plane),
         texels: wp.array(dtype=wp.vec4),
         occupied: wp.array(dtype=wp.uint8),
         image_gradient: wp.array3d(dtype=wp.vec4),
@@ -286,88 +353,152 @@ def kernels(capacity: int) -> SimpleNamespace:
         view, row, piece = wp.tid()
         view += first_view
         row += first_row
-        layers = Layers()
+        firsts = ints()
+        heights = ints()
+        widths = ints()
+        ids = ints()
+        left = wides_ints()
+        top = wides_ints()
+        fx = wides()
+        fy = wides()
+        nears = wides()
+        order = ints()
+        near = floats()
         reds = floats()
         greens = floats()
         blues = floats()
         alphas = floats()
         values = floats()
         total = float(0.0)
-        for column in range(piece * run, wp.min(piece * run + run, width)):
-            layers.count = 0
-            anything = bool(False)
-            for n in range(boxes.shape[1]):
-                hit = locate(boxes[view, n], to_texel[view, n], nearness[view, n], textures[view, n], column, row, orthographic)
-                if hit[2] != 0.0:
-                    layers.ids[layers.count] = n
-                    layers.u[layers.count] = hit[0]
-                    layers.v[layers.count] = hit[1]
-                    layers.near[layers.count] = hit[2]
-                    layers.count += 1
-                    if not anything:
-                        anything = not empty(occupied, textures[view, n], hit[0], hit[1])
-            wanted = wp.vec4()
-            if target.shape[0] != 0:
-                wanted = premultiplied(target[view, row, column], straight)
-            g = wp.vec4()
-            if image_gradient.shape[0] != 0:
-                g = image_gradient[view, row, column]
-            # Where the picture and the target are both empty there is no difference, and no gradient of one.
-            if anything or wanted[3] > 0.0 or g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0:
-                layers = ordered(layers)
-                colour = wp.vec4()
-                through = float(1.0)
-                for i in range(layers.count):
-                    s = sample(texels, textures[view, layers.ids[i]], layers.u[i], layers.v[i])
-                    opacity = through * s[3]
-                    through -= opacity
-                    colour += wp.vec4(s[0] * opacity, s[1] * opacity, s[2] * opacity, opacity)
-                    reds[i] = s[0]
-                    greens[i] = s[1]
-                    blues[i] = s[2]
-                    alphas[i] = s[3]
+        end = wp.min(piece * run + run, width)
+        for column in range(piece * run, end, lanes):
+            active = 0
+            n = 0
+            while n < count:
+                plane = planes[view * count + n]
+                if reaches(plane.box, column, row, lanes):
+                    hits = locate(plane, column, row, orthographic)
+                    ids[active] = n
+                    firsts[active] = plane.texture[0]
+                    heights[active] = plane.texture[1]
+                    widths[active] = plane.texture[2]
+                    left[active] = hits.left
+                    top[active] = hits.top
+                    fx[active] = hits.fx
+                    fy[active] = hits.fy
+                    nears[active] = hits.near
+                    for c in range(0, lanes, 4):
+                        if hits.left[c] > -2:
+                            i = (
+                                plane.texture[0]
+                                + wp.min(hits.top[c] + 2, plane.texture[1] - 1) * plane.texture[2]
+                                + wp.max(hits.left[c], 0)
+                            )
+                            prefetch(texels, i)
+                            prefetch(texel_gradient, i)
+                    active += 1
+                n += 1
+            c = 0
+            while c < wp.min(end - column, lanes):
+                wanted = wp.vec4()
                 if target.shape[0] != 0:
-                    d = colour - wanted
-                    if norm == L1:
-                        total += wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2]) + wp.abs(d[3])
-                        g += wp.vec4(sign(d[0]), sign(d[1]), sign(d[2]), sign(d[3])) * weight
-                    else:
-                        total += wp.dot(d, d)
-                        g += d * (2.0 * weight)
-                        if norm == BACKGROUNDS:
-                            colours = d[0] + d[1] + d[2]
-                            total -= d[3] * colours
-                            g -= wp.vec4(d[3], d[3], d[3], colours) * weight
-                if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0:
-                    behind = float(0.0)  # what the layers behind add to the loss, to first order, seen unobstructed
-                    for k in range(layers.count):
-                        i = layers.count - 1 - k
-                        difference = reds[i] * g[0] + greens[i] * g[1] + blues[i] * g[2] + g[3] - behind
-                        values[i] = difference
-                        behind += alphas[i] * difference
+                    wanted = premultiplied(target[view, row, column + c], straight)
+                g = wp.vec4()
+                if image_gradient.shape[0] != 0:
+                    g = image_gradient[view, row, column + c]
+                # Where the picture and the target are both empty there is no difference, and no gradient of one.
+                anything = wanted[3] > 0.0 or g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0
+                hit = 0
+                k = 0
+                while k < active:
+                    if left[k, c] > -2:
+                        place = int(hit)
+                        while place > 0 and near[place - 1] < nears[k, c] - TIE * wp.abs(nears[k, c]):
+                            near[place] = near[place - 1]
+                            order[place] = order[place - 1]
+                            place -= 1
+                        near[place] = nears[k, c]
+                        order[place] = k
+                        hit += 1
+                        if not anything:
+                            anything = not empty(occupied, wp.vec3i(firsts[k], heights[k], widths[k]), left[k, c], top[k, c])
+                    k += 1
+                if anything:
+                    colour = wp.vec4()
                     through = float(1.0)
-                    for i in range(layers.count):
-                        if through > 0.0:
-                            n = layers.ids[i]
-                            u = layers.u[i]
-                            v = layers.v[i]
-                            opacity = through * alphas[i]
-                            of_sample = wp.vec4(g[0] * opacity, g[1] * opacity, g[2] * opacity, through * values[i])
-                            scatter(texel_gradient, textures[view, n], u, v, of_sample)
-                            if matrix_gradient.shape[0] != 0:
-                                t = slope(texels, textures[view, n], u, v, of_sample)
-                                m = to_texel[view, n]
-                                x = float(column)
-                                y = float(row)
-                                scale = 1.0 / (m[2, 0] * x + m[2, 1] * y + m[2, 2])
-                                pixel = wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(1.0))
-                                of_u = t[0] * scale
-                                of_v = t[1] * scale
-                                of_w = -(u * of_u + v * of_v)
-                                wp.atomic_add(matrix_gradient, view, row, n, 0, pixel * wp.float64(of_u))
-                                wp.atomic_add(matrix_gradient, view, row, n, 1, pixel * wp.float64(of_v))
-                                wp.atomic_add(matrix_gradient, view, row, n, 2, pixel * wp.float64(of_w))
-                            through -= opacity
+                    i = 0
+                    while i < hit:
+                        k = order[i]
+                        s = fetch(texels, wp.vec3i(firsts[k], heights[k], widths[k]), left[k, c], top[k, c], fx[k, c], fy[k, c])
+                        opacity = through * s[3]
+                        through -= opacity
+                        colour += wp.vec4(s[0] * opacity, s[1] * opacity, s[2] * opacity, opacity)
+                        reds[i] = s[0]
+                        greens[i] = s[1]
+                        blues[i] = s[2]
+                        alphas[i] = s[3]
+                        i += 1
+                    if target.shape[0] != 0:
+                        d = colour - wanted
+                        if norm == L1:
+                            total += wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2]) + wp.abs(d[3])
+                            g += wp.vec4(sign(d[0]), sign(d[1]), sign(d[2]), sign(d[3])) * weight
+                        else:
+                            total += wp.dot(d, d)
+                            g += d * (2.0 * weight)
+                            if norm == BACKGROUNDS:
+                                colours = d[0] + d[1] + d[2]
+                                total -= d[3] * colours
+                                g -= wp.vec4(d[3], d[3], d[3], colours) * weight
+                    if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0:
+                        behind = float(0.0)  # what the layers behind add to the loss, to first order, seen unobstructed
+                        b = 0
+                        while b < hit:
+                            i = hit - 1 - b
+                            difference = reds[i] * g[0] + greens[i] * g[1] + blues[i] * g[2] + g[3] - behind
+                            values[i] = difference
+                            behind += alphas[i] * difference
+                            b += 1
+                        through = float(1.0)
+                        i = 0
+                        while i < hit:
+                            if through > 0.0:
+                                k = order[i]
+                                opacity = through * alphas[i]
+                                of_sample = wp.vec4(g[0] * opacity, g[1] * opacity, g[2] * opacity, through * values[i])
+                                scatter(
+                                    texel_gradient,
+                                    wp.vec3i(firsts[k], heights[k], widths[k]),
+                                    left[k, c],
+                                    top[k, c],
+                                    fx[k, c],
+                                    fy[k, c],
+                                    of_sample,
+                                )
+                                if matrix_gradient.shape[0] != 0:
+                                    t = slope(
+                                        texels,
+                                        wp.vec3i(firsts[k], heights[k], widths[k]),
+                                        left[k, c],
+                                        top[k, c],
+                                        fx[k, c],
+                                        fy[k, c],
+                                        of_sample,
+                                    )
+                                    m = planes[view * count + ids[k]].to_texel
+                                    x = float(column + c)
+                                    y = float(row)
+                                    scale = 1.0 / (m[2, 0] * x + m[2, 1] * y + m[2, 2])
+                                    of_u = t[0] * scale
+                                    of_v = t[1] * scale
+                                    of_w = -((float(left[k, c]) + fx[k, c]) * of_u + (float(top[k, c]) + fy[k, c]) * of_v)
+                                    pixel = wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(1.0))
+                                    wp.atomic_add(matrix_gradient, view, row, ids[k], 0, pixel * wp.float64(of_u))
+                                    wp.atomic_add(matrix_gradient, view, row, ids[k], 1, pixel * wp.float64(of_v))
+                                    wp.atomic_add(matrix_gradient, view, row, ids[k], 2, pixel * wp.float64(of_w))
+                                through -= opacity
+                            i += 1
+                c += 1
         if target.shape[0] != 0:
             wp.atomic_add(loss, view, row, total)
 

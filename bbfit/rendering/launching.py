@@ -26,9 +26,9 @@ def in_parallel(launch: Callable[[int, int], None], pieces: Iterable[tuple[int, 
         pass
 
 
-def pieces_of(count: int, least: int, pieces_a_worker: int = 4) -> list[tuple[int, int]]:
-    """Cut ``range(count)`` into about equal pieces of at least ``least``, a few for each worker so that none idles for long."""
-    number = max(1, min(count // max(least, 1), pieces_a_worker * worker_count()))
+def pieces_of(count: int, least: int, most: int | None = None) -> list[tuple[int, int]]:
+    """Cut ``range(count)`` into about equal pieces of at least ``least``: at most ``most``, or a few for each worker."""
+    number = max(1, min(count // max(least, 1), 4 * worker_count() if most is None else most))
     edges = [count * i // number for i in range(number + 1)]
     return [(begin, end) for begin, end in pairwise(edges) if end > begin]
 

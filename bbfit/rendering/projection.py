@@ -55,7 +55,9 @@ class Projection:
 
 def project(cloud: BillboardCloud, camera: Camera) -> Projection:
     """Project every billboard of a cloud into every view of a camera batch; the result lies on the cloud's device."""
-    cloud, cameras = cloud.with_texels(cloud.texels.detach()).to(torch.float64), camera.batch().to(torch.float64)
+    placement = ("centers", "rights", "ups", "half_extents")
+    cloud = replace(cloud, **{name: getattr(cloud, name).to(torch.float64) for name in placement})
+    cameras = camera.batch().to(torch.float64)
     height, width = cameras.height, cameras.width
     visible = drawable(cloud, cameras)
     identity = torch.eye(3, dtype=torch.float64, device=visible.device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -88,7 +89,7 @@ def test_the_fused_fit_is_the_reference_fit(views: ViewDataset, config: FitConfi
 def test_levels_share_the_steps(views: ViewDataset, steps: int) -> None:
     levels = levels_of(FitConfig(steps=steps).resolve(), views.train.cameras)
     assert levels[0].begin == 0 and levels[-1].end == steps and levels[-1].halvings == 0
-    assert all(a.end == b.begin and a.halvings == b.halvings + 1 for a, b in zip(levels, levels[1:], strict=False))
+    assert all(a.end == b.begin and a.halvings == b.halvings + 1 for a, b in pairwise(levels))
     assert max(level.end - level.begin for level in levels) - min(level.end - level.begin for level in levels) <= 1
     assert min(views.train.cameras.width, views.train.cameras.height) >> levels[0].halvings >= LEAST_SIDE
     assert len(levels_of(FitConfig(preset="thesis").resolve(), views.train.cameras)) == 1

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from bbfit.fitting.losses import image_loss, structural_similarity
+from bbfit.images import over_colour, premultiply
 
 
 def test_l1_and_l2_are_sums_over_channels_averaged_over_pixels() -> None:
@@ -14,6 +15,22 @@ def test_l1_and_l2_are_sums_over_channels_averaged_over_pixels() -> None:
     render[1, 2, 3] = torch.tensor([0.5, -0.25, 0.0, 1.0])
     assert image_loss(render, target, "l1", 0.0).item() == pytest.approx((0.5 + 0.25 + 1.0) / 30)
     assert image_loss(render, target, "l2", 0.0).item() == pytest.approx((0.25 + 0.0625 + 1.0) / 30)
+
+
+def test_backgrounds_is_the_expected_difference_over_random_opaque_ones() -> None:
+    """Exactly, by Simpson's rule, since the difference is quadratic in the background; and as a mean over random ones."""
+    generator = torch.Generator().manual_seed(0)
+    a, b = (premultiply(torch.rand(2, 5, 7, 4, generator=generator, dtype=torch.float64)) for _ in range(2))
+
+    def over(background: torch.Tensor | float) -> torch.Tensor:
+        return (over_colour(a, background) - over_colour(b, background)).square().sum(-1).mean()
+
+    stated = image_loss(a, b, "backgrounds", 0.0).item()
+    assert stated == pytest.approx(((over(0.0) + 4 * over(0.5) + over(1.0)) / 6).item(), rel=1e-12)
+    samples = torch.stack([over(torch.rand(3, generator=generator, dtype=torch.float64)) for _ in range(4000)])
+    deviation = samples.std().item() / 4000**0.5
+    assert deviation < 0.01 * stated and abs(samples.mean().item() - stated) < 4 * deviation
+    assert image_loss(a, a, "backgrounds", 0.0).item() == 0
 
 
 def test_ssim_equals_kornias() -> None:

@@ -173,3 +173,33 @@ def test_convergence_point_needs_two_directions() -> None:
     camera = Camera(torch.eye(4).repeat(3, 1, 1), torch.eye(3).repeat(3, 1, 1), 8, 8)
     with pytest.raises(InputError, match="around the tree"):
         convergence_point(camera)
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize(("width", "height"), [(31, 20), (62, 40), (7, 5), (15, 60), (1, 1)])
+def test_a_resized_camera_covers_the_same_field_of_view(width: int, height: int, single: bool, orthographic: bool) -> None:
+    """Places are shares of the picture from its outer edges, also where the principal point is off the centre."""
+    intrinsics = pinhole_intrinsics(50, 31, 20).repeat(5, 1, 1) + torch.tensor([[3.0, 0, 2.5], [0, -1, -4], [0, 0, 0]]).double()
+    camera: Camera = Camera(random_rigid(5), intrinsics, 31, 20, orthographic)
+    camera = camera[2] if single else camera
+    resized = camera.resized(width, height)
+    assert (resized.width, resized.height, resized.orthographic, resized.batched) == (width, height, orthographic, not single)
+    points = 20 * torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 10
+    before = (camera.project(points) + 0.5) / torch.tensor([31, 20])
+    after = (resized.project(points) + 0.5) / torch.tensor([width, height])
+    assert before.isfinite().any() and torch.equal(before.isfinite(), after.isfinite())
+    torch.testing.assert_close(after, before, rtol=1e-11, atol=1e-11, equal_nan=True)
+    back = resized.resized(31, 20)
+    assert (back.intrinsics - camera.intrinsics).abs().max() < EXACT and torch.equal(
+        camera.intrinsics[..., 2, :], back.intrinsics[..., 2, :]
+    )
+
+
+def test_resizing_is_making_a_camera_of_that_size() -> None:
+    pose = torch.eye(4, dtype=torch.float64)
+    ours = Camera(pose, pinhole_intrinsics(40, 512, 256), 512, 256).resized(64, 32)
+    assert (ours.intrinsics - pinhole_intrinsics(40, 64, 32)).abs().max() < EXACT
+    ours = Camera(pose, orthographic_intrinsics(6, 36, 24), 36, 24, True).resized(12, 8)
+    assert (ours.intrinsics - orthographic_intrinsics(6, 12, 8)).abs().max() < EXACT
+    assert Camera(pose, pinhole_intrinsics(40, 8, 8), 8, 8).to(torch.float32).resized(3, 5).intrinsics.dtype == torch.float32

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinhole_intrinsics
-from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.cloud import BillboardCloud, even_upright
+from bbfit.geometry.orbit import Orbit
 
 PLACEMENT = ("centers", "rights", "ups", "half_extents")
 
@@ -73,3 +74,17 @@ def tracked(cloud: BillboardCloud) -> tuple[BillboardCloud, dict[str, Tensor]]:
     """The cloud with gradients asked for, and its leaves by name."""
     leaves = {name: getattr(cloud, name).detach().clone().requires_grad_() for name in (*PLACEMENT, "texels")}
     return replace(cloud, **leaves), leaves
+
+
+def noise(cloud: BillboardCloud, seed: int = 0) -> BillboardCloud:
+    """The cloud with random texels of its dtype."""
+    generator = torch.Generator().manual_seed(seed)
+    return cloud.with_texels(torch.rand(cloud.texels.shape, generator=generator, dtype=cloud.texels.dtype))
+
+
+def ring_of(size: int, billboards: int = 4, views: int = 2) -> tuple[BillboardCloud, Camera]:
+    """Upright billboards with noise on them, and some views of them as a fit has them, float32."""
+    cloud = even_upright(billboards, axis=torch.zeros(3), half_extents=torch.ones(2), texture_sizes=torch.tensor([size, size]))
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).numpy()
+    cameras = Orbit(7, (10.0,)).frame(corners, target=torch.zeros(3).double(), width=size, height=size)
+    return noise(cloud), cameras[1 : 1 + views]
