@@ -91,27 +91,15 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None)
     if not len(texels) or not views:
         return image
     occupied = occupancy(texels.detach()) if occupied is None else occupied
-    kernel, device, run = (
-        kernels(_capacity(projection.count), _lanes(texels.device)).draw,
-        wp.device_from_torch(texels.device),
-        _run(projection, texels.device),
-    )
-    packed = _packed_planes(projection)
-    shared = [
-        run,
-        width,
-        int(projection.orthographic),
-        projection.count,
-        _planes(packed),
-        _array(texels, wp.vec4),
-        _array(occupied, wp.uint8),
-    ]
-    pieces = -(-width // run)
-    outputs = [_array(image, wp.vec4)]
+    run, device = _run(projection, texels.device), wp.device_from_torch(texels.device)
+    kernel, packed = kernels(_capacity(projection.count), _lanes(texels.device)).draw, _packed_planes(projection)
     kernel.module.load(device)  # or every thread would compile it
+    arguments = [run, width, int(projection.orthographic), projection.count, _planes(packed)]
+    arguments += [_array(texels, wp.vec4), _array(occupied, wp.uint8)]
+    outputs = [_array(image, wp.vec4)]
 
     def launch(begin: int, end: int) -> None:
-        wp.launch(kernel, (views, end - begin, pieces), [begin, *shared], outputs, device=device)
+        wp.launch(kernel, (views, end - begin, -(-width // run)), [begin, *arguments], outputs, device=device)
 
     in_parallel(launch, [(0, height)] if texels.is_cuda else pieces_of(height, -(-LEAST_PIXELS // (width * views)), MOST_BANDS))
     return image

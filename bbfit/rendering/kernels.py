@@ -6,17 +6,34 @@ keeping layers in memory, then goes back to front for the derivatives in the opa
 """
 
 # mypy: ignore-errors
-# ruff: noqa: UP018 - float(0) declares a variable of a kernel, 0.0 a constant.
+# ruff: noqa: UP018, RUF046 - int(0) declares a variable of a kernel, 0 a constant.
 
+import os
+import sys
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 
 import warp as wp
 
 from bbfit.rendering.compositing import TIE as TIE_VALUE
 
-wp.config.log_level = wp.LOG_ERROR  # a library does not print, and a machine without a GPU is nothing to warn of
-wp.init()
+
+def _initialise() -> None:
+    """Start Warp without a word: a library does not print, and a machine without a GPU is nothing to warn of, though Warp's C code does."""
+    wp.config.log_level = wp.LOG_ERROR
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with Path(os.devnull).open("wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        wp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+_initialise()
 
 FLAGS = "-march=native -ffp-contract=fast"
 """Clang's flags for CPU kernels: without them multiplications and additions are not fused."""
@@ -24,6 +41,7 @@ TIE = wp.constant(TIE_VALUE)
 BLOCK = 4
 """Consecutive texels whose being empty is known by one byte, and that Adam takes together."""
 BLOCK_BITS = wp.constant(2)
+MISS = wp.constant(-2)
 ROUNDING = wp.constant(5e-7)
 NORMS = {"l1": 1, "l2": 2, "backgrounds": 3}
 """How differences of premultiplied RGBA are measured; see :func:`bbfit.rendering.fused.PixelLoss`."""
@@ -175,6 +193,12 @@ def reaches(box: wp.vec4i, column: int, row: int, lanes: int) -> bool:
 def prefetch(texels: wp.array(dtype=wp.vec4), index: int): ...
 
 
+@wp.func
+def next_row(texture: wp.vec3i, left: int, top: int) -> int:
+    """The texel below those that a sample is made of, which a pixel in the next row is likely to want."""
+    return texture[0] + wp.min(top + 2, texture[1] - 1) * texture[2] + wp.max(left, 0)
+
+
 @wp.struct
 class Plane:
     """A billboard in a view; see :class:`bbfit.rendering.projection.Projection`."""
@@ -208,7 +232,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def locate(plane: Plane, column: int, row: int, orthographic: int) -> Hits:
-        """Where the pixels from ``column`` on see a plane; ``left`` is -2 where they do not."""
+        """Where the pixels from ``column`` on see a plane; ``left`` is :data:`MISS` where they do not."""
         hits = Hits()
         y = float(row)
         m = plane.to_texel
@@ -224,8 +248,8 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
             u = (m[0, 0] * x + u0) * scale
             v = (m[1, 0] * x + v0) * scale
             hit = w > 0.0 and u > -1.0 and u < last_u and v > -1.0 and v < last_v  # false for NaN
-            u = wp.where(hit, u, -2.0)
-            v = wp.where(hit, v, -2.0)
+            u = wp.where(hit, u, float(MISS))
+            v = wp.where(hit, v, float(MISS))
             fu = wp.floor(u)
             fv = wp.floor(v)
             hits.left[c] = int(fu)
@@ -238,7 +262,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                 near = plane.nearness[0] * float(column + c) + plane.nearness[1] * y + plane.nearness[2]
                 hits.near[c] = near
                 if near >= 0.0:
-                    hits.left[c] = -2
+                    hits.left[c] = MISS
         return hits
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
@@ -268,8 +292,8 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
         near = floats()
         end = wp.min(piece * run + run, width)
         for column in range(piece * run, end, lanes):
-            active = 0
-            n = 0
+            active = int(0)
+            n = int(0)
             while n < count:
                 plane = planes[view * count + n]
                 if reaches(plane.box, column, row, lanes):
@@ -293,12 +317,12 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                     active += 1
                 n += 1
             if active > 0:
-                c = 0
+                c = int(0)
                 while c < wp.min(end - column, lanes):
-                    hit = 0
-                    k = 0
+                    hit = int(0)
+                    k = int(0)
                     while k < active:
-                        if left[k, c] > -2:
+                        if left[k, c] > MISS:
                             if not empty(occupied, wp.vec3i(firsts[k], heights[k], widths[k]), left[k, c], top[k, c]):
                                 place = int(hit)
                                 while place > 0 and near[place - 1] < nears[k, c] - TIE * wp.abs(nears[k, c]):
@@ -312,7 +336,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                     if hit > 0:
                         colour = wp.vec4()
                         through = float(1.0)
-                        i = 0
+                        i = int(0)
                         while i < hit:
                             if through > 0.0:
                                 k = order[i]
@@ -372,8 +396,8 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
         total = float(0.0)
         end = wp.min(piece * run + run, width)
         for column in range(piece * run, end, lanes):
-            active = 0
-            n = 0
+            active = int(0)
+            n = int(0)
             while n < count:
                 plane = planes[view * count + n]
                 if reaches(plane.box, column, row, lanes):
@@ -398,7 +422,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                             prefetch(texel_gradient, i)
                     active += 1
                 n += 1
-            c = 0
+            c = int(0)
             while c < wp.min(end - column, lanes):
                 wanted = wp.vec4()
                 if target.shape[0] != 0:
@@ -408,10 +432,10 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                     g = image_gradient[view, row, column + c]
                 # Where the picture and the target are both empty there is no difference, and no gradient of one.
                 anything = wanted[3] > 0.0 or g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0
-                hit = 0
-                k = 0
+                hit = int(0)
+                k = int(0)
                 while k < active:
-                    if left[k, c] > -2:
+                    if left[k, c] > MISS:
                         place = int(hit)
                         while place > 0 and near[place - 1] < nears[k, c] - TIE * wp.abs(nears[k, c]):
                             near[place] = near[place - 1]
@@ -426,10 +450,11 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                 if anything:
                     colour = wp.vec4()
                     through = float(1.0)
-                    i = 0
+                    i = int(0)
                     while i < hit:
                         k = order[i]
-                        s = fetch(texels, wp.vec3i(firsts[k], heights[k], widths[k]), left[k, c], top[k, c], fx[k, c], fy[k, c])
+                        texture = wp.vec3i(firsts[k], heights[k], widths[k])
+                        s = fetch(texels, texture, left[k, c], top[k, c], fx[k, c], fy[k, c])
                         opacity = through * s[3]
                         through -= opacity
                         colour += wp.vec4(s[0] * opacity, s[1] * opacity, s[2] * opacity, opacity)
@@ -452,7 +477,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                                 g -= wp.vec4(d[3], d[3], d[3], colours) * weight
                     if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0:
                         behind = float(0.0)  # what the layers behind add to the loss, to first order, seen unobstructed
-                        b = 0
+                        b = int(0)
                         while b < hit:
                             i = hit - 1 - b
                             difference = reds[i] * g[0] + greens[i] * g[1] + blues[i] * g[2] + g[3] - behind
@@ -460,7 +485,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                             behind += alphas[i] * difference
                             b += 1
                         through = float(1.0)
-                        i = 0
+                        i = int(0)
                         while i < hit:
                             if through > 0.0:
                                 k = order[i]
