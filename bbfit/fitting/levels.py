@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -47,7 +48,9 @@ class Targets:
 
     def packed(self, indices: Sequence[int]) -> Tensor:
         """Some of the pictures, uint8 [B, H, W, 4], straight at full resolution and premultiplied otherwise."""
-        return self.views.images(indices) if self.shrunk is None else self.shrunk[list(indices)]
+        pictures = [self.views.image(i) if self.shrunk is None else self.shrunk[i] for i in indices]
+        # By numpy: torch would wake its threads, which then keep spinning on the cores that the kernels are about to use.
+        return torch.from_numpy(np.stack([picture.numpy() for picture in pictures]))
 
     def pictures(self, indices: Sequence[int]) -> Tensor:
         """Some of the pictures, premultiplied RGBA in [0, 1], float32 [B, H, W, 4]."""

@@ -306,7 +306,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                     fx[active] = hits.fx
                     fy[active] = hits.fy
                     nears[active] = hits.near
-                    for c in range(0, lanes, 4):
+                    for c in range(lanes):
                         if hits.left[c] > -2:
                             i = (
                                 plane.texture[0]
@@ -411,7 +411,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                     fx[active] = hits.fx
                     fy[active] = hits.fy
                     nears[active] = hits.near
-                    for c in range(0, lanes, 4):
+                    for c in range(lanes):
                         if hits.left[c] > -2:
                             i = (
                                 plane.texture[0]
