@@ -63,6 +63,47 @@ def accumulate(gradient: wp.array(dtype=wp.vec4), index: int, value: wp.vec4): .
 def flag(flags: wp.array(dtype=wp.uint8), index: int) -> wp.uint8: ...
 
 
+# Left to itself the compiler takes these sums apart into single floats.
+_ROW = "typedef float row __attribute__((vector_size(16), aligned(4), may_alias));"
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    const auto upper = wp::add(texels.data[i], wp::mul(wp::sub(texels.data[i + 1], texels.data[i]), fx));
+    const auto lower = wp::add(texels.data[j], wp::mul(wp::sub(texels.data[j + 1], texels.data[j]), fx));
+    return wp::add(upper, wp::mul(wp::sub(lower, upper), fy));
+#else
+    {_ROW}
+    const row *p = (const row*)(texels.data + i), *q = (const row*)(texels.data + j);
+    const row upper = p[0] + (p[1] - p[0]) * fx, lower = q[0] + (q[1] - q[0]) * fx;
+    const row mixed = upper + (lower - upper) * fy;
+    return wp::vec_t<4, wp::float32>(mixed[0], mixed[1], mixed[2], mixed[3]);
+#endif
+""")
+def bilinear(texels: wp.array(dtype=wp.vec4), i: int, j: int, fx: float, fy: float) -> wp.vec4: ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    const auto right = wp::mul(g, fx), left = wp::sub(g, right);
+    wp::atomic_add(gradient.data + i, wp::mul(left, 1.0f - fy));
+    wp::atomic_add(gradient.data + i + 1, wp::mul(right, 1.0f - fy));
+    wp::atomic_add(gradient.data + j, wp::mul(left, fy));
+    wp::atomic_add(gradient.data + j + 1, wp::mul(right, fy));
+#else
+    {_ROW}
+    row *p = (row*)(gradient.data + i), *q = (row*)(gradient.data + j);
+    const row all = {{g.c[0], g.c[1], g.c[2], g.c[3]}};
+    const row right = all * fx, left = all - right;
+    p[0] += left * (1.0f - fy);
+    p[1] += right * (1.0f - fy);
+    q[0] += left * fy;
+    q[1] += right * fy;
+#endif
+""")
+def accumulate_bilinear(gradient: wp.array(dtype=wp.vec4), i: int, j: int, fx: float, fy: float, g: wp.vec4): ...
+
+
 @wp.func
 def fetch(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float) -> wp.vec4:
     """Bilinear straight RGBA; beyond the outermost texel centres the colour stays and the alpha fades.
@@ -71,10 +112,7 @@ def fetch(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: in
     """
     if left >= 0 and left + 1 < texture[2] and top >= 0 and top + 1 < texture[1]:
         i = texture[0] + top * texture[2] + left
-        j = i + texture[2]
-        upper = texel(texels, i) + (texel(texels, i + 1) - texel(texels, i)) * fx
-        lower = texel(texels, j) + (texel(texels, j + 1) - texel(texels, j)) * fx
-        return upper + (lower - upper) * fy
+        return bilinear(texels, i, i + texture[2], fx, fy)
     x0 = wp.max(left, 0)
     x1 = wp.min(left + 1, texture[2] - 1)
     above = texture[0] + wp.max(top, 0) * texture[2]
@@ -109,19 +147,15 @@ def empty(occupied: wp.array(dtype=wp.uint8), texture: wp.vec3i, left: int, top:
 @wp.func
 def scatter(gradient: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float, g: wp.vec4):
     """The adjoint of :func:`fetch` in the texels."""
-    right = g * fx
-    a = (g - right) * (1.0 - fy)
-    b = right * (1.0 - fy)
-    c = (g - right) * fy
-    d = right * fy
     if left >= 0 and left + 1 < texture[2] and top >= 0 and top + 1 < texture[1]:
         i = texture[0] + top * texture[2] + left
-        j = i + texture[2]
-        accumulate(gradient, i, a)
-        accumulate(gradient, i + 1, b)
-        accumulate(gradient, j, c)
-        accumulate(gradient, j + 1, d)
+        accumulate_bilinear(gradient, i, i + texture[2], fx, fy, g)
     else:
+        right = g * fx
+        a = (g - right) * (1.0 - fy)
+        b = right * (1.0 - fy)
+        c = (g - right) * fy
+        d = right * fy
         x0 = wp.max(left, 0)
         x1 = wp.min(left + 1, texture[2] - 1)
         above = texture[0] + wp.max(top, 0) * texture[2]
@@ -165,12 +199,10 @@ def slope(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: in
 @wp.func
 def premultiplied(packed: int, straight: int) -> wp.vec4:
     """A pixel of 8-bit RGBA as floats."""
-    alpha = float((packed >> 24) & 255) / 255.0
-    scale = wp.where(straight != 0, alpha, 1.0)
-    red = float(packed & 255) / 255.0
-    green = float((packed >> 8) & 255) / 255.0
-    blue = float((packed >> 16) & 255) / 255.0
-    return wp.vec4(red * scale, green * scale, blue * scale, alpha)
+    unit = 1.0 / 255.0
+    alpha = float((packed >> 24) & 255) * unit
+    scale = wp.where(straight != 0, alpha * unit, unit)
+    return wp.vec4(float(packed & 255) * scale, float((packed >> 8) & 255) * scale, float((packed >> 16) & 255) * scale, alpha)
 
 
 @wp.func
