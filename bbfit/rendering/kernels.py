@@ -4,8 +4,8 @@ They mean what :mod:`bbfit.rendering.reference` says. A thread walks a run of pi
 In every pixel the layers that it hits are put in depth order and blended front to back. The backward pass blends again instead of
 keeping layers in memory, then goes back to front for the derivatives in the opacities and front to back to scatter all.
 
-Two things look odd and are for speed, a tenth and a half: ``while`` in place of ``for``, since Warp's ``range`` hides from the compiler that
-an index is not negative, and names that no other loop uses, since a vector that two loops assign is kept in memory.
+Two things look odd and are for speed, a tenth and a half: ``while`` in place of ``for``, since Warp's ``range`` hides from the compiler
+that an index is not negative, and names that no other loop uses, since a vector that two loops assign is kept in memory.
 """
 
 # mypy: ignore-errors
@@ -203,10 +203,12 @@ def slope(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: in
 @wp.func
 def premultiplied(packed: int, straight: int) -> wp.vec4:
     """A pixel of 8-bit RGBA as floats."""
-    unit = 1.0 / 255.0
-    alpha = float((packed >> 24) & 255) * unit
-    scale = wp.where(straight != 0, alpha * unit, unit)
-    return wp.vec4(float(packed & 255) * scale, float((packed >> 8) & 255) * scale, float((packed >> 16) & 255) * scale, alpha)
+    alpha = float((packed >> 24) & 255) / 255.0  # divided, so that 255 is exactly 1
+    scale = wp.where(straight != 0, alpha, 1.0)
+    red = float(packed & 255) / 255.0
+    green = float((packed >> 8) & 255) / 255.0
+    blue = float((packed >> 16) & 255) / 255.0
+    return wp.vec4(red * scale, green * scale, blue * scale, alpha)
 
 
 @wp.func
