@@ -43,7 +43,10 @@ ONLY_IN = {
     "bpy": {"blender/worker.py"},
     "cv2": {"images.py", "fitting/bounds.py"},
     "xatlas": {"exporting/atlas.py"},
-    "warp": {"rendering/kernels.py", "rendering/fused.py", "fitting/adam.py", "fitting/fused_ssim.py", "fitting/ssim_kernels.py"},
+    "warp": {
+        *(f"rendering/{name}.py" for name in ("launching", "sampling", "kernels", "fused")),
+        *(f"fitting/{name}.py" for name in ("adam", "fused_ssim", "ssim_kernels")),
+    },
     "ray": {"sweep.py"},
 }
 NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib")

@@ -10,8 +10,8 @@ import warp as wp
 from torch import Tensor
 
 from bbfit.rendering.fused import occupancy
-from bbfit.rendering.kernels import BLOCK, FLAGS
-from bbfit.rendering.launching import in_parallel, pieces_of
+from bbfit.rendering.launching import FLAGS, in_parallel, pieces_of
+from bbfit.rendering.sampling import BLOCK
 
 BETAS, EPSILON = (0.9, 0.999), 1e-8
 # A block without gradient for so many steps rests until it has one again. Its first moment has then shrunk by 0.9^128, so that all that
@@ -74,7 +74,7 @@ class AdamState:
     """Texels and what Adam keeps of them, padded to whole blocks; all of it changes in place."""
 
     texels: Tensor
-    """Float32 [P', 4], P' a multiple of :data:`bbfit.rendering.kernels.BLOCK`."""
+    """Float32 [P', 4], P' a multiple of :data:`bbfit.rendering.sampling.BLOCK`."""
     gradient: Tensor
     """To be added to before every update, which clears it, [P', 4]."""
     first_moment: Tensor

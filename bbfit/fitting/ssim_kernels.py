@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from bbfit.rendering.kernels import FLAGS
+from bbfit.rendering.launching import FLAGS
 
 _RADIUS, _SIGMA = 5, 1.5
 _WEIGHTS = [math.exp(-((tap - _RADIUS) ** 2) / (2 * _SIGMA**2)) for tap in range(2 * _RADIUS + 1)]

@@ -12,9 +12,10 @@ from torch.autograd.function import once_differentiable
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.rendering.kernels import BLOCK, NORMS, Plane, kernels
+from bbfit.rendering.kernels import NORMS, Plane, kernels
 from bbfit.rendering.launching import in_parallel, pieces_of
 from bbfit.rendering.projection import Projection, project
+from bbfit.rendering.sampling import BLOCK
 
 # Pixels that are worth a CPU thread's while.
 LEAST_PIXELS = 1 << 14

@@ -2,12 +2,36 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 
 import torch
+import warp as wp
+
+FLAGS = "-march=native -ffp-contract=fast"
+"""Clang's flags for CPU kernels: without them multiplications and additions are not fused."""
+
+
+def _initialise() -> None:
+    """Start Warp without a word: a library does not print, and a machine without a GPU is nothing to warn of, though Warp's C code does."""
+    wp.config.log_level = wp.LOG_ERROR
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with Path(os.devnull).open("wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        wp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+_initialise()
 
 
 def worker_count() -> int:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bbfit.fitting.adam import BETAS, EPSILON, REST_AFTER, AdamState
 from bbfit.rendering.fused import occupancy
-from bbfit.rendering.kernels import BLOCK
+from bbfit.rendering.sampling import BLOCK
 
 STEPS = 420
 

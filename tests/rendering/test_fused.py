@@ -282,3 +282,13 @@ def test_auto_takes_the_reference_for_float64_and_the_kernels_otherwise() -> Non
     assert torch.equal(render(cloud, camera, backend="reference"), render_reference(cloud, camera))
     kernels = render(exact, camera, backend="fused")
     assert kernels.dtype == torch.float64 and torch.equal(kernels, render_fused(cloud, camera).double())
+
+
+@pytest.mark.parametrize("count", [1, 3, 17])
+def test_a_thread_a_pixel_gives_the_same(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The launch that a GPU gets, on the CPU: what differs between the two is then only the compiler and atomic addition."""
+    monkeypatch.setattr(fused, "_lanes", lambda device: 1)
+    monkeypatch.setattr(fused, "_run", lambda projection, device: 1)
+    for seed in range(5):
+        for orthographic in (False, True):
+            assert max(errors(*random_scene(seed, count, orthographic=orthographic)).values()) < ALLOWED

@@ -1,0 +1,203 @@
+"""What a kernel does with one sample of a texture: read it, look whether it is empty, and the adjoints."""
+
+# mypy: ignore-errors
+
+import warp as wp
+
+from bbfit.rendering.launching import FLAGS
+
+BLOCK = 4
+"""Consecutive texels whose being empty is known by one byte, and that Adam takes together."""
+BLOCK_BITS = wp.constant(2)
+ROUNDING = wp.constant(5e-7)
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
+
+
+# Warp's own indexing multiplies by strides and takes negative indices, which costs more than the rest of a sample.
+@wp.func_native("return texels.data[index];")
+def texel(texels: wp.array(dtype=wp.vec4), index: int) -> wp.vec4:
+    """Texel ``index``."""
+
+
+@wp.func_native("wp::atomic_add(gradient.data + index, value);")
+def accumulate(gradient: wp.array(dtype=wp.vec4), index: int, value: wp.vec4):
+    """Add ``value`` to texel ``index``."""
+
+
+@wp.func_native("return flags.data[index];")
+def flag(flags: wp.array(dtype=wp.uint8), index: int) -> wp.uint8:
+    """Flag ``index``."""
+
+
+# Left to itself the compiler takes these sums apart into single floats.
+_ROW = "typedef float row __attribute__((vector_size(16), aligned(4), may_alias));"
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    const auto upper = wp::add(texels.data[i], wp::mul(wp::sub(texels.data[i + 1], texels.data[i]), fx));
+    const auto lower = wp::add(texels.data[j], wp::mul(wp::sub(texels.data[j + 1], texels.data[j]), fx));
+    return wp::add(upper, wp::mul(wp::sub(lower, upper), fy));
+#else
+    {_ROW}
+    const row *p = (const row*)(texels.data + i), *q = (const row*)(texels.data + j);
+    const row upper = p[0] + (p[1] - p[0]) * fx, lower = q[0] + (q[1] - q[0]) * fx;
+    const row mixed = upper + (lower - upper) * fy;
+    return wp::vec_t<4, wp::float32>(mixed[0], mixed[1], mixed[2], mixed[3]);
+#endif
+""")
+def bilinear(texels: wp.array(dtype=wp.vec4), i: int, j: int, fx: float, fy: float) -> wp.vec4:
+    """The mean of texels i, i + 1, j and j + 1, weighted by ``fx`` to the right and ``fy`` down."""
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    const auto right = wp::mul(g, fx), left = wp::sub(g, right);
+    wp::atomic_add(gradient.data + i, wp::mul(left, 1.0f - fy));
+    wp::atomic_add(gradient.data + i + 1, wp::mul(right, 1.0f - fy));
+    wp::atomic_add(gradient.data + j, wp::mul(left, fy));
+    wp::atomic_add(gradient.data + j + 1, wp::mul(right, fy));
+#else
+    {_ROW}
+    row *p = (row*)(gradient.data + i), *q = (row*)(gradient.data + j);
+    const row all = {{g.c[0], g.c[1], g.c[2], g.c[3]}};
+    const row right = all * fx, left = all - right;
+    p[0] += left * (1.0f - fy);
+    p[1] += right * (1.0f - fy);
+    q[0] += left * fy;
+    q[1] += right * fy;
+#endif
+""")
+def accumulate_bilinear(gradient: wp.array(dtype=wp.vec4), i: int, j: int, fx: float, fy: float, g: wp.vec4):
+    """The adjoint of :func:`bilinear`."""
+
+
+@wp.func
+def fetch(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float) -> wp.vec4:
+    """Bilinear straight RGBA; beyond the outermost texel centres the colour stays and the alpha fades.
+
+    ``left`` and ``top`` are the whole parts of the texel coordinates, at least -1, ``fx`` and ``fy`` the rest.
+    """
+    if left >= 0 and left + 1 < texture[2] and top >= 0 and top + 1 < texture[1]:
+        i = texture[0] + top * texture[2] + left
+        return bilinear(texels, i, i + texture[2], fx, fy)
+    x0 = wp.max(left, 0)
+    x1 = wp.min(left + 1, texture[2] - 1)
+    above = texture[0] + wp.max(top, 0) * texture[2]
+    below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
+    a = texel(texels, above + x0)
+    b = texel(texels, above + x1)
+    c = texel(texels, below + x0)
+    d = texel(texels, below + x1)
+    upper = a + (b - a) * fx
+    lower = c + (d - c) * fx
+    mixed = upper + (lower - upper) * fy
+    weight_l = wp.where(left < 0, 0.0, 1.0 - fx)
+    weight_r = wp.where(left + 1 >= texture[2], 0.0, fx)
+    weight_t = wp.where(top < 0, 0.0, 1.0 - fy)
+    weight_b = wp.where(top + 1 >= texture[1], 0.0, fy)
+    alpha = (a[3] * weight_l + b[3] * weight_r) * weight_t + (c[3] * weight_l + d[3] * weight_r) * weight_b
+    return wp.vec4(mixed[0], mixed[1], mixed[2], alpha)
+
+
+@wp.func
+def empty(occupied: wp.array(dtype=wp.uint8), texture: wp.vec3i, left: int, top: int) -> bool:
+    """Whether all texels that a sample is made of are known to be transparent."""
+    above = texture[0] + wp.max(top, 0) * texture[2]
+    below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
+    x0 = wp.max(left, 0)
+    x1 = wp.min(left + 1, texture[2] - 1)
+    any_above = flag(occupied, (above + x0) >> BLOCK_BITS) | flag(occupied, (above + x1) >> BLOCK_BITS)
+    any_below = flag(occupied, (below + x0) >> BLOCK_BITS) | flag(occupied, (below + x1) >> BLOCK_BITS)
+    return (any_above | any_below) == wp.uint8(0)
+
+
+@wp.func
+def scatter(gradient: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float, g: wp.vec4):
+    """The adjoint of :func:`fetch` in the texels."""
+    if left >= 0 and left + 1 < texture[2] and top >= 0 and top + 1 < texture[1]:
+        i = texture[0] + top * texture[2] + left
+        accumulate_bilinear(gradient, i, i + texture[2], fx, fy, g)
+    else:
+        right = g * fx
+        a = (g - right) * (1.0 - fy)
+        b = right * (1.0 - fy)
+        c = (g - right) * fy
+        d = right * fy
+        x0 = wp.max(left, 0)
+        x1 = wp.min(left + 1, texture[2] - 1)
+        above = texture[0] + wp.max(top, 0) * texture[2]
+        below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
+        in_l = wp.where(left < 0, 0.0, 1.0)
+        in_r = wp.where(left + 1 >= texture[2], 0.0, 1.0)
+        in_t = wp.where(top < 0, 0.0, 1.0)
+        in_b = wp.where(top + 1 >= texture[1], 0.0, 1.0)
+        accumulate(gradient, above + x0, wp.vec4(a[0], a[1], a[2], a[3] * in_l * in_t))
+        accumulate(gradient, above + x1, wp.vec4(b[0], b[1], b[2], b[3] * in_r * in_t))
+        accumulate(gradient, below + x0, wp.vec4(c[0], c[1], c[2], c[3] * in_l * in_b))
+        accumulate(gradient, below + x1, wp.vec4(d[0], d[1], d[2], d[3] * in_r * in_b))
+
+
+@wp.func
+def slope(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float, g: wp.vec4) -> wp.vec2:
+    """The adjoint of :func:`fetch` in the texel coordinates."""
+    x0 = wp.max(left, 0)
+    x1 = wp.min(left + 1, texture[2] - 1)
+    above = texture[0] + wp.max(top, 0) * texture[2]
+    below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
+    in_l = wp.where(left < 0, 0.0, 1.0)
+    in_r = wp.where(left + 1 >= texture[2], 0.0, 1.0)
+    in_t = wp.where(top < 0, 0.0, 1.0)
+    in_b = wp.where(top + 1 >= texture[1], 0.0, 1.0)
+    a = texel(texels, above + x0)
+    b = texel(texels, above + x1)
+    c = texel(texels, below + x0)
+    d = texel(texels, below + x1)
+    a[3] = a[3] * in_l * in_t
+    b[3] = b[3] * in_r * in_t
+    c[3] = c[3] * in_l * in_b
+    d[3] = d[3] * in_r * in_b
+    ga = wp.dot(a, g)
+    gb = wp.dot(b, g)
+    gc = wp.dot(c, g)
+    gd = wp.dot(d, g)
+    return wp.vec2((gb - ga) * (1.0 - fy) + (gd - gc) * fy, (gc - ga) * (1.0 - fx) + (gd - gb) * fx)
+
+
+@wp.func
+def premultiplied(packed: int, straight: int) -> wp.vec4:
+    """A pixel of 8-bit RGBA as floats."""
+    alpha = float((packed >> 24) & 255) / 255.0  # divided, so that 255 is exactly 1
+    scale = wp.where(straight != 0, alpha, 1.0)
+    red = float(packed & 255) / 255.0
+    green = float((packed >> 8) & 255) / 255.0
+    blue = float((packed >> 16) & 255) / 255.0
+    return wp.vec4(red * scale, green * scale, blue * scale, alpha)
+
+
+@wp.func
+def sign(x: float) -> float:
+    """-1, 0 or 1; 0 for what may be rounding of a difference of values in [0, 1]. Warp's own says 1 of zero."""
+    return wp.where(x > ROUNDING, 1.0, wp.where(x < -ROUNDING, -1.0, 0.0))
+
+
+@wp.func
+def reaches(box: wp.vec4i, column: int, row: int, lanes: int) -> bool:
+    """Whether pixels of a row from ``column`` on may lie in a box."""
+    return row >= box[2] and row <= box[3] and column <= box[1] and column + lanes > box[0]
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    __builtin_prefetch(texels.data + index);
+#endif
+""")
+def prefetch(texels: wp.array(dtype=wp.vec4), index: int):
+    """Ask for texel ``index`` to be brought into the cache; the hardware does not foresee a new row of a texture."""
+
+
+@wp.func
+def next_row(texture: wp.vec3i, left: int, top: int) -> int:
+    """The texel below those that a sample is made of, which a pixel in the next row is likely to want."""
+    return texture[0] + wp.min(top + 2, texture[1] - 1) * texture[2] + wp.max(left, 0)
