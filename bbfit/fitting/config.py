@@ -18,6 +18,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
     "default": {
         "bounds": "silhouette",
         "loss": "backgrounds",
+        "ssim_weight": 0.005,
         "levels": 4,
         "steps": 300,
         "views_per_step": 2,
@@ -28,6 +29,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
     "thesis": {
         "bounds": "viewport",
         "loss": "l2",
+        "ssim_weight": 0.0,
         "levels": 1,
         "steps": 10_000,
         "views_per_step": 1,
@@ -55,8 +57,8 @@ class FitConfig:
     loss: Loss | None = None
     """Absolute (l1) or squared (l2) difference of premultiplied RGBA, summed over channels and averaged over pixels, or the squared
     difference over random backgrounds in expectation (backgrounds). Preset: backgrounds; thesis: l2."""
-    ssim_weight: float = 0.0
-    """Weight of 1 - SSIM beside the loss."""
+    ssim_weight: float | None = None
+    """Weight of 1 - SSIM beside the loss. Preset: 0.005; thesis: 0."""
     levels: int | None = None
     """Resolutions of views and textures, coarse to fine, sides doubling from each to the next; the steps are shared out evenly.
     Preset: 4; thesis: 1."""
@@ -87,7 +89,8 @@ class FitConfig:
         check_choice("schedule", self.schedule, (None, "cosine", "growth"))
         check_count("seed", self.seed, 0)
         check_count("checkpoint_every", self.checkpoint_every)
-        check_range("ssim_weight", self.ssim_weight, 0, 1)
+        if self.ssim_weight is not None:
+            check_range("ssim_weight", self.ssim_weight, 0, 1)
         check_choice("backend", self.backend, ("auto", "reference", "fused"))
         if self.levels is not None:
             check_count("levels", self.levels)

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from bbfit.files import write_tensors
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import random_textures, start_cloud
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resize_textures, shrunk_sizes
-from bbfit.fitting.steps import make_stepper
+from bbfit.fitting.steps import Stepper, make_stepper
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import bleed_colour
@@ -38,6 +39,8 @@ class Step:
     """The step's loss, before its update."""
     learning_rate: float
     """Adam's rate in this step."""
+    snapshot: Callable[[], BillboardCloud]
+    """Copies the cloud as it is after the step, at the step's level of resolution, to the CPU."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +120,7 @@ def fit(
             loss = stepper.step(draw_views(config, len(views.train), index, level.halvings), rate)
             losses.append(float(loss))
             if on_step is not None:
-                on_step(Step(index + 1, config.steps, losses[-1], rate))
+                on_step(Step(index + 1, config.steps, losses[-1], rate, partial(_snapshot, cloud, stepper)))
             if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
                 _save(checkpoint, mark, _Progress(losses, stepper.tensors(), time.perf_counter() - begun))
         fitted = cloud.with_texels(stepper.texels.detach().cpu())
@@ -125,6 +128,10 @@ def fit(
     # No view determines the colour of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
     bled = [bleed_colour(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     return FitResult(fitted.with_texels(torch.cat(bled)), losses, config, time.perf_counter() - begun)
+
+
+def _snapshot(cloud: BillboardCloud, stepper: Stepper) -> BillboardCloud:
+    return cloud.with_texels(stepper.texels.detach().cpu().clone())
 
 
 @dataclass(frozen=True)

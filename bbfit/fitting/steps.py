@@ -15,6 +15,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.reference import render_reference
 
 if TYPE_CHECKING:
+    from bbfit.rendering.fused import PixelLoss
     from bbfit.rendering.projection import Projection
 
 
@@ -71,7 +72,7 @@ class ReferenceStepper:
         self._adam.param_groups[0]["lr"] = rate
         image = render_reference(self._cloud.with_texels(self.texels), self._targets.cameras[list(chosen)].to(device))
         assert self._config.loss is not None
-        loss = image_loss(image, self._targets.pictures(chosen).to(device), self._config.loss, self._config.ssim_weight)
+        loss = image_loss(image, self._targets.pictures(chosen).to(device), self._config.loss, self._config.ssim_weight or 0.0)
         self._adam.zero_grad()
         loss.backward()
         self._adam.step()
@@ -89,6 +90,7 @@ class FusedStepper:
 
         self._targets, self._config, self._count = targets, config, len(cloud.texels)
         self.state, self.steps = AdamState.start(cloud.texels), 0
+        self._scratch: list[Tensor] | None = None
         self._projection = project(cloud, targets.cameras.to(cloud.texels.device))
 
     @property
@@ -113,20 +115,24 @@ class FusedStepper:
         pixels = len(chosen) * projection.width * projection.height
         assert config.loss is not None
         loss = PixelLoss(self._targets.packed(chosen).to(device), self._targets.shrunk is None, config.loss, 1 / pixels)
-        dissimilarity, of_image = self._dissimilarity(projection, chosen) if config.ssim_weight else (0.0, None)
+        dissimilarity, of_image = self._dissimilarity(projection, loss) if config.ssim_weight else (0.0, None)
         sums, _ = differentiate(state.texels, projection, state.gradient, image_gradient=of_image, loss=loss, occupied=state.occupied)
         assert sums is not None
         self.steps += 1
         state.update(self.steps, rate)
         return sums.sum() / pixels + dissimilarity
 
-    def _dissimilarity(self, projection: Projection, chosen: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """The weighted 1 - SSIM of the present picture, and its gradient in the picture, [B, H, W, 4]."""
+    def _dissimilarity(self, projection: Projection, loss: PixelLoss) -> tuple[Tensor, Tensor]:
+        """The weighted 1 - SSIM of the present picture to the loss's target, and its gradient in the picture, [B, H, W, 4]."""
         from bbfit.fitting.fused_ssim import similarity_and_gradient
-        from bbfit.rendering.fused import draw
+        from bbfit.rendering.fused import draw, unpacked
 
-        image = draw(self.state.texels, projection, self.state.occupied)
-        weight = self._config.ssim_weight
-        similarity, of_image = similarity_and_gradient(image, self._targets.pictures(chosen).to(image.device), -weight)
+        # Memory that is kept: fresh pages for a few large pictures a step would cost as much as drawing them.
+        if self._scratch is None or self._scratch[0].shape != loss.target.shape:
+            self._scratch = [torch.empty(loss.target.shape, dtype=torch.float32, device=loss.target.device) for _ in range(3)]
+        image = draw(self.state.texels, projection, self.state.occupied, out=self._scratch[0])
+        target = unpacked(loss.target, loss.straight, out=self._scratch[1])
+        weight = self._config.ssim_weight or 0.0
+        similarity, of_image = similarity_and_gradient(image, target, -weight, out=self._scratch[2])
         assert of_image is not None
         return weight * (1 - similarity), of_image

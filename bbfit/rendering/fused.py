@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.rendering.kernels import NORMS, Plane, kernels
+from bbfit.rendering.kernels import NORMS, Plane, kernels, unpack
 from bbfit.rendering.launching import in_parallel, pieces_of
 from bbfit.rendering.projection import Projection, project
 from bbfit.rendering.sampling import BLOCK
@@ -80,17 +80,18 @@ def occupancy(texels: Tensor) -> Tensor:
     return (alpha.view(-1, BLOCK) != 0).any(-1).to(torch.uint8)
 
 
-def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None) -> Tensor:
+def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None, out: Tensor | None = None) -> Tensor:
     """Draw textures, float32 [P, 4], contiguous: premultiplied RGBA, float32 [V, H, W, 4].
 
     Parameters
     ----------
     occupied : :func:`occupancy` of the texels; worked out when left out.
+    out : memory for the picture, float32 [V, H, W, 4], contiguous, all of which is overwritten.
     """
     views, height, width = len(projection), projection.height, projection.width
-    image = torch.zeros(views, height, width, 4, dtype=torch.float32, device=texels.device)
+    image = torch.empty(views, height, width, 4, dtype=torch.float32, device=texels.device) if out is None else out
     if not len(texels) or not views:
-        return image
+        return image.zero_()
     occupied = occupancy(texels.detach()) if occupied is None else occupied
     run, device = _run(projection, texels.device), wp.device_from_torch(texels.device)
     kernel, packed = kernels(_capacity(projection.count), _lanes(texels.device)).draw, _packed_planes(projection)
@@ -103,6 +104,21 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None)
         wp.launch(kernel, (views, end - begin, -(-width // run)), [begin, *arguments], outputs, device=device)
 
     in_parallel(launch, [(0, height)] if texels.is_cuda else pieces_of(height, -(-LEAST_PIXELS // (width * views)), MOST_BANDS))
+    return image
+
+
+def unpacked(packed: Tensor, straight: bool, out: Tensor | None = None) -> Tensor:
+    """8-bit RGBA, uint8 [V, H, W, 4], contiguous, as premultiplied RGBA in [0, 1], float32; ``out`` as :func:`draw` takes it."""
+    image = torch.empty(packed.shape, dtype=torch.float32, device=packed.device) if out is None else out
+    run, device = 1 if packed.is_cuda else 1 << 10, wp.device_from_torch(packed.device)
+    arguments = [run, _array(packed.view(torch.int32).flatten(), wp.int32), int(straight)]
+    outputs, runs = [_array(image.view(-1, 4), wp.vec4)], -(-packed.numel() // 4 // run)
+    unpack.module.load(device)  # or every thread would compile it
+
+    def launch(begin: int, end: int) -> None:
+        wp.launch(unpack, end - begin, [begin, *arguments], outputs, device=device)
+
+    in_parallel(launch, [(0, runs)] if packed.is_cuda else pieces_of(runs, LEAST_PIXELS // run))
     return image
 
 

@@ -40,6 +40,16 @@ class Plane:
     box: wp.vec4i
 
 
+@wp.kernel
+def unpack(first: int, run: int, packed: wp.array(dtype=wp.int32), straight: int, image: wp.array(dtype=wp.vec4)):
+    """Write 8-bit RGBA [P] as premultiplied floats; launched over runs of pixels, from run ``first``."""
+    begin = (first + wp.tid()) * run
+    i = int(begin)
+    while i < wp.min(begin + run, packed.shape[0]):
+        image[i] = premultiplied(packed[i], straight)
+        i += 1
+
+
 @cache
 def kernels(capacity: int, lanes: int) -> SimpleNamespace:
     """The kernels ``draw`` and ``differentiate`` with room for ``capacity`` billboards, which take ``lanes`` pixels at a time.
@@ -142,38 +152,36 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                             prefetch(texels, next_row(plane.texture, hits.left[lane], hits.top[lane]))
                     active += 1
                 n += 1
-            if active > 0:
-                c = int(0)
-                while c < wp.min(end - column, lanes):
-                    hit = int(0)
-                    k = int(0)
-                    while k < active:
-                        if left[k, c] > MISS:
-                            if not empty(occupied, wp.vec3i(firsts[k], heights[k], widths[k]), left[k, c], top[k, c]):
-                                place = int(hit)
-                                while place > 0 and near[place - 1] < nears[k, c] - TIE * wp.abs(nears[k, c]):
-                                    near[place] = near[place - 1]
-                                    order[place] = order[place - 1]
-                                    place -= 1
-                                near[place] = nears[k, c]
-                                order[place] = k
-                                hit += 1
-                        k += 1
-                    if hit > 0:
-                        colour = wp.vec4()
-                        through = float(1.0)
-                        i = int(0)
-                        while i < hit:
-                            if through > 0.0:
-                                k = order[i]
-                                s = fetch(texels, wp.vec3i(firsts[k], heights[k], widths[k]), left[k, c], top[k, c], fx[k, c], fy[k, c])
-                                weight = through * s[3]
-                                through -= weight
-                                colour += wp.vec4(s[0] * weight, s[1] * weight, s[2] * weight, weight)
-                            i += 1
-                        image[view, row, column + c] = colour
-
-                    c += 1
+            c = int(0)
+            while c < wp.min(end - column, lanes):
+                hit = int(0)
+                k = int(0)
+                while k < active:
+                    if left[k, c] > MISS:
+                        if not empty(occupied, wp.vec3i(firsts[k], heights[k], widths[k]), left[k, c], top[k, c]):
+                            place = int(hit)
+                            while place > 0 and near[place - 1] < nears[k, c] - TIE * wp.abs(nears[k, c]):
+                                near[place] = near[place - 1]
+                                order[place] = order[place - 1]
+                                place -= 1
+                            near[place] = nears[k, c]
+                            order[place] = k
+                            hit += 1
+                    k += 1
+                colour = wp.vec4()
+                through = float(1.0)
+                i = int(0)
+                while i < hit:
+                    if through > 0.0:
+                        layer = order[i]
+                        texture = wp.vec3i(firsts[layer], heights[layer], widths[layer])
+                        s = fetch(texels, texture, left[layer, c], top[layer, c], fx[layer, c], fy[layer, c])
+                        weight = through * s[3]
+                        through -= weight
+                        colour += wp.vec4(s[0] * weight, s[1] * weight, s[2] * weight, weight)
+                    i += 1
+                image[view, row, column + c] = colour
+                c += 1
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
     def differentiate(

@@ -50,7 +50,7 @@ def test_fit_explains_held_out_views_of_a_cloud_it_can_represent(views: ViewData
 def test_thesis_preset_is_the_thesis() -> None:
     config = FitConfig(preset="thesis").resolve()
     assert (config.steps, config.views_per_step, config.learning_rate) == (10_000, 1, 0.01)
-    assert (config.schedule, config.ssim_weight, config.bounds, config.loss) == ("growth", 0.0, "viewport", "l2")
+    assert (config.schedule, config.ssim_weight, config.bounds, config.loss, config.levels) == ("growth", 0.0, "viewport", "l2", 1)
     rates = [learning_rate(config, index) for index in range(3)]
     assert rates == pytest.approx([0.01, 0.01 * (1 + 0.1 / 10_000), 0.01 * (1 + 0.1 / 10_000) ** 2], rel=1e-12)
     assert learning_rate(config, 10_000) == pytest.approx(0.01 * math.exp(0.1), rel=1e-5)
