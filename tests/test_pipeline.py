@@ -54,7 +54,7 @@ def test_everything_is_written(done: RunResult) -> None:
 
 def test_record_holds_the_resolved_configuration(done: RunResult) -> None:
     record = json.loads((done.folder / "run.json").read_text())
-    assert record["config"]["fit"]["learning_rate"] == 0.05 and record["config"]["fit"]["bounds"] == "silhouette"
+    assert record["config"]["fit"]["learning_rate"] == 0.15 and record["config"]["fit"]["bounds"] == "silhouette"
     assert record["seeds"] == {"views": 0, "fit": 0}
     assert {"bbfit", "torch", "kornia", "python"} <= set(record["versions"])
     assert set(record["stages"]) == {"fit", "export", "evaluate"}

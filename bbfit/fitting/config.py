@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 from bbfit.checks import check_choice, check_count, check_range
-from bbfit.rendering.dispatch import Backend
+from bbfit.rendering.config import Backend
 
 Preset = Literal["default", "thesis"]
 Sides = Literal["one", "two", "pair"]

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 
 from bbfit.checks import check_choice
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.rendering.config import Backend
 from bbfit.rendering.reference import render_reference
-
-Backend = Literal["auto", "reference", "fused"]
 
 
 def render(cloud: BillboardCloud, camera: Camera, *, backend: Backend = "auto") -> Tensor:
