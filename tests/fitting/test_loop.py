@@ -121,6 +121,16 @@ def test_a_killed_fit_goes_on_to_the_same_result(views: ViewDataset, tmp_path: P
     assert same(whole, again)
 
 
+def test_a_snapshot_is_a_copy_of_the_cloud_at_its_level(views: ViewDataset) -> None:
+    config, seen = FitConfig(billboards=2, steps=8), []
+    result = fit(views, config, on_step=lambda step: seen.append(step.snapshot()))
+    sizes = [tuple(cloud.texture_sizes[0].tolist()) for cloud in seen]
+    assert sizes == sorted(sizes) and len(set(sizes)) == len(levels_of(config.resolve(), views.train.cameras)) > 1
+    assert not torch.equal(seen[-1].texels, seen[-2].texels)
+    visible = result.cloud.texels[:, 3] > 0
+    assert torch.equal(seen[-1].texels[visible], result.cloud.texels[visible])
+
+
 @pytest.mark.parametrize("spoil", ["other configuration", "cut short"])
 def test_a_checkpoint_that_does_not_fit_is_not_used(views: ViewDataset, tmp_path: Path, spoil: str) -> None:
     config = FitConfig(billboards=2, steps=4, checkpoint_every=2)

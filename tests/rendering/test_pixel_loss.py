@@ -12,7 +12,7 @@ from torch import Tensor
 from bbfit.fitting.losses import image_loss
 from bbfit.geometry.camera import Camera
 from bbfit.images import premultiply
-from bbfit.rendering.fused import PixelLoss, differentiate, draw, occupancy
+from bbfit.rendering.fused import PixelLoss, differentiate, draw, occupancy, unpacked
 from bbfit.rendering.projection import project
 from bbfit.rendering.reference import render_reference
 
@@ -158,3 +158,14 @@ def test_occupancy_is_by_blocks_of_four_texels() -> None:
     assert occupancy(texels).tolist() == [0, 1, 1]
     assert occupancy(texels[:9]).tolist() == [0, 1, 0]
     assert occupancy(texels[:0]).tolist() == []
+
+
+@pytest.mark.parametrize("straight", [True, False])
+def test_packed_pictures_unpack_to_premultiplied_floats(straight: bool) -> None:
+    packed = torch.randint(0, 256, (2, 37, 53, 4), generator=torch.Generator().manual_seed(1)).to(torch.uint8)
+    exact = packed.double() / 255
+    exact = premultiply(exact) if straight else exact
+    out = torch.full(packed.shape, torch.nan)
+    assert unpacked(packed, straight, out) is out
+    assert (out - exact).abs().max() < 1.5e-7  # two roundings
+    assert torch.equal(unpacked(packed, straight), out)
