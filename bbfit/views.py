@@ -21,7 +21,7 @@ from bbfit.geometry.camera import Camera
 from bbfit.images import premultiply, read_rgba
 from bbfit.layout import REQUEST_FILE, Frame, cameras_of, read_frames, split_views
 
-CACHE_BYTES = 1 << 30
+CACHE_BYTES = 3 << 29
 """Decoded pictures that a dataset keeps in memory at most, in bytes; the ones used longest ago go first."""
 
 
@@ -105,7 +105,7 @@ class ViewSet:
 
     def check(self) -> None:
         """Decode every picture once, so that a bad one is found now and not in the middle of long work."""
-        with ThreadPoolExecutor() as pool:
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # each thread keeps memory of its own
             for _ in pool.map(self.image, range(len(self))):
                 pass
 

@@ -38,13 +38,16 @@ class Targets:
             return Targets(views.cameras, views, None)
         width, height = (max(1, round(side / 2**halvings)) for side in (views.cameras.width, views.cameras.height))
 
-        def shrink(index: int) -> Tensor:
-            picture = views.targets([index]).permute(0, 3, 1, 2)
-            return (interpolate(picture, (height, width), mode="area") * 255).round().to(torch.uint8).permute(0, 2, 3, 1)
+        shrunk = torch.empty(len(views), height, width, 4, dtype=torch.uint8)
 
-        with ThreadPoolExecutor() as pool:
-            shrunk = torch.cat(list(pool.map(shrink, range(len(views)))))
-        return Targets(views.cameras.resized(width, height), views, shrunk.contiguous())
+        def shrink(index: int) -> None:
+            picture = views.targets([index]).permute(0, 3, 1, 2)
+            shrunk[index] = (interpolate(picture, (height, width), mode="area") * 255).round()[0].permute(1, 2, 0)
+
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # each thread keeps memory of its own
+            for _ in pool.map(shrink, range(len(views))):
+                pass
+        return Targets(views.cameras.resized(width, height), views, shrunk)
 
     def packed(self, indices: Sequence[int]) -> Tensor:
         """Some of the pictures, uint8 [B, H, W, 4], straight at full resolution and premultiplied otherwise."""
