@@ -29,14 +29,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.nn.functional import interpolate
 
 import bbfit
@@ -113,23 +112,14 @@ def grow(quick: bool) -> list[Row]:
     return rows
 
 
-@dataclass(frozen=True)
-class Enlarged:
-    """Stands in for a view set's cache: its pictures at another size."""
-
-    views: ViewSet
-    size: int
-
-    def get(self, path: Path) -> Tensor:
-        """One picture, uint8 [size, size, 4]."""
-        picture = self.views.image(self.views.paths.index(path)).permute(2, 0, 1)[None].float()
-        return interpolate(picture, (self.size, self.size), mode="bilinear")[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
-
-
 def enlarged(views: ViewSet, size: int) -> ViewSet:
     """The same views in square pictures of another size."""
-    pictures = {path: Enlarged(views, size).get(path) for path in views.paths}
-    return replace(views, cameras=views.cameras.resized(size, size), _cache=pictures)
+    pictures = {}
+    for index, path in enumerate(views.paths):
+        picture = views.image(index).permute(2, 0, 1)[None].float()
+        picture = interpolate(picture, (size, size), mode="bilinear")[0].permute(1, 2, 0)
+        pictures[path] = picture.round().to(torch.uint8).contiguous()
+    return replace(views, cameras=views.cameras.resized(size, size), _cache=pictures)  # type: ignore[arg-type]
 
 
 def seconds_of(work: Callable[[], object], device: torch.device) -> float:
@@ -219,9 +209,9 @@ def steps(quick: bool) -> list[Row]:
         for size in (256, 512, 1024):
             large = enlarged(views, size)
             turns = 2 if quick else 7
-            density = bbfit.FitConfig(views_per_step=1, levels=1)
+            default = bbfit.FitConfig(views_per_step=1, levels=1)
             for count in (4,) if quick else (2, 4, 8, 16):
-                rows.append(step_row(large, replace(density, billboards=count), "step", device=device, turns=turns, copy=copy))
+                rows.append(step_row(large, replace(default, billboards=count), "step", device=device, turns=turns, copy=copy))
                 show(rows[-1])
             if not quick:
                 thesis = bbfit.FitConfig(preset="thesis")

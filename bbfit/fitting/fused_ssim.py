@@ -18,38 +18,22 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from bbfit.fitting.ssim_kernels import PAIRS_REACH, REACH, STAGES, STAGES_OF_VALUE, kernels
+from bbfit.fitting.ssim_kernels import PAIRS_REACH, REACH, STAGES, kernels
 from bbfit.rendering.launching import in_parallel, pieces_of, worker_count
 
 # Pairs of rows that are worth a thread's while, since it begins PAIRS_REACH early.
 _LEAST_PAIRS = 48
 
 
-def fused_structural_similarity(a: Tensor, b: Tensor) -> Tensor:
-    """:func:`bbfit.fitting.losses.structural_similarity` in float32, differentiable in ``a``, whose gradient is worked out with the value.
+def similarity_and_gradient(a: Tensor, b: Tensor, weight: float, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """The mean structural similarity, float64, and ``weight`` times its gradient in ``a``.
 
-    On a CPU equal inputs give equal bytes, whatever the number of threads.
-
-    Parameters
-    ----------
-    a, b : float32 [V, H, W, 4] in [0, 1], contiguous, at least 11 pixels high and wide; ``b`` is the target and must not want a gradient.
-
-    Returns
-    -------
-    A scalar, float32.
-    """
-    assert not b.requires_grad
-    return _Similarity.apply(a, b)
-
-
-def similarity_and_gradient(
-    a: Tensor, b: Tensor, weight: float | None, out: Tensor | None = None
-) -> tuple[Tensor, Tensor | None]:  # fmt: skip
-    """The mean structural similarity, float64, and ``weight`` times its gradient in ``a``, without autograd; no gradient for ``None``.
+    Computes :func:`bbfit.fitting.losses.structural_similarity` in float32. On a CPU equal inputs give equal bytes, whatever the number of
+    threads.
 
     Parameters
     ----------
-    a, b : as :func:`fused_structural_similarity` takes them.
+    a, b : float32 [V, H, W, 4] in [0, 1], contiguous, at least 11 pixels high and wide.
     out : memory for the gradient, all of which is overwritten; float32 and contiguous like ``a``.
     """
     assert a.shape == b.shape and a.shape[3] == 4 and min(a.shape[1:3]) > REACH and len(a)
@@ -58,21 +42,21 @@ def similarity_and_gradient(
     views, height, width, channels = a.shape
     pairs, terms = (height + 1) // 2, views * (height - REACH) * (width - REACH) * channels
     own = kernels(1 if on_gpu or width - REACH < 4 else 4)
-    vector, stages = own.vector, STAGES_OF_VALUE if weight is None else STAGES
+    vector = own.vector
     down, along = (pairs + PAIRS_REACH, -(-width // own.step)) if on_gpu else (1, 1)
 
-    gradient = out if out is not None else a.new_empty(views, height if weight is not None else 1, width, channels)
-    assert gradient.is_contiguous() and gradient.dtype == torch.float32 and (weight is None or gradient.shape == a.shape)
+    gradient = torch.empty_like(a) if out is None else out
+    assert gradient.is_contiguous() and gradient.dtype == torch.float32 and gradient.shape == a.shape
     sums = a.new_zeros(views, height - REACH, along, channels * own.step)
     pixels = torch.arange(own.step, device=a.device)
     fresh = (pixels >= pixels[:, None]).float().repeat_interleave(channels, 1)
     pictures = [_overlapping(picture, own, vector) for picture in (a, b)]
-    fixed = [down, along, (weight or 0.0) / terms, *_ranges(a, b, own), *pictures, wp.from_torch(fresh, dtype=vector)]
+    fixed = [down, along, weight / terms, *_ranges(a, b, own), *pictures, wp.from_torch(fresh, dtype=vector)]
     outputs = [wp.from_torch(sums, dtype=vector), _overlapping(gradient, own, vector)]
     if on_gpu:
         scratch = _scratch(a, own, 2 * down, 2 * down)
         for view in range(views):
-            for stage in range(stages):
+            for stage in range(STAGES):
                 wp.launch(own.sweep, (down, along), [view, 0, down, stage, stage + 1, *fixed, *scratch], outputs, device=device)
     else:
         spare: SimpleQueue[list[Any]] = SimpleQueue()
@@ -83,27 +67,13 @@ def similarity_and_gradient(
             scratch = spare.get()
             for view in range(begin // pairs, (end - 1) // pairs + 1):
                 first, last = max(begin - view * pairs, 0), min(end - view * pairs, pairs)
-                arguments = [view, first, last + PAIRS_REACH, 0, stages, *fixed, *scratch]
+                arguments = [view, first, last + PAIRS_REACH, 0, STAGES, *fixed, *scratch]
                 wp.launch(own.sweep, (1, 1), arguments, outputs, device=device)
             spare.put(scratch)
 
         own.sweep.module.load(device)  # lest every thread compile it
         in_parallel(sweep, pieces_of(views * pairs, _LEAST_PAIRS))
-    return 1 - sums.sum(dtype=torch.float64) / terms, gradient if weight is not None else None
-
-
-class _Similarity(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
-        value, gradient = similarity_and_gradient(a, b, 1.0 if ctx.needs_input_grad[0] else None)
-        ctx.save_for_backward(gradient)
-        return value.to(torch.float32)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        (gradient,) = ctx.saved_tensors
-        return gradient * gradients[0], None
+    return 1 - sums.sum(dtype=torch.float64) / terms, gradient
 
 
 def _ranges(a: Tensor, b: Tensor, own: SimpleNamespace) -> list[Any]:

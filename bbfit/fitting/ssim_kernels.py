@@ -28,8 +28,7 @@ REACH = wp.constant(len(_WEIGHTS) - 1)
 """Pixels that a picture has more than windows, along a row or a column."""
 PAIRS_REACH = len(_WEIGHTS) // 2
 """The same in pairs of rows: the first pairs are of rows -REACH and -REACH + 1, which have no windows."""
-STAGES, STAGES_OF_VALUE = 4, 2
-"""Stages in all, and those that make the value."""
+STAGES = 4
 
 
 @wp.func

@@ -134,5 +134,4 @@ class FusedStepper:
         target = unpacked(loss.target, loss.straight, out=self._scratch[1])
         weight = self._config.ssim_weight or 0.0
         similarity, of_image = similarity_and_gradient(image, target, -weight, out=self._scratch[2])
-        assert of_image is not None
         return weight * (1 - similarity), of_image

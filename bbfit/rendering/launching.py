@@ -20,8 +20,13 @@ FLAGS = "-march=native -ffp-contract=fast"
 def _initialise() -> None:
     """Start Warp without a word: a library does not print, and a machine without a GPU is nothing to warn of, though Warp's C code does."""
     wp.config.log_level = wp.LOG_ERROR
-    sys.stderr.flush()
-    kept = os.dup(2)
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is no standard error to keep quiet
+        wp.init()
+        return
+    if sys.stderr is not None:
+        sys.stderr.flush()
     try:
         with Path(os.devnull).open("wb") as nowhere:
             os.dup2(nowhere.fileno(), 2)

@@ -74,6 +74,32 @@ def accumulate_bilinear(gradient: wp.array(dtype=wp.vec4), i: int, j: int, fx: f
 
 
 @wp.func
+def corners(texture: wp.vec3i, left: int, top: int) -> wp.vec4i:
+    """The four texels around a sample, row by row; at a border the nearest ones there are."""
+    x0 = wp.max(left, 0)
+    x1 = wp.min(left + 1, texture[2] - 1)
+    above = texture[0] + wp.max(top, 0) * texture[2]
+    below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
+    return wp.vec4i(above + x0, above + x1, below + x0, below + x1)
+
+
+@wp.func
+def present(texture: wp.vec3i, left: int, top: int) -> wp.vec4:
+    """1 for each of the :func:`corners` that the texture has, 0 for one beyond its border, whose alpha is 0."""
+    in_l = wp.where(left < 0, 0.0, 1.0)
+    in_r = wp.where(left + 1 >= texture[2], 0.0, 1.0)
+    in_t = wp.where(top < 0, 0.0, 1.0)
+    in_b = wp.where(top + 1 >= texture[1], 0.0, 1.0)
+    return wp.vec4(in_l * in_t, in_r * in_t, in_l * in_b, in_r * in_b)
+
+
+@wp.func
+def weights(fx: float, fy: float) -> wp.vec4:
+    """How much each of the :func:`corners` counts."""
+    return wp.vec4((1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy)
+
+
+@wp.func
 def fetch(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float) -> wp.vec4:
     """Bilinear straight RGBA; beyond the outermost texel centres the colour stays and the alpha fades.
 
@@ -82,35 +108,23 @@ def fetch(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: in
     if left >= 0 and left + 1 < texture[2] and top >= 0 and top + 1 < texture[1]:
         i = texture[0] + top * texture[2] + left
         return bilinear(texels, i, i + texture[2], fx, fy)
-    x0 = wp.max(left, 0)
-    x1 = wp.min(left + 1, texture[2] - 1)
-    above = texture[0] + wp.max(top, 0) * texture[2]
-    below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
-    a = texel(texels, above + x0)
-    b = texel(texels, above + x1)
-    c = texel(texels, below + x0)
-    d = texel(texels, below + x1)
-    upper = a + (b - a) * fx
-    lower = c + (d - c) * fx
-    mixed = upper + (lower - upper) * fy
-    weight_l = wp.where(left < 0, 0.0, 1.0 - fx)
-    weight_r = wp.where(left + 1 >= texture[2], 0.0, fx)
-    weight_t = wp.where(top < 0, 0.0, 1.0 - fy)
-    weight_b = wp.where(top + 1 >= texture[1], 0.0, fy)
-    alpha = (a[3] * weight_l + b[3] * weight_r) * weight_t + (c[3] * weight_l + d[3] * weight_r) * weight_b
-    return wp.vec4(mixed[0], mixed[1], mixed[2], alpha)
+    at = corners(texture, left, top)
+    there = present(texture, left, top)
+    weight = weights(fx, fy)
+    mixed = wp.vec4()
+    for i in range(4):
+        t = texel(texels, at[i])
+        mixed += wp.vec4(t[0], t[1], t[2], t[3] * there[i]) * weight[i]
+    return mixed
 
 
 @wp.func
 def empty(occupied: wp.array(dtype=wp.uint8), texture: wp.vec3i, left: int, top: int) -> bool:
     """Whether all texels that a sample is made of are known to be transparent."""
-    above = texture[0] + wp.max(top, 0) * texture[2]
-    below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
-    x0 = wp.max(left, 0)
-    x1 = wp.min(left + 1, texture[2] - 1)
-    any_above = flag(occupied, (above + x0) >> BLOCK_BITS) | flag(occupied, (above + x1) >> BLOCK_BITS)
-    any_below = flag(occupied, (below + x0) >> BLOCK_BITS) | flag(occupied, (below + x1) >> BLOCK_BITS)
-    return (any_above | any_below) == wp.uint8(0)
+    at = corners(texture, left, top)
+    above = flag(occupied, at[0] >> BLOCK_BITS) | flag(occupied, at[1] >> BLOCK_BITS)
+    below = flag(occupied, at[2] >> BLOCK_BITS) | flag(occupied, at[3] >> BLOCK_BITS)
+    return (above | below) == wp.uint8(0)
 
 
 @wp.func
@@ -120,49 +134,25 @@ def scatter(gradient: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top
         i = texture[0] + top * texture[2] + left
         accumulate_bilinear(gradient, i, i + texture[2], fx, fy, g)
     else:
-        right = g * fx
-        a = (g - right) * (1.0 - fy)
-        b = right * (1.0 - fy)
-        c = (g - right) * fy
-        d = right * fy
-        x0 = wp.max(left, 0)
-        x1 = wp.min(left + 1, texture[2] - 1)
-        above = texture[0] + wp.max(top, 0) * texture[2]
-        below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
-        in_l = wp.where(left < 0, 0.0, 1.0)
-        in_r = wp.where(left + 1 >= texture[2], 0.0, 1.0)
-        in_t = wp.where(top < 0, 0.0, 1.0)
-        in_b = wp.where(top + 1 >= texture[1], 0.0, 1.0)
-        accumulate(gradient, above + x0, wp.vec4(a[0], a[1], a[2], a[3] * in_l * in_t))
-        accumulate(gradient, above + x1, wp.vec4(b[0], b[1], b[2], b[3] * in_r * in_t))
-        accumulate(gradient, below + x0, wp.vec4(c[0], c[1], c[2], c[3] * in_l * in_b))
-        accumulate(gradient, below + x1, wp.vec4(d[0], d[1], d[2], d[3] * in_r * in_b))
+        at = corners(texture, left, top)
+        there = present(texture, left, top)
+        weight = weights(fx, fy)
+        for c in range(4):
+            accumulate(gradient, at[c], wp.vec4(g[0], g[1], g[2], g[3] * there[c]) * weight[c])
 
 
 @wp.func
 def slope(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float, g: wp.vec4) -> wp.vec2:
     """The adjoint of :func:`fetch` in the texel coordinates."""
-    x0 = wp.max(left, 0)
-    x1 = wp.min(left + 1, texture[2] - 1)
-    above = texture[0] + wp.max(top, 0) * texture[2]
-    below = texture[0] + wp.min(top + 1, texture[1] - 1) * texture[2]
-    in_l = wp.where(left < 0, 0.0, 1.0)
-    in_r = wp.where(left + 1 >= texture[2], 0.0, 1.0)
-    in_t = wp.where(top < 0, 0.0, 1.0)
-    in_b = wp.where(top + 1 >= texture[1], 0.0, 1.0)
-    a = texel(texels, above + x0)
-    b = texel(texels, above + x1)
-    c = texel(texels, below + x0)
-    d = texel(texels, below + x1)
-    a[3] = a[3] * in_l * in_t
-    b[3] = b[3] * in_r * in_t
-    c[3] = c[3] * in_l * in_b
-    d[3] = d[3] * in_r * in_b
-    ga = wp.dot(a, g)
-    gb = wp.dot(b, g)
-    gc = wp.dot(c, g)
-    gd = wp.dot(d, g)
-    return wp.vec2((gb - ga) * (1.0 - fy) + (gd - gc) * fy, (gc - ga) * (1.0 - fx) + (gd - gb) * fx)
+    at = corners(texture, left, top)
+    there = present(texture, left, top)
+    gains = wp.vec4()
+    for c in range(4):
+        t = texel(texels, at[c])
+        gains[c] = wp.dot(wp.vec4(t[0], t[1], t[2], t[3] * there[c]), g)
+    of_u = (gains[1] - gains[0]) * (1.0 - fy) + (gains[3] - gains[2]) * fy
+    of_v = (gains[2] - gains[0]) * (1.0 - fx) + (gains[3] - gains[1]) * fx
+    return wp.vec2(of_u, of_v)
 
 
 @wp.func
