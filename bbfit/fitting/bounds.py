@@ -15,6 +15,8 @@ from bbfit.views import ViewSet
 
 # Views that meet a billboard more obliquely than this say nothing useful about its extent.
 _OBLIQUE = math.cos(math.radians(60))
+# Alpha from which a texel counts as being something.
+_OPAQUE = 0.05
 # Billboards whose cosines differ by less face a view equally well.
 _TIE = 1e-3
 
@@ -64,6 +66,31 @@ def silhouette_bounds(planes: BillboardCloud, views: ViewSet) -> Tensor:
     return torch.where(seen[:, None], bounds, widest)
 
 
+def opaque_bounds(cloud: BillboardCloud) -> Tensor:
+    """Bounds of what is not transparent in each billboard's textures; same return as :func:`facing_view_bounds`.
+
+    A margin of two texels is left around it. Where it reaches the border of the texture there may be more beyond, so the bounds then grow
+    by a tenth of the side. A billboard without anything on it keeps its bounds.
+    """
+    bounds = []
+    for n, texture in enumerate(cloud.textures()):
+        mask = (texture[..., 3].amax(0) > _OPAQUE).numpy().astype(np.uint8)
+        x, y, width, height = cv2.boundingRect(mask)
+        sides = torch.tensor([mask.shape[1], mask.shape[0]])
+        if not width:
+            bounds.append(
+                torch.stack([-cloud.half_extents[n, 0], cloud.half_extents[n, 0], -cloud.half_extents[n, 1], cloud.half_extents[n, 1]])
+            )
+            continue
+        low, high = torch.tensor([x, y]), torch.tensor([x + width, y + height])
+        spare = (sides / 10).ceil().clamp_min(2)
+        low = torch.where(low < 1, low - spare, (low - 2).clamp_min(0))
+        high = torch.where(high > sides - 1, high + spare, torch.minimum(high + 2, sides))
+        metres = (torch.stack([low, high]) / sides * 2 - 1) * cloud.half_extents[n]
+        bounds.append(torch.stack([metres[0, 0], metres[1, 0], -metres[1, 1], -metres[0, 1]]))
+    return torch.stack(bounds)
+
+
 def _union(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(torch.tensor([True, False, True, False]), torch.minimum(a, b), torch.maximum(a, b))
 
@@ -92,3 +119,20 @@ def _bounds_on_plane(planes: BillboardCloud, n: int, camera: Camera, pixels: Ten
     coordinates = on_plane[:, :2] / on_plane[:, 2:]
     (left, bottom), (right, top) = coordinates.amin(0), coordinates.amax(0)
     return torch.stack([left, right, bottom, top])
+
+
+def smallest_rectangle(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Centre, unit axis along its width, half width and height, [2] each, of the smallest rectangle around points of a plane, [P, 2].
+
+    It is turned only if that makes it a fifth smaller, and then by 45 degrees at most.
+    """
+    low, high = points.amin(0), points.amax(0)
+    upright = torch.tensor([1.0, 0.0], dtype=points.dtype)
+    (x, y), (width, height), degrees = cv2.minAreaRect(points.float().numpy())
+    if width * height > 0.8 * float((high - low).prod()):
+        return (low + high) / 2, upright, (high - low) / 2
+    if degrees > 45:
+        width, height, degrees = height, width, degrees - 90
+    turn = math.radians(degrees)
+    axis = torch.tensor([math.cos(turn), math.sin(turn)], dtype=points.dtype)
+    return torch.tensor([x, y], dtype=points.dtype), axis, torch.tensor([width / 2, height / 2], dtype=points.dtype)

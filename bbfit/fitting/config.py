@@ -10,12 +10,17 @@ from bbfit.rendering.config import Backend
 
 Preset = Literal["default", "thesis"]
 Sides = Literal["one", "two", "pair"]
+Placement = Literal["even", "clusters"]
+Orientation = Literal["any", "upright", "free"]
 Bounds = Literal["viewport", "thesis", "silhouette"]
 Loss = Literal["l1", "l2", "backgrounds"]
 Schedule = Literal["cosine", "growth"]
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "default": {
+        "billboards": 8,
+        "placement": "clusters",
+        "placement_rate": 0.015,
         "bounds": "silhouette",
         "loss": "backgrounds",
         "ssim_weight": 0.005,
@@ -27,6 +32,9 @@ _PRESETS: dict[str, dict[str, Any]] = {
     },
     # Thesis, section 4.4 and 5.
     "thesis": {
+        "billboards": 4,
+        "placement": "even",
+        "placement_rate": 0.0,
         "bounds": "viewport",
         "loss": "l2",
         "ssim_weight": 0.0,
@@ -45,8 +53,20 @@ class FitConfig:
 
     preset: Preset = "default"
     """thesis repeats the thesis's schedule: 10,000 steps of one random view, Adam at 0.01 growing by a tenth, no bounds, L2."""
-    billboards: int = 4
-    """Number N of upright billboards, at k*180/N degrees through the tree's axis."""
+    billboards: int | None = None
+    """Number N of billboards. Preset: 8; thesis: 4."""
+    placement: Placement | None = None
+    """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters), found by a search
+    over clusterings of points on the mesh or, without one, in the visual hull of the views. Preset: clusters; thesis: even."""
+    orientation: Orientation = "any"
+    """Whether clusters are upright planes, planes that may lean any way (free), or whatever does better (any)."""
+    candidates: int = 16
+    """Clusterings that the search compares."""
+    relocations: int = 12
+    """How often the search tries to take the billboard that is missed least to where the picture is worst."""
+    placement_rate: float | None = None
+    """How fast billboards move with their textures at first: radians a step, and shares of the tree's radius. 0: they stay.
+    Preset: 0.015; thesis: 0."""
     sides: Sides = "one"
     """one texture for both sides; two, each seen from its own side; or the thesis's pair of rectangles a hair apart."""
     bounds: Bounds | None = None
@@ -81,7 +101,14 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         check_choice("preset", self.preset, ("default", "thesis"))
-        check_count("billboards", self.billboards)
+        if self.billboards is not None:
+            check_count("billboards", self.billboards)
+        check_choice("placement", self.placement, (None, "even", "clusters"))
+        check_choice("orientation", self.orientation, ("any", "upright", "free"))
+        check_count("candidates", self.candidates)
+        check_count("relocations", self.relocations, 0)
+        if self.placement_rate is not None:
+            check_range("placement_rate", self.placement_rate, 0, 1)
         check_choice("sides", self.sides, ("one", "two", "pair"))
         check_choice("bounds", self.bounds, (None, "viewport", "thesis", "silhouette"))
         check_range("texel_density", self.texel_density, 0, 16, open_low=True)

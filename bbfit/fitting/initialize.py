@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from bbfit.fitting.bounds import facing_view_bounds, silhouette_bounds
 from bbfit.fitting.config import FitConfig
-from bbfit.geometry.camera import convergence_point
+from bbfit.geometry.camera import Camera, convergence_point
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.views import ViewSet
 
@@ -24,11 +25,9 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
     that faces them (thesis, sections 4.2 and 6.3).
     """
     camera, config = views.cameras, config.resolve()
-    axis = convergence_point(camera)
-    focal = camera.intrinsics[:, 0, 0].mean()
-    if not camera.orthographic:
-        focal = focal / (camera.position - axis).norm(dim=-1).mean()
-    density = config.texel_density * focal  # texels a metre
+    assert config.billboards is not None
+    axis, focal = convergence_point(camera), pixels_a_metre(camera)
+    density = config.texel_density * focal
     size = torch.tensor([camera.height, camera.width])
     sides = config.sides
     planes = even_upright(
@@ -46,6 +45,23 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
             bounds = silhouette_bounds(planes, views)
         planes = bounded(planes, bounds, density)
     return random_textures(planes.to(torch.float32), planes.texture_sizes, config.seed)
+
+
+def pixels_a_metre(camera: Camera) -> Tensor:
+    """Pixels that a metre takes up where the tree's axis is seen face on, a scalar."""
+    focal = camera.intrinsics[:, 0, 0].mean()
+    return focal if camera.orthographic else focal / (camera.position - convergence_point(camera)).norm(dim=-1).mean()
+
+
+def tree_radius(views: ViewSet) -> float:
+    """Root mean square distance of the tree from its middle, in metres, as some views show it; as deep as it is wide."""
+    alphas = torch.stack([views.image(i)[..., 3].double() for i in range(0, len(views), max(1, len(views) // 8))])
+    spread = 0.0
+    for weights, share in ((alphas.sum(1), 2.0), (alphas.sum(2), 1.0)):
+        weights = weights / weights.sum(-1, keepdim=True)
+        at = torch.arange(weights.shape[1], dtype=torch.float64)
+        spread += share * float(((weights * at.square()).sum(-1) - (weights * at).sum(-1).square()).mean())
+    return math.sqrt(spread) / float(pixels_a_metre(views.cameras))
 
 
 def random_textures(cloud: BillboardCloud, sizes: Tensor, seed: int) -> BillboardCloud:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import grid_sample, interpolate
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
@@ -73,6 +73,31 @@ def resize_textures(cloud: BillboardCloud, sizes: Tensor) -> BillboardCloud:
         filtered = torch.where(both[..., 3:4] > 1e-3, unpremultiply(both[..., :4]), both[..., 4:])
         textures.append(filtered.reshape(-1, 4))
     return replace(cloud, texture_sizes=sizes, texels=torch.cat(textures))
+
+
+def resampled(cloud: BillboardCloud, onto: BillboardCloud, sizes: Tensor) -> BillboardCloud:
+    """``onto`` with the textures of ``cloud``, whose rectangles lie in the same planes with the same axes but may be larger or smaller.
+
+    They get new sizes, int64 [N, 2].
+
+    Filtered as :func:`resize_textures` does it. Beyond the border of a texture there is nothing, in the colour of the border.
+    """
+    if torch.equal(cloud.centers, onto.centers) and torch.equal(cloud.half_extents, onto.half_extents):
+        return resize_textures(cloud, sizes)
+    textures = []
+    for n, (texture, size) in enumerate(zip(cloud.textures(), sizes.tolist(), strict=True)):
+        shift = onto.centers[n] - cloud.centers[n]
+        across = torch.stack([shift @ cloud.rights[n], -shift @ cloud.ups[n]]) / cloud.half_extents[n]  # middle of the new one in [-1, 1]
+        scale = onto.half_extents[n] / cloud.half_extents[n]
+        steps = [(2 * torch.arange(count, dtype=torch.float64) + 1) / count - 1 for count in size]
+        grid = torch.stack(torch.meshgrid(across[1] + scale[1] * steps[0], across[0] + scale[0] * steps[1], indexing="ij")[::-1], -1)
+        grid = grid[None].expand(len(texture), -1, -1, -1).to(texture)
+        both = torch.cat([premultiply(texture), texture], -1).permute(0, 3, 1, 2)
+        inside = grid_sample(both[:, :4], grid, padding_mode="zeros", align_corners=False).permute(0, 2, 3, 1)
+        beyond = grid_sample(both[:, 4:7], grid, padding_mode="border", align_corners=False).permute(0, 2, 3, 1)
+        plain = torch.cat([beyond, inside[..., 3:]], -1)
+        textures.append(torch.where(inside[..., 3:] > 1e-3, unpremultiply(inside), plain).reshape(-1, 4))
+    return replace(onto, texture_sizes=sizes, texels=torch.cat(textures))
 
 
 def shrunk_sizes(cloud: BillboardCloud, halvings: int) -> Tensor:

@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -15,16 +15,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bbfit.checks import InputTypeError, fail
+from bbfit.checks import InputTypeError, check_file, fail
 from bbfit.files import write_tensors
+from bbfit.fitting.bounds import opaque_bounds
+from bbfit.fitting.clusters import sized
 from bbfit.fitting.config import FitConfig
-from bbfit.fitting.initialize import random_textures, start_cloud
-from bbfit.fitting.levels import LEAST_SIDE, Targets, resize_textures, shrunk_sizes
+from bbfit.fitting.initialize import bounded, pixels_a_metre, random_textures, start_cloud, tree_radius
+from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
+from bbfit.fitting.movement import Movement
+from bbfit.fitting.points import hull_points, mesh_points
+from bbfit.fitting.search import find_placement
 from bbfit.fitting.steps import Stepper, make_stepper
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import bleed_colour
 from bbfit.views import ViewDataset
+
+_START, _FOUND = "start.", "found."
 
 
 @dataclass(frozen=True)
@@ -59,10 +66,16 @@ class FitResult:
 
 @dataclass
 class _Progress:
-    """What a checkpoint holds: the losses of the steps done, and the stepper's tensors after the last of them."""
+    """What a checkpoint holds."""
 
     losses: list[float]
+    """Of the steps done."""
+    start: BillboardCloud
+    """The rectangles at the beginning of the level, with their texture sizes at full resolution; its texels mean nothing."""
+    found: BillboardCloud | None
+    """What the search for a placement has found, as long as no step is done."""
     tensors: dict[str, Tensor]
+    """The stepper's, after the last step."""
     seconds: float
 
 
@@ -70,68 +83,94 @@ def fit(
     views: ViewDataset,
     config: FitConfig | None = None,
     *,
+    tree: str | Path | None = None,
     checkpoint: str | Path | None = None,
     on_step: Callable[[Step], None] | None = None,
+    on_place: Callable[[int, int], None] | None = None,
 ) -> FitResult:
     """Fit a billboard cloud to the training views; the test views are not looked at.
 
-    Each step draws some training views, renders the cloud from their cameras, and lets Adam (Kingma and Ba 2015) move the texels down
-    the gradient of the loss; texels are kept in [0, 1]. Views and textures start coarse and are refined level by level. At the end
-    transparent texels get their neighbours' colour.
+    First a placement is searched for, unless it is to be the even one. Then each step draws some training views, renders the cloud from
+    their cameras, and lets Adam (Kingma and Ba 2015) move the texels, and at all but the finest level the billboards, down the gradient of
+    the loss; texels are kept in [0, 1]. Views and textures start coarse and are refined level by level; billboards that have moved are cut
+    to what they show at the end of a level. At the end transparent texels get their neighbours' colour.
 
     Parameters
     ----------
     views : training views from around the tree.
     config : the preset ``default`` when left out.
+    tree : the mesh that the views show, as glTF, OBJ, PLY or STL, to place billboards by; the visual hull of the views when left out.
     checkpoint : file to keep the state in every ``config.checkpoint_every`` steps. If it holds the state of a fit of the same views by
         the same configuration, that fit goes on, and ends with the same result as an unbroken one. The caller removes the file once
         the result is safe.
     on_step : called after every step.
+    on_place : called while a placement is searched for, with how much of the work is done and how much there is.
 
     Raises
     ------
     InputError
-        if a view cannot be read or is empty, or the device is not there.
+        if a view cannot be read or is empty, the mesh is not of the tree that the views show, or the device is not there.
     """
     if not isinstance(views, ViewDataset):
         raise InputTypeError(f"views: expected a ViewDataset, got {views!r}; ViewDataset.load(folder) reads one")
     config = (config or FitConfig()).resolve()
-    assert config.steps is not None and config.views_per_step is not None
+    assert config.steps is not None and config.views_per_step is not None and config.learning_rate is not None
     device = _device(config.device)
     begun = time.perf_counter()
     views.train.check()
-    start = start_cloud(views.train, config)
-    mark = sha256(json.dumps([2, asdict(config), views.train.fingerprint], sort_keys=True).encode()).hexdigest()
+    mesh = None if tree is None else sha256(check_file("tree", tree).read_bytes()).hexdigest()
+    mark = sha256(json.dumps([3, asdict(config), views.train.fingerprint, mesh], sort_keys=True).encode()).hexdigest()
     checkpoint = Path(checkpoint) if checkpoint is not None else None
-    done = (_load(checkpoint, mark) if checkpoint is not None else None) or _Progress([], {}, 0.0)
+    done = _load(checkpoint, mark) if checkpoint is not None else None
+    if done is None:
+        done = _begin(views, config, tree, on_place)
+        if checkpoint is not None and done.found is not None:
+            _save(checkpoint, mark, replace(done, seconds=time.perf_counter() - begun))
     begun -= done.seconds
 
-    losses, fitted = done.losses, None  # type: list[float], BillboardCloud | None
-    for level in levels_of(config, views.train.cameras):
+    start, fitted, losses = done.start, done.found, done.losses
+    density, radius = config.texel_density * pixels_a_metre(views.train.cameras), tree_radius(views.train)
+    for level in (levels := levels_of(config, views.train.cameras)):
         if len(losses) > level.end:
             continue  # the checkpoint is of a later level
         sizes = shrunk_sizes(start, level.halvings)
-        cloud = random_textures(start, sizes, config.seed) if fitted is None else resize_textures(fitted, sizes)
-        stepper = make_stepper(cloud.to(device), Targets.at(views.train, level.halvings), config)
+        cloud = random_textures(start, sizes, config.seed) if fitted is None else resampled(fitted, start, sizes)
+        movement = Movement(cloud, radius) if config.placement_rate and (level.halvings or len(levels) == 1) else None
+        stepper = make_stepper(cloud.to(device), Targets.at(views.train, level.halvings), config, movement)
         if done.tensors and len(losses) > level.begin:
             stepper.restore(done.tensors, len(losses) - level.begin)
         for index in range(len(losses), level.end):
             rate = learning_rate(config, index)
-            loss = stepper.step(draw_views(config, len(views.train), index, level.halvings), rate)
-            losses.append(float(loss))
+            placement_rate = (config.placement_rate or 0.0) * rate / config.learning_rate
+            chosen = draw_views(config, len(views.train), index, level.halvings)
+            losses.append(float(stepper.step(chosen, rate, placement_rate)))
             if on_step is not None:
-                on_step(Step(index + 1, config.steps, losses[-1], rate, partial(_snapshot, cloud, stepper)))
+                on_step(Step(index + 1, config.steps, losses[-1], rate, partial(_cloud_of, stepper)))
             if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
-                _save(checkpoint, mark, _Progress(losses, stepper.tensors(), time.perf_counter() - begun))
-        fitted = cloud.with_texels(stepper.texels.detach().cpu())
+                _save(checkpoint, mark, _Progress(losses, start, None, stepper.tensors(), time.perf_counter() - begun))
+        fitted = stepper.cloud
+        if movement is not None:
+            start = bounded(fitted, opaque_bounds(fitted), density).to(torch.float32)
     assert fitted is not None
     # No view determines the colour of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
     bled = [bleed_colour(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     return FitResult(fitted.with_texels(torch.cat(bled)), losses, config, time.perf_counter() - begun)
 
 
-def _snapshot(cloud: BillboardCloud, stepper: Stepper) -> BillboardCloud:
-    return cloud.with_texels(stepper.texels.detach().cpu().clone())
+def _begin(views: ViewDataset, config: FitConfig, tree: str | Path | None, on_place: Callable[[int, int], None] | None) -> _Progress:
+    """Before the first step: evenly placed billboards, or what the search finds."""
+    if config.placement == "even":
+        return _Progress([], start_cloud(views.train, config), None, {}, 0.0)
+    if tree is None:
+        points = hull_points(views.train, seed=config.seed)
+    else:
+        points = mesh_points(tree, views.train, seed=config.seed)
+    found = find_placement(views.train, points, config, on_place)
+    return _Progress([], sized(found, float(config.texel_density * pixels_a_metre(views.train.cameras))), found, {}, 0.0)
+
+
+def _cloud_of(stepper: Stepper) -> BillboardCloud:
+    return stepper.cloud
 
 
 @dataclass(frozen=True)
@@ -192,8 +231,12 @@ def _device(name: str) -> torch.device:
 
 def _save(path: Path, mark: str, progress: _Progress) -> None:
     tensors = {name: tensor.detach().cpu() for name, tensor in progress.tensors.items()}
-    losses = torch.tensor(progress.losses, dtype=torch.float64)
-    write_tensors(path, tensors | {"losses": losses}, {"fit": mark, "seconds": repr(progress.seconds)})
+    tensors["losses"] = torch.tensor(progress.losses, dtype=torch.float64)
+    for prefix, cloud in {_START: progress.start, _FOUND: progress.found}.items():
+        for field in fields(cloud) if cloud is not None else ():
+            if prefix == _FOUND or field.name != "texels":
+                tensors[prefix + field.name] = getattr(cloud, field.name).contiguous()
+    write_tensors(path, tensors, {"fit": mark, "seconds": repr(progress.seconds)})
 
 
 def _load(path: Path, mark: str) -> _Progress | None:
@@ -208,6 +251,13 @@ def _load(path: Path, mark: str) -> _Progress | None:
             if metadata.get("fit") != mark:
                 return None
             tensors = {name: file.get_tensor(name) for name in file.keys()}
-            return _Progress(tensors.pop("losses").tolist(), tensors, float(metadata["seconds"]))
     except SafetensorError:
         return None
+    parts = {
+        prefix: {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
+        for prefix in (_START, _FOUND)
+    }
+    texels = parts[_START]["texture_sizes"].prod(-1) * (1 + parts[_START]["two_sided"].long())
+    start = BillboardCloud(**parts[_START], texels=torch.zeros(int(texels.sum()), 4))
+    found = BillboardCloud(**parts[_FOUND]) if parts[_FOUND] else None
+    return _Progress(tensors.pop("losses").tolist(), start, found, tensors, float(metadata["seconds"]))

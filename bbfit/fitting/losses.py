@@ -31,12 +31,18 @@ def image_loss(render: Tensor, target: Tensor, kind: Loss, ssim_weight: float) -
     -------
     A scalar.
     """
-    difference = render - target
-    loss = (difference.abs() if kind == "l1" else difference.square()).sum(-1).mean()
-    if kind == "backgrounds":
-        loss = loss - (difference[..., 3] * difference[..., :3].sum(-1)).mean()
+    loss = pixel_losses(render, target, kind).mean()
     if ssim_weight:
         loss = loss + ssim_weight * (1 - structural_similarity(render, target))
+    return loss
+
+
+def pixel_losses(render: Tensor, target: Tensor, kind: Loss) -> Tensor:
+    """The loss of every pixel, without SSIM, [V, H, W]; see :func:`image_loss`."""
+    difference = render - target
+    loss = (difference.abs() if kind == "l1" else difference.square()).sum(-1)
+    if kind == "backgrounds":
+        loss = loss - difference[..., 3] * difference[..., :3].sum(-1)
     return loss
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.losses import image_loss
+from bbfit.fitting.movement import Movement
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.reference import render_reference
 
@@ -20,13 +21,17 @@ if TYPE_CHECKING:
 
 
 class Stepper(Protocol):
-    """An optimiser of a cloud's texels."""
+    """An optimiser of a cloud's texels and, if it has been given a movement, of where the billboards stand."""
 
     @property
     def texels(self) -> Tensor:
         """The texels as they are now, [P, 4]."""
 
-    def step(self, chosen: Sequence[int], rate: float) -> Tensor:
+    @property
+    def cloud(self) -> BillboardCloud:
+        """The cloud as it is now, on the CPU, with texels of its own."""
+
+    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0) -> Tensor:
         """Take the next step on the chosen views; return the loss before the update, a scalar."""
 
     def tensors(self) -> dict[str, Tensor]:
@@ -36,16 +41,16 @@ class Stepper(Protocol):
         """Go on from :meth:`tensors` as they were after so many steps."""
 
 
-def make_stepper(cloud: BillboardCloud, targets: Targets, config: FitConfig) -> Stepper:
+def make_stepper(cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None) -> Stepper:
     """A stepper for a resolved configuration, which starts from the cloud's texels on their device."""
-    return (ReferenceStepper if config.backend == "reference" else FusedStepper)(cloud, targets, config)
+    return (ReferenceStepper if config.backend == "reference" else FusedStepper)(cloud, targets, config, movement)
 
 
 class ReferenceStepper:
     """The specification: kornia's warp, autograd and torch's Adam."""
 
-    def __init__(self, cloud: BillboardCloud, targets: Targets, config: FitConfig) -> None:
-        self._cloud, self._targets, self._config = cloud, targets, config
+    def __init__(self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None) -> None:
+        self._cloud, self._targets, self._config, self._movement = cloud, targets, config, movement
         self._start(cloud.texels.clone(), torch.zeros_like(cloud.texels), torch.zeros_like(cloud.texels), 0)
 
     def _start(self, texels: Tensor, first_moment: Tensor, second_moment: Tensor, steps: int) -> None:
@@ -60,17 +65,30 @@ class ReferenceStepper:
     def tensors(self) -> dict[str, Tensor]:
         """See :class:`Stepper`."""
         kept = self._adam.state[self.texels]
-        return {"texels": self.texels.detach(), "first_moment": kept["exp_avg"], "second_moment": kept["exp_avg_sq"]}
+        moved = self._movement.tensors() if self._movement else {}
+        return {"texels": self.texels.detach(), "first_moment": kept["exp_avg"], "second_moment": kept["exp_avg_sq"]} | moved
 
     def restore(self, tensors: dict[str, Tensor], steps: int) -> None:
         """See :class:`Stepper`."""
         self._start(tensors["texels"], tensors["first_moment"], tensors["second_moment"], steps)
+        if self._movement:
+            self._movement.restore(tensors, steps)
 
-    def step(self, chosen: Sequence[int], rate: float) -> Tensor:
+    @property
+    def cloud(self) -> BillboardCloud:
+        """See :class:`Stepper`."""
+        texels = self.texels.detach().cpu().clone()
+        return self._movement.now(texels) if self._movement else self._cloud.to("cpu").with_texels(texels)
+
+    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0) -> Tensor:
         """See :class:`Stepper`."""
         device = self.texels.device
         self._adam.param_groups[0]["lr"] = rate
-        image = render_reference(self._cloud.with_texels(self.texels), self._targets.cameras[list(chosen)].to(device))
+        cloud, moved = self._cloud.with_texels(self.texels), None
+        if self._movement and placement_rate:
+            moved = self._movement.parameters.clone().requires_grad_()
+            cloud = self._movement.placed(moved, self.texels).to(torch.float32).to(device)
+        image = render_reference(cloud, self._targets.cameras[list(chosen)].to(device))
         assert self._config.loss is not None
         loss = image_loss(image, self._targets.pictures(chosen).to(device), self._config.loss, self._config.ssim_weight or 0.0)
         self._adam.zero_grad()
@@ -78,49 +96,78 @@ class ReferenceStepper:
         self._adam.step()
         with torch.no_grad():
             self.texels.clamp_(0, 1)
+        if moved is not None:
+            assert self._movement is not None and moved.grad is not None
+            self._movement.update(moved.grad, placement_rate)
         return loss.detach()
 
 
 class FusedStepper:
     """The same by Warp kernels: one pass over the pixels and one over the texels."""
 
-    def __init__(self, cloud: BillboardCloud, targets: Targets, config: FitConfig) -> None:
+    def __init__(self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None) -> None:
         from bbfit.fitting.adam import AdamState
         from bbfit.rendering.projection import project
 
-        self._targets, self._config, self._count = targets, config, len(cloud.texels)
+        self._cloud, self._targets, self._config, self._movement = cloud, targets, config, movement
         self.state, self.steps = AdamState.start(cloud.texels), 0
         self._scratch: list[Tensor] | None = None
-        self._projection = project(cloud, targets.cameras.to(cloud.texels.device))
+        self._standing = None if movement else project(cloud, targets.cameras.to(cloud.texels.device))
 
     @property
     def texels(self) -> Tensor:
         """See :class:`Stepper`."""
-        return self.state.texels[: self._count]
+        return self.state.texels[: len(self._cloud.texels)]
+
+    @property
+    def cloud(self) -> BillboardCloud:
+        """See :class:`Stepper`."""
+        texels = self.texels.cpu().clone()
+        return self._movement.now(texels) if self._movement else self._cloud.to("cpu").with_texels(texels)
 
     def tensors(self) -> dict[str, Tensor]:
         """See :class:`Stepper`."""
-        return self.state.tensors()
+        return self.state.tensors() | (self._movement.tensors() if self._movement else {})
 
     def restore(self, tensors: dict[str, Tensor], steps: int) -> None:
         """See :class:`Stepper`."""
-        self.state, self.steps = self.state.restored(tensors), steps
+        self.state, self.steps = self.state.restored({name: tensors[name] for name in self.state.tensors()}), steps
+        if self._movement:
+            self._movement.restore(tensors, steps)
 
-    def step(self, chosen: Sequence[int], rate: float) -> Tensor:
+    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0) -> Tensor:
         """See :class:`Stepper`."""
         from bbfit.rendering.fused import PixelLoss, differentiate
 
         state, config, device = self.state, self._config, self.state.texels.device
-        projection = self._projection.take(torch.tensor(chosen, device=device))
+        moved = self._movement.parameters.clone().requires_grad_(bool(placement_rate)) if self._movement else None
+        projection = self._project(chosen, moved)
         pixels = len(chosen) * projection.width * projection.height
         assert config.loss is not None
         loss = PixelLoss(self._targets.packed(chosen).to(device), self._targets.shrunk is None, config.loss, 1 / pixels)
         dissimilarity, of_image = self._dissimilarity(projection, loss) if config.ssim_weight else (0.0, None)
-        sums, _ = differentiate(state.texels, projection, state.gradient, image_gradient=of_image, loss=loss, occupied=state.occupied)
+        wanted = projection.to_texel.requires_grad
+        sums, of_matrices = differentiate(
+            state.texels, projection, state.gradient, image_gradient=of_image, loss=loss, occupied=state.occupied, placement=wanted
+        )
         assert sums is not None
+        if moved is not None and of_matrices is not None:
+            assert self._movement is not None
+            (gradient,) = torch.autograd.grad(projection.to_texel, moved, of_matrices.to(projection.to_texel))
+            self._movement.update(gradient, placement_rate)
         self.steps += 1
         state.update(self.steps, rate)
         return sums.sum() / pixels + dissimilarity
+
+    def _project(self, chosen: Sequence[int], moved: Tensor | None) -> Projection:
+        """Where the chosen views see the billboards, after a movement if there is one."""
+        from bbfit.rendering.projection import project
+
+        device = self.state.texels.device
+        if self._standing is not None:
+            return self._standing.take(torch.tensor(chosen, device=device))
+        assert self._movement is not None and moved is not None
+        return project(self._movement.placed(moved, self._cloud.texels).to(device), self._targets.cameras[list(chosen)].to(device))
 
     def _dissimilarity(self, projection: Projection, loss: PixelLoss) -> tuple[Tensor, Tensor]:
         """The weighted 1 - SSIM of the present picture to the loss's target, and its gradient in the picture, [B, H, W, 4]."""

@@ -1,0 +1,165 @@
+"""Planes through a tree's points by k-planes clustering, and rectangles on them.
+
+k-means with planes for means (Bradley and Mangasarian 2000, "k-Plane Clustering"), for the purpose of Décoret et al.'s (2003) billboard
+clouds: every point is moved onto a plane, and what is paid for is how far that displacement can be seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from bbfit.fitting.bounds import smallest_rectangle
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cloud import BillboardCloud
+
+_ITERATIONS = 20
+# A cluster with fewer points than this share of an even one is begun anew where points lie far from all planes.
+_STARVED = 0.02
+
+
+@dataclass(frozen=True)
+class Planes:
+    """K planes, ``normal . x = offset``, and the points that are nearest to each."""
+
+    normals: Tensor
+    """Unit vectors, float64 [K, 3]."""
+    offsets: Tensor
+    """Metres, float64 [K]."""
+    labels: Tensor
+    """Plane of every point, int64 [P]."""
+    cost: float
+    """Mean squared displacement as the cameras see it, square metres."""
+
+
+def seen_across(camera: Camera) -> Tensor:
+    """The mean over views of the projection across the viewing direction, [3, 3]: ``d . M d`` is what of |d|^2 is seen of a displacement."""
+    forward = camera.batch().forward
+    return torch.eye(3, dtype=forward.dtype) - (forward[:, :, None] * forward[:, None, :]).mean(0)
+
+
+def cluster_planes(points: Tensor, count: int, seen: Tensor, *, upright: bool, generator: torch.Generator) -> Planes:
+    """Planes from a random start, by turns of giving each point to the plane that displaces it least and fitting each plane to its points.
+
+    Parameters
+    ----------
+    points : float64 [P, 3].
+    count : K, at least 1.
+    seen : :func:`seen_across` of the cameras.
+    upright : whether planes have to contain the vertical.
+    """
+    normals = torch.randn(count, 3, dtype=points.dtype, generator=generator)
+    if upright:
+        normals[:, 1] = 0
+    normals = torch.nn.functional.normalize(normals, dim=-1)
+    offsets = (normals * points[torch.randint(len(points), (count,), generator=generator)]).sum(-1)
+    least = max(3, int(_STARVED * len(points) / count))
+    labels = torch.full((len(points),), -1)
+    for _ in range(_ITERATIONS):
+        distance = _displacement(points, normals, offsets, seen)
+        nearest, chosen = distance.min(-1)
+        for k in torch.nonzero(torch.bincount(chosen, minlength=count) < least)[:, 0].tolist():
+            far = points[nearest.argmax()]
+            around = (points - far).square().sum(-1).topk(min(len(points), 2 * least), largest=False).indices
+            chosen[around], nearest[around] = k, 0
+        if torch.equal(chosen, labels):
+            break
+        labels = chosen
+        for k in range(count):
+            own = points[labels == k]
+            if len(own) >= 3:
+                normals[k], offsets[k] = _best_plane(own, upright=upright)
+    distance, labels = _displacement(points, normals, offsets, seen).min(-1)
+    return Planes(normals, offsets, labels, float(distance.square().mean()))
+
+
+def _displacement(points: Tensor, normals: Tensor, offsets: Tensor, seen: Tensor) -> Tensor:
+    """How far moving each point onto each plane is seen, root mean square over views, in metres, [P, K]."""
+    visible = ((normals @ seen) * normals).sum(-1).clamp_min(0).sqrt()
+    return (points @ normals.mT - offsets).abs() * visible
+
+
+def _best_plane(points: Tensor, *, upright: bool) -> tuple[Tensor, Tensor]:
+    """Normal and offset of the plane with the least squared distances: across the direction of least variance (Pearson 1901)."""
+    mean = points.mean(0)
+    centred = points - mean
+    if upright:
+        flat = centred[:, ::2]
+        x, z = torch.linalg.eigh(flat.mT @ flat)[1][:, 0]
+        normal = torch.stack([x, torch.zeros_like(x), z])
+    else:
+        normal = torch.linalg.eigh(centred.mT @ centred)[1][:, 0]
+    return normal, normal @ mean
+
+
+def rectangles(points: Tensor, planes: Planes, texels_a_metre: float, margin: float, *, two_sided: bool) -> BillboardCloud:
+    """The smallest rectangles on the planes that hold the points of each, float64, with transparent textures.
+
+    Rectangles stand upright unless a turned one is a fifth smaller.
+
+    Parameters
+    ----------
+    margin : metres added on every side.
+    two_sided : whether each gets a texture for its back.
+    """
+    parts = []
+    for k, (normal, offset) in enumerate(zip(planes.normals, planes.offsets, strict=True)):
+        own = points[planes.labels == k]
+        up = torch.tensor([0.0, 1.0, 0.0], dtype=points.dtype)
+        if float(normal[1].abs()) > 0.999:
+            up = torch.tensor([0.0, 0.0, -1.0], dtype=points.dtype)
+        right = torch.nn.functional.normalize(torch.linalg.cross(up, normal), dim=0)
+        up = torch.linalg.cross(normal, right)
+        flat = torch.stack([own @ right, own @ up], -1) if len(own) else torch.zeros(1, 2, dtype=points.dtype)
+        centre, axis, half = smallest_rectangle(flat)
+        middle = normal * offset + right * centre[0] + up * centre[1]
+        parts.append((middle, axis[0] * right + axis[1] * up, axis[0] * up - axis[1] * right, half + margin))
+    centers, rights, ups, halves = (torch.stack(part) for part in zip(*parts, strict=True))
+    return sized(
+        BillboardCloud(
+            centers,
+            rights,
+            ups,
+            halves,
+            torch.ones(len(centers), 2, dtype=torch.int64),
+            torch.full((len(centers),), two_sided),
+            torch.zeros(len(centers), 4),
+        ),
+        texels_a_metre,
+    )
+
+
+def sized(cloud: BillboardCloud, texels_a_metre: float) -> BillboardCloud:
+    """The same billboards with transparent textures of ``texels_a_metre``, rectangles rounded up to whole texels."""
+    sizes = (2 * cloud.half_extents * texels_a_metre).flip(-1).ceil().long().clamp_min(1)
+    count = int((sizes.prod(-1) * (1 + cloud.two_sided.long())).sum())
+    return replace(
+        cloud, half_extents=sizes.flip(-1).to(cloud.half_extents) / texels_a_metre / 2, texture_sizes=sizes, texels=torch.zeros(count, 4)
+    )
+
+
+def splatted(cloud: BillboardCloud, points: Tensor, colours: Tensor, labels: Tensor) -> BillboardCloud:
+    """The same billboards with textures made of the points that each carries.
+
+    A texel's colour is the mean of its points' colours, and its alpha is 1 - exp(-n / m), with n points on it and m of them, on average,
+    on those texels of the billboard that have any: what a random arrangement of as much surface covers.
+
+    Parameters
+    ----------
+    points, colours, labels : [P, 3], straight RGB [P, 3] and billboard [P].
+    """
+    textures = []
+    for k, (h, w) in enumerate(cloud.texture_sizes.tolist()):
+        own = labels == k
+        offset = points[own] - cloud.centers[k]
+        u = (offset @ cloud.rights[k] / cloud.half_extents[k, 0] + 1) * w / 2
+        v = (1 - offset @ cloud.ups[k] / cloud.half_extents[k, 1]) * h / 2
+        index = v.long().clamp(0, h - 1) * w + u.long().clamp(0, w - 1)
+        number = torch.zeros(h * w).index_add_(0, index, torch.ones(len(index)))
+        colour = torch.zeros(h * w, 3).index_add_(0, index, colours[own]) / number.clamp_min(1)[:, None]
+        colour[number == 0] = colours[own].mean(0) if len(index) else 0.5
+        alpha = 1 - torch.exp(-number / number[number > 0].mean()) if len(index) else number
+        textures.append(torch.cat([colour, alpha[:, None]], -1).repeat(1 + int(cloud.two_sided[k]), 1))
+    return cloud.with_texels(torch.cat(textures))

@@ -1,0 +1,126 @@
+"""Where a tree is: points on its triangles, or in the visual hull of its views where there is no mesh."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from bbfit.blender.sources import UP_AXIS
+from bbfit.checks import check_file, fail
+from bbfit.fitting.initialize import pixels_a_metre
+from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, convergence_point
+from bbfit.views import ViewSet
+
+COUNT = 20_000
+"""Points that are drawn unless said otherwise."""
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
+"""Endings of tree files whose triangles can be read without Blender."""
+# Points of a mesh that must lie on the tree in a training view, on average, for the two to belong together.
+_AGREEMENT = 0.7
+# Random points that the hull is carved from at a time, and how often at most.
+_CARVED, _ROUNDS = 1 << 20, 16
+# Side of the silhouettes that the hull is carved with, in pixels, at least.
+_HULL_SIDE = 256
+
+
+def mesh_points(path: str | Path, views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
+    """Points on the triangles of a tree's mesh, evenly by area, [P, 3] float64, in the world of the views.
+
+    Parameters
+    ----------
+    path : a file with one of :data:`MESH_SUFFIXES`.
+    views : views of the same tree, which the mesh is checked against.
+
+    Raises
+    ------
+    MissingFileError, InputError
+        if the file is missing, cannot be read, has no triangles, or is not of the tree that the views show.
+    """
+    import trimesh
+
+    path = check_file("tree", path)
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        fail("tree", f"{path} has triangles that only Blender can read", f"give one of {' '.join(MESH_SUFFIXES)}, or no tree")
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:  # whatever a damaged file makes trimesh raise
+        fail("tree", f"{path} cannot be read ({error})", "expected a mesh")
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not mesh.area > 0:
+        fail("tree", f"{path} has no triangles", "expected a mesh")
+    sampled, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    points = torch.tensor(sampled, dtype=torch.float64)
+    if UP_AXIS[path.suffix.lower()] == "z":
+        points = points @ torch.tensor(Z_UP_TO_Y_UP, dtype=torch.float64)[:3, :3].mT
+    chosen = range(0, len(views), max(1, len(views) // 8))
+    seen = [_inside(points, views.cameras[i], views.targets([i])[0, ..., 3] > 0).double().mean() for i in chosen]
+    if float(torch.stack(seen).mean()) < _AGREEMENT:
+        fail("tree", f"{path} is not where the views show a tree", "give the mesh that they were rendered from, or no mesh")
+    return points
+
+
+def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
+    """Points in the visual hull (Laurentini 1994): wherever no view shows the background, [P, 3] float64.
+
+    Raises
+    ------
+    InputError
+        if the silhouettes have nothing in common, because the cameras or the pictures are wrong.
+    """
+    cameras = views.cameras
+    halvings = max(0, int(math.log2(min(cameras.width, cameras.height) / _HULL_SIDE)))
+    side = 1 << halvings
+    masks = []
+    for index in range(len(views)):
+        alpha = (views.image(index)[..., 3] > 0).float()
+        masks.append(max_pool2d(alpha[None], side, ceil_mode=True)[0] > 0)
+    cameras = cameras.resized(masks[0].shape[1], masks[0].shape[0])
+    centre, extent = convergence_point(cameras), max(cameras.width, cameras.height) / float(pixels_a_metre(cameras))
+    low, high = centre - extent / 2, centre + extent / 2
+    generator, found = torch.Generator().manual_seed(seed), list[Tensor]()
+    for _ in range(_ROUNDS):
+        points = low + (high - low) * torch.rand(_CARVED, 3, dtype=torch.float64, generator=generator)
+        for index, mask in enumerate(masks):
+            points = points[_inside(points, cameras[index], mask, beyond=True)]
+        found.append(points)
+        if sum(map(len, found)) >= count:
+            break
+        if len(found) == 1 and len(points):  # from now on only where the hull is
+            margin = 0.02 * extent
+            low, high = torch.maximum(low, points.amin(0) - margin), torch.minimum(high, points.amax(0) + margin)
+    hull = torch.cat(found)[:count]
+    if not len(hull):
+        fail("views", "their silhouettes have no point in common", "check the cameras, or give the tree's mesh")
+    return hull
+
+
+def point_colours(points: Tensor, views: ViewSet, cameras: Camera, pictures: Tensor) -> Tensor:
+    """Straight RGB of points as the views show them on average, occlusion ignored, [P, 3] float32.
+
+    Parameters
+    ----------
+    pictures : premultiplied RGBA, [V, H, W, 4], of ``cameras``.
+    """
+    total = torch.zeros(len(points), 4)
+    for index in range(len(views)):
+        x, y, inside = _pixels(points, cameras[index])
+        total[inside] += pictures[index, y[inside], x[inside]]
+    return total[:, :3] / total[:, 3:].clamp_min(1e-6)
+
+
+def _pixels(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Column, row and whether it is in the picture, of the pixel of every point, [P] each."""
+    pixel = camera.project(points).nan_to_num(nan=-1e6).round()
+    x, y = pixel.clamp(-1e6, 1e6).long().unbind(-1)
+    return x, y, (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+
+
+def _inside(points: Tensor, camera: Camera, mask: Tensor, *, beyond: bool = False) -> Tensor:
+    """Which points one camera sees on a mask [H, W]; ``beyond`` is the answer for those outside the picture."""
+    x, y, inside = _pixels(points, camera)
+    on = torch.full((len(points),), beyond)
+    on[inside] = mask[y[inside], x[inside]]
+    return on
