@@ -121,6 +121,7 @@ def _fit(
     views: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIEWS")],
     /,
     out: Path,
+    tree: Path | None = None,
     config: Annotated[FitConfig, tyro.conf.arg(name="")] = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
@@ -129,6 +130,7 @@ def _fit(
     Args:
         views: Folder of views, bbfit's own or any in the NeRF-synthetic layout.
         out: Folder for the results.
+        tree: The mesh that the views show (.glb .gltf .obj .ply .stl), to place billboards by; without it the views tell where the tree is.
         config: How the billboards are fitted.
         export: How the models are written.
     """
@@ -137,7 +139,7 @@ def _fit(
 
     check_folder("views", views)
     with _progress() as tell:
-        result = run(views, out, RunConfig(fit=config, export=export), on_progress=tell)
+        result = run(views, out, RunConfig(tree=tree, fit=config, export=export), on_progress=tell)
     _show(result)
 
 

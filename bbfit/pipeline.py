@@ -22,6 +22,7 @@ from bbfit.exporting.model import export
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
+from bbfit.fitting.points import MESH_SUFFIXES
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.reporting.plots import comparison_picture, loss_plot
 from bbfit.trees.config import GrowConfig
@@ -32,7 +33,7 @@ from bbfit.views import ViewDataset
 
 RECORD_FILE = "run.json"
 # Raise a stage's number when its results change for the same inputs, so that old results are made anew.
-_STAGE_VERSIONS = {"grow": 1, "fit": 2, "export": 1, "evaluate": 2}
+_STAGE_VERSIONS = {"grow": 1, "fit": 3, "export": 1, "evaluate": 2}
 _PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headless", "bpy", "trimesh", "xatlas", "scikit-image", "warp-lang")
 
 
@@ -42,6 +43,8 @@ class RunConfig:
 
     species: str | None = None
     """What to grow when no tree is given: a quaking aspen if left open, or the one species in ``grow.species_file``."""
+    tree: Path | None = None
+    """The mesh that a given folder of views shows, to place billboards by; left out, they are placed by the views alone."""
     grow: GrowConfig = field(default_factory=lambda: GrowConfig(detail=0.5))
     """Growing a tree, at moderate detail."""
     views: ViewsConfig = field(default_factory=ViewsConfig)
@@ -99,10 +102,14 @@ def run(
     """
     config = config or RunConfig()
     tell = on_progress or (lambda stage, done, total, note="": None)
+    tree = config.tree
+    if tree is not None and (source is None or not Path(source).is_dir()):
+        fail("tree", f"{tree} is given beside {source or 'a tree to grow'}", "a mesh goes with a folder of views")
     if source is None:
         species = load_species(config.species or (None if config.grow.species_file else "quaking_aspen"), config.grow.species_file)
         record = _Record(output_folder("out", out), species, config)
-        views = _render(_grow(species, record, config.grow, tell), record, config.views, tell)
+        tree = _grow(species, record, config.grow, tell)
+        views = _render(tree, record, config.views, tell)
     else:
         source = Path(source)
         if config.species is not None or config.grow != RunConfig().grow:
@@ -113,10 +120,12 @@ def run(
         if source.is_dir():
             views = ViewDataset.load(source, seed=config.fit.seed)
         else:
-            views = _render(source, record, config.views, tell)
+            tree, views = source, _render(source, record, config.views, tell)
+            if tree.suffix.lower() not in MESH_SUFFIXES:
+                tree = None  # only Blender can read it; the views tell enough
     views.train.check()
     views.test.check()
-    cloud = _fit(views, record, config.fit, tell)
+    cloud = _fit(views, tree, record, config.fit, tell)
     _export(cloud, record, export_config(views, config.export), tell)
     report = _evaluate(cloud, views, record, tell)
     return RunResult(record.folder, cloud, report, tuple(record.skipped))
@@ -152,6 +161,7 @@ class _Record:
         resolved = {
             "species": grown,
             "grow": asdict(config.grow) if grown else None,
+            "tree": str(config.tree.resolve()) if config.tree else None,
             "views": None if isinstance(source, Path) and source.is_dir() else asdict(config.views),
             "fit": asdict(config.fit.resolve()),
             "export": asdict(config.export),
@@ -226,9 +236,12 @@ def _render(tree: Path, record: _Record, config: ViewsConfig, tell: Progress) ->
     return views
 
 
-def _fit(views: ViewDataset, record: _Record, config: FitConfig, tell: Progress) -> BillboardCloud:
+def _fit(views: ViewDataset, tree: Path | None, record: _Record, config: FitConfig, tell: Progress) -> BillboardCloud:
     config, path = config.resolve(), record.folder / "cloud.safetensors"
-    inputs = _hash("fit", {**asdict(config), "checkpoint_every": None}, views.train.fingerprint)
+    if config.placement == "even":
+        tree = None  # it has no say
+    mesh = None if tree is None else _hash_file(check_file("tree", tree))
+    inputs = _hash("fit", {**asdict(config), "checkpoint_every": None}, views.train.fingerprint, mesh)
     if record.stands("fit", inputs):
         return BillboardCloud.load(path)
 
@@ -236,7 +249,7 @@ def _fit(views: ViewDataset, record: _Record, config: FitConfig, tell: Progress)
         tell("fit", step.index, step.total, f"loss {step.loss:.5f}")
 
     checkpoint = record.folder / "fit.checkpoint"
-    result = fit(views, config, checkpoint=checkpoint, on_step=on_step)
+    result = fit(views, config, tree=tree, checkpoint=checkpoint, on_step=on_step, on_place=lambda done, total: tell("place", done, total))
     result.cloud.save(path)
     write_bytes(record.folder / "loss.csv", _loss_table(result.losses))
     loss_plot(result.losses, record.folder / "loss.png")

@@ -36,6 +36,7 @@ def _update_blocks(
     correction: float,
     epsilon: float,
     rest_after: int,
+    crispness: float,
     texels: wp.array(dtype=texel_block),  # type: ignore[valid-type]
     gradient: wp.array(dtype=texel_block),  # type: ignore[valid-type]
     first_moment: wp.array(dtype=texel_block),  # type: ignore[valid-type]
@@ -57,11 +58,16 @@ def _update_blocks(
                 if idle > rest_after:
                     decay1 = wp.pow(beta1, float(idle - rest_after))
                     decay2 = wp.pow(beta2, float(idle - rest_after))
+            p = texels[i]
+            if crispness != 0.0:
+                for t in range(wp.static(BLOCK)):
+                    alpha = p[4 * t + 3]
+                    if alpha > 0.0:
+                        g[4 * t + 3] += crispness * (1.0 - 2.0 * alpha)
             m = first_moment[i] * decay1 + g * (1.0 - beta1)
             v = second_moment[i] * decay2 + wp.cw_mul(g, g) * (1.0 - beta2)
             first_moment[i] = m
             second_moment[i] = v
-            p = texels[i]
             for c in range(wp.static(4 * BLOCK)):
                 p[c] = wp.clamp(p[c] - rate * m[c] / (wp.sqrt(v[c]) * correction + epsilon), 0.0, 1.0)
             texels[i] = p
@@ -103,8 +109,10 @@ class AdamState:
         kept = {name: tensor.to(self.texels.device) for name, tensor in tensors.items()}
         return replace(AdamState.start(kept["texels"]), **kept)
 
-    def update(self, step: int, rate: float) -> None:
+    def update(self, step: int, rate: float, crispness: float = 0.0) -> None:
         """Take step number ``step``, from 1, at the given rate; keep the texels in [0, 1].
+
+        ``crispness`` times the derivative of alpha (1 - alpha) is added to the gradient of every alpha that is not 0.
 
         The same as ``torch.optim.Adam`` followed by ``clamp_`` up to rounding and :data:`REST_AFTER`.
         """
@@ -119,6 +127,7 @@ class AdamState:
             (1 - beta2**step) ** -0.5,
             EPSILON,
             REST_AFTER,
+            crispness,
             *(
                 wp.from_torch(tensor.view(-1, 4 * BLOCK), dtype=texel_block)
                 for tensor in (self.texels, self.gradient, self.first_moment, self.second_moment)

@@ -35,7 +35,7 @@ class Planes:
 
 
 def seen_across(camera: Camera) -> Tensor:
-    """The mean over views of the projection across the viewing direction, [3, 3]: ``d . M d`` is what of |d|^2 is seen of a displacement."""
+    """The mean over views of the projection across the viewing direction, M [3, 3]: of a displacement d, ``d . M d`` of |d|^2 is seen."""
     forward = camera.batch().forward
     return torch.eye(3, dtype=forward.dtype) - (forward[:, :, None] * forward[:, None, :]).mean(0)
 

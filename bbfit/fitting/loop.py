@@ -118,6 +118,8 @@ def fit(
     device = _device(config.device)
     begun = time.perf_counter()
     views.train.check()
+    if config.placement == "even":
+        tree = None  # it has no say
     mesh = None if tree is None else sha256(check_file("tree", tree).read_bytes()).hexdigest()
     mark = sha256(json.dumps([3, asdict(config), views.train.fingerprint, mesh], sort_keys=True).encode()).hexdigest()
     checkpoint = Path(checkpoint) if checkpoint is not None else None
@@ -136,7 +138,8 @@ def fit(
         sizes = shrunk_sizes(start, level.halvings)
         cloud = random_textures(start, sizes, config.seed) if fitted is None else resampled(fitted, start, sizes)
         movement = Movement(cloud, radius) if config.placement_rate and (level.halvings or len(levels) == 1) else None
-        stepper = make_stepper(cloud.to(device), Targets.at(views.train, level.halvings), config, movement)
+        asked = config if level.halvings == 0 else replace(config, sharpness_weight=0.0, crispness_weight=0.0)
+        stepper = make_stepper(cloud.to(device), Targets.at(views.train, level.halvings), asked, movement)
         if done.tensors and len(losses) > level.begin:
             stepper.restore(done.tensors, len(losses) - level.begin)
         for index in range(len(losses), level.end):

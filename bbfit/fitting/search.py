@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -24,11 +25,13 @@ from bbfit.views import ViewSet
 SIDE = 64
 """About the width of the pictures that the search is done on, in pixels."""
 # Steps of every candidate, of those that survive, and of every relocation; their rates; how many survive.
-_STEPS, _MORE_STEPS, _MEND_STEPS = 45, 75, 50
+_STEPS, _MORE_STEPS, _MEND_STEPS = 30, 50, 40
 _RATE, _LATER_RATE = 0.15, 0.1
 _SURVIVORS = 0.3
+# Relocations that are tried side by side, of which the best counts: a fixed number, so that results do not hang on the cores.
+_AT_ONCE = 2
 # Views in every step.
-_BATCH = 16
+_BATCH = 8
 # Points nearer to a new plane than this share of the tree's radius are what it carries; planes tried for each.
 _NEAR, _TRIALS = 0.08, 150
 # Margin around what a billboard carries, as a share of the tree's radius.
@@ -39,6 +42,7 @@ _MARGIN = 0.06
 class _Candidate:
     cloud: BillboardCloud
     loss: float
+    seed: int
 
 
 def find_placement(views: ViewSet, points: Tensor, config: FitConfig, on_work: Callable[[int, int], None] | None = None) -> BillboardCloud:
@@ -64,7 +68,11 @@ def find_placement(views: ViewSet, points: Tensor, config: FitConfig, on_work: C
 
 class _Search:
     def __init__(self, views: ViewSet, points: Tensor, config: FitConfig, on_work: Callable[[int, int], None]) -> None:
-        self._config, self._points, self._on_work = config, points, on_work
+        self._config, self._points, self._on_work = (
+            replace(config, ssim_weight=0.0, sharpness_weight=0.0, crispness_weight=0.0),
+            points,
+            on_work,
+        )
         side = min(views.cameras.width, views.cameras.height)
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))
@@ -80,15 +88,26 @@ class _Search:
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
         config = self._config
-        first = sorted((self._candidate(index) for index in range(config.candidates)), key=lambda candidate: candidate.loss)
-        longer = [self._fitted(one.cloud, _MORE_STEPS, _LATER_RATE, index) for index, one in enumerate(first[: self._survivors])]
-        best = min(longer, key=lambda candidate: candidate.loss)
-        refused = 0
-        for index in range(config.relocations):
-            other = self._relocated(best, index, refused)
-            refused = refused + 1 if other.loss >= best.loss else 0
-            best = min(best, other, key=lambda candidate: candidate.loss)
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            first = sorted(self._tell(pool.map(self._candidate, range(config.candidates))), key=lambda candidate: candidate.loss)
+            longer = pool.map(lambda one: self._fitted(one.cloud, _MORE_STEPS, _LATER_RATE, one.seed), first[: self._survivors])
+            best = min(self._tell(longer), key=lambda candidate: candidate.loss)
+            refused = 0
+            for index in range(0, config.relocations, _AT_ONCE):
+                several = range(index, min(index + _AT_ONCE, config.relocations))
+                others = self._tell(pool.map(self._relocations_of(best, refused), several))
+                refused = refused + _AT_ONCE if min(other.loss for other in others) >= best.loss else 0
+                best = min(best, *others, key=lambda candidate: candidate.loss)
         return best.cloud
+
+    def _tell(self, candidates: Iterable[_Candidate]) -> list[_Candidate]:
+        """All candidates, with every one counted when it is there."""
+        done = []
+        for candidate in candidates:
+            done.append(candidate)
+            self._done += 1
+            self._on_work(self._done, self._total)
+        return done
 
     def _upright(self, index: int) -> bool:
         return self._config.orientation == "upright" or (self._config.orientation == "any" and index % 2 == 0)
@@ -114,9 +133,7 @@ class _Search:
             fall = 0.5 * (1 + math.cos(math.pi * step / steps))
             chosen = torch.randperm(len(self._targets.cameras), generator=generator)[:_BATCH].tolist()
             stepper.step(chosen, rate * fall, (config.placement_rate or 0.0) * fall)
-        self._done += 1
-        self._on_work(self._done, self._total)
-        return _Candidate(stepper.cloud, float(self._losses(stepper.cloud).mean()))
+        return _Candidate(stepper.cloud, float(self._losses(stepper.cloud).mean()), seed)
 
     def _losses(self, cloud: BillboardCloud) -> Tensor:
         """The loss of every pixel of every training view, [V, H, W]."""
@@ -125,18 +142,23 @@ class _Search:
         image = render(cloud.to(device), self._targets.cameras.to(device), backend=self._config.backend)
         return pixel_losses(image.cpu(), self._pictures, self._config.loss)
 
-    def _relocated(self, best: _Candidate, index: int, refused: int) -> _Candidate:
-        """``best`` with one of the billboards that are missed least taken to where the loss is largest."""
+    def _relocations_of(self, best: _Candidate, refused: int) -> Callable[[int], _Candidate]:
+        """Makes relocation number ``index`` of ``best``: a billboard that is little missed is taken to where the loss is large."""
         cloud = best.cloud
         without = [part(cloud, [k for k in range(len(cloud)) if k != dropped]) for dropped in range(len(cloud))]
-        worth = torch.tensor([float(self._losses(rest).mean()) for rest in without])
-        rest = without[int(worth.argsort()[refused % min(3, len(cloud))])]
-        generator = torch.Generator().manual_seed((self._config.seed << 16) + index)
-        added = self._proposal(self._losses(rest), self._upright(index), generator)
-        return self._fitted(joined(rest, added), _MEND_STEPS, _LATER_RATE, index)
+        losses = [self._losses(rest) for rest in without]
+        least_missed = torch.tensor([float(loss.mean()) for loss in losses]).argsort().tolist()
+
+        def relocation(index: int) -> _Candidate:
+            dropped = least_missed[(refused + index % _AT_ONCE) // 2 % min(3, len(cloud))]
+            generator = torch.Generator().manual_seed((self._config.seed << 16) + index)
+            added = self._proposal(losses[dropped], self._upright(index), generator)
+            return self._fitted(joined(without[dropped], added), _MEND_STEPS, _LATER_RATE, index)
+
+        return relocation
 
     def _proposal(self, losses: Tensor, upright: bool, generator: torch.Generator) -> BillboardCloud:
-        """A billboard through points where the loss is large: of random planes the one with most loss near it (Fischler and Bolles 1981)."""
+        """A billboard through points where the loss is large: of random planes (Fischler and Bolles 1981) that with most of it near."""
         views, height, width = losses.shape
         x, y = self._pixels.unbind(-1)
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)

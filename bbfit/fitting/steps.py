@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.levels import Targets
-from bbfit.fitting.losses import image_loss
+from bbfit.fitting.losses import blending, image_loss
 from bbfit.fitting.movement import Movement
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.reference import render_reference
@@ -89,10 +89,12 @@ class ReferenceStepper:
             moved = self._movement.parameters.clone().requires_grad_()
             cloud = self._movement.placed(moved, self.texels).to(torch.float32).to(device)
         image = render_reference(cloud, self._targets.cameras[list(chosen)].to(device))
-        assert self._config.loss is not None
-        loss = image_loss(image, self._targets.pictures(chosen).to(device), self._config.loss, self._config.ssim_weight or 0.0)
+        config = self._config
+        assert config.loss is not None
+        target = self._targets.pictures(chosen).to(device)
+        loss = image_loss(image, target, config.loss, config.ssim_weight or 0.0, config.sharpness_weight or 0.0)
         self._adam.zero_grad()
-        loss.backward()
+        (loss + (config.crispness_weight or 0.0) * blending(self.texels) / (target.shape[1] * target.shape[2])).backward()
         self._adam.step()
         with torch.no_grad():
             self.texels.clamp_(0, 1)
@@ -145,7 +147,7 @@ class FusedStepper:
         pixels = len(chosen) * projection.width * projection.height
         assert config.loss is not None
         loss = PixelLoss(self._targets.packed(chosen).to(device), self._targets.shrunk is None, config.loss, 1 / pixels)
-        dissimilarity, of_image = self._dissimilarity(projection, loss) if config.ssim_weight else (0.0, None)
+        lost, of_image = self._perceived(projection, loss)
         wanted = projection.to_texel.requires_grad
         sums, of_matrices = differentiate(
             state.texels, projection, state.gradient, image_gradient=of_image, loss=loss, occupied=state.occupied, placement=wanted
@@ -156,8 +158,8 @@ class FusedStepper:
             (gradient,) = torch.autograd.grad(projection.to_texel, moved, of_matrices.to(projection.to_texel))
             self._movement.update(gradient, placement_rate)
         self.steps += 1
-        state.update(self.steps, rate)
-        return sums.sum() / pixels + dissimilarity
+        state.update(self.steps, rate, (config.crispness_weight or 0.0) / (projection.width * projection.height))
+        return sums.sum() / pixels + lost
 
     def _project(self, chosen: Sequence[int], moved: Tensor | None) -> Projection:
         """Where the chosen views see the billboards, after a movement if there is one."""
@@ -169,16 +171,27 @@ class FusedStepper:
         assert self._movement is not None and moved is not None
         return project(self._movement.placed(moved, self._cloud.texels).to(device), self._targets.cameras[list(chosen)].to(device))
 
-    def _dissimilarity(self, projection: Projection, loss: PixelLoss) -> tuple[Tensor, Tensor]:
-        """The weighted 1 - SSIM of the present picture to the loss's target, and its gradient in the picture, [B, H, W, 4]."""
+    def _perceived(self, projection: Projection, loss: PixelLoss) -> tuple[Tensor | float, Tensor | None]:
+        """What is lost in structure and sharpness against the loss's target, weighted, and its gradient in the picture, [B, H, W, 4]."""
+        from bbfit.fitting.fused_sharpness import add_sharpness_gradient
         from bbfit.fitting.fused_ssim import similarity_and_gradient
         from bbfit.rendering.fused import draw, unpacked
 
+        ssim_weight, sharpness_weight = self._config.ssim_weight or 0.0, self._config.sharpness_weight or 0.0
+        if not ssim_weight and not sharpness_weight:
+            return 0.0, None
         # Memory that is kept: fresh pages for a few large pictures a step would cost as much as drawing them.
         if self._scratch is None or self._scratch[0].shape != loss.target.shape:
             self._scratch = [torch.empty(loss.target.shape, dtype=torch.float32, device=loss.target.device) for _ in range(3)]
         image = draw(self.state.texels, projection, self.state.occupied, out=self._scratch[0])
         target = unpacked(loss.target, loss.straight, out=self._scratch[1])
-        weight = self._config.ssim_weight or 0.0
-        similarity, of_image = similarity_and_gradient(image, target, -weight, out=self._scratch[2])
-        return weight * (1 - similarity), of_image
+        lost: Tensor | float = 0.0
+        of_image = self._scratch[2]
+        if ssim_weight:
+            similarity, of_image = similarity_and_gradient(image, target, -ssim_weight, out=of_image)
+            lost = ssim_weight * (1 - similarity)
+        else:
+            of_image.zero_()
+        if sharpness_weight:
+            lost = lost + sharpness_weight * add_sharpness_gradient(image, target, sharpness_weight, of_image)
+        return lost, of_image

@@ -1,0 +1,378 @@
+"""Points where a tree is: on the triangles of its mesh, and in the visual hull of its views."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from bbfit.checks import InputError, MissingFileError
+from bbfit.fitting.points import hull_points, mesh_points, point_colours
+from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
+from bbfit.geometry.orbit import Orbit
+from bbfit.views import ViewDataset, ViewSet
+
+PLY_OF_POINTS = """ply
+format ascii 1.0
+element vertex 2
+property float x
+property float y
+property float z
+end_header
+0 0 0
+1 0 0
+"""
+DATA = Path(__file__).resolve().parents[2] / "data"
+
+
+def viewset(pictures: Tensor, cameras: Camera) -> ViewSet:
+    """Views that lie in memory, uint8 [V, H, W, 4], straight alpha."""
+    cache = type("Pictures", (), {"get": lambda self, path: pictures[int(path.name)]})()
+    return ViewSet(tuple(Path(str(index)) for index in range(len(pictures))), cameras, cache)
+
+
+def ring_around_origin(count: int, width: int, height: int, *, elevation: float = 0.0) -> Camera:
+    """Cameras whose pictures hold a cube of two metres around the origin."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    return Orbit(count, (elevation,)).frame(corners, target=torch.zeros(3, dtype=torch.float64), width=width, height=height)
+
+
+@pytest.fixture(scope="module")
+def views() -> ViewSet:
+    """The training views of the small tree."""
+    return ViewDataset.load(DATA / "views").train
+
+
+@pytest.fixture(scope="module")
+def tree() -> trimesh.Trimesh:
+    """The mesh of the small tree. Do not change it."""
+    return trimesh.load(DATA / "tree.glb", force="mesh", process=False)
+
+
+@pytest.fixture(scope="module")
+def on_mesh(views: ViewSet) -> Tensor:
+    return mesh_points(DATA / "tree.glb", views)
+
+
+@pytest.fixture(scope="module")
+def hull(views: ViewSet) -> Tensor:
+    return hull_points(views)
+
+
+@pytest.fixture(scope="module")
+def anywhere() -> ViewSet:
+    """Views that show something in every pixel, so that any mesh within a metre of the origin agrees with them."""
+    return viewset(torch.full((4, 16, 16, 4), 255, dtype=torch.uint8), ring_around_origin(4, 16, 16))
+
+
+def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
+    return trimesh.creation.box(bounds=[low, high])
+
+
+# Mesh
+
+
+def test_points_lie_on_triangles_of_the_mesh(on_mesh: Tensor, tree: trimesh.Trimesh) -> None:
+    assert on_mesh.shape == (20_000, 3) and on_mesh.dtype == torch.float64
+    triangles = np.asarray(tree.triangles)
+    for point in on_mesh[::500].numpy():
+        nearest = trimesh.triangles.closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
+        assert np.linalg.norm(nearest - point, axis=-1).min() < 1e-6  # metres; a triangle's side is about a hundredth
+
+
+def test_points_are_even_by_area(on_mesh: Tensor, tree: trimesh.Trimesh) -> None:
+    """Their mean and their shares in the eight octants about it are the area's, within four deviations of chance.
+
+    Evenly by triangle instead of by area, the mean would be 7 deviations away.
+    """
+    areas, centroids = tree.area_faces, tree.triangles_center
+    deviation = on_mesh.std(0) / len(on_mesh) ** 0.5
+    mean = torch.tensor(np.average(centroids, axis=0, weights=areas))
+    assert ((on_mesh.mean(0) - mean).abs() < 4 * deviation).all()
+    assert ((on_mesh.mean(0) - torch.tensor(centroids.mean(0))).abs() > 6 * deviation).any()
+
+    def octants(points: NDArray[np.float64]) -> NDArray[np.int64]:
+        return (points > mean.numpy()) @ np.array([1, 2, 4])
+
+    share = np.bincount(octants(centroids), areas, minlength=8) / areas.sum()
+    found = np.bincount(octants(on_mesh.numpy()), minlength=8) / len(on_mesh)
+    assert (np.abs(found - share) < 4 * np.sqrt(share / len(on_mesh)) + 2e-3).all()  # and what triangles across a border may add
+
+
+def test_every_face_of_a_box_gets_its_share(anywhere: ViewSet, tmp_path: Path) -> None:
+    low, high = np.array([-0.1, 0.0, -0.6]), np.array([0.2, 0.5, 0.5])
+    box(tuple(low), tuple(high)).export(tmp_path / "box.glb")
+    count = 6000
+    points = mesh_points(tmp_path / "box.glb", anywhere, count=count).numpy()
+    assert points.shape == (count, 3)
+    faces = np.abs(np.concatenate([points - low, points - high], -1)) < 1e-6
+    assert (faces.sum(-1) == 1).all() and (points > low - 1e-6).all() and (points < high + 1e-6).all()
+    sides = high - low
+    share = np.tile(sides.prod() / sides, 2) / (2 * sides.prod() * (1 / sides).sum())
+    assert (np.abs(faces.mean(0) - share) < 4 * np.sqrt(share / count)).all()
+
+
+def test_points_of_a_mesh_are_seeded(on_mesh: Tensor, views: ViewSet) -> None:
+    assert torch.equal(mesh_points(DATA / "tree.glb", views, seed=0), on_mesh)
+    other = mesh_points(DATA / "tree.glb", views, seed=1)
+    assert not (other[:, None] == on_mesh[None, :100]).all(-1).any()
+
+
+@pytest.mark.parametrize("name", ["tree.glb", "tree.gltf", "tree.obj", "tree.ply", "tree.stl", "TREE.STL"])
+def test_z_up_files_are_turned_and_others_are_not(anywhere: ViewSet, tmp_path: Path, name: str) -> None:
+    """Up in PLY and STL files is z: (x, y, z) there is (x, z, -y) in the world."""
+    mesh, ending = box((0.0, 0.2, 0.6), (0.1, 0.5, 0.9)), name[-4:].lower().lstrip(".")
+    if ending == "gltf":  # several files
+        for part, data in trimesh.exchange.gltf.export_gltf(mesh.scene()).items():
+            (tmp_path / part.replace("model", "tree")).write_bytes(data)
+    else:
+        mesh.export(tmp_path / name, file_type=ending)
+    points = mesh_points(tmp_path / name, anywhere, count=500)
+    low, high = ((0.0, 0.6, -0.5), (0.1, 0.9, -0.2)) if ending in ("ply", "stl") else ((0.0, 0.2, 0.6), (0.1, 0.5, 0.9))
+    torch.testing.assert_close(points.amin(0), torch.tensor(low, dtype=torch.float64), atol=0.01, rtol=0)
+    torch.testing.assert_close(points.amax(0), torch.tensor(high, dtype=torch.float64), atol=0.01, rtol=0)
+
+
+def test_all_meshes_of_a_scene_count_where_the_scene_puts_them(anywhere: ViewSet, tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    for name, shift in (("trunk", [0.0, -0.5, 0.0]), ("crown", [0.0, 0.5, 0.25])):
+        cube = box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1))
+        scene.add_geometry(cube, geom_name=name, transform=trimesh.transformations.translation_matrix(shift))
+    scene.export(tmp_path / "tree.glb")
+    points = mesh_points(tmp_path / "tree.glb", anywhere, count=500)
+    crown = points[:, 1] > 0
+    assert 150 < int(crown.sum()) < 350
+    assert ((points[crown] - torch.tensor([0.0, 0.5, 0.25])).abs() < 0.1 + 1e-6).all()
+    assert ((points[~crown] - torch.tensor([0.0, -0.5, 0.0])).abs() < 0.1 + 1e-6).all()
+
+
+def test_a_missing_mesh_is_said_to_be_missing(views: ViewSet, tmp_path: Path) -> None:
+    with pytest.raises(MissingFileError, match=r"^tree: .*tree\.glb does not exist"):
+        mesh_points(tmp_path / "tree.glb", views)
+
+
+@pytest.mark.parametrize("ending", ["fbx", "blend", "usdz", "txt"])
+def test_what_only_blender_reads_is_refused(views: ViewSet, tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"tree.{ending}"
+    path.write_bytes(b"Kaydara FBX Binary")
+    with pytest.raises(InputError, match=rf"^tree: .*tree\.{ending} .*only Blender.*\.glb \.gltf \.obj \.ply \.stl"):
+        mesh_points(path, views)
+
+
+@pytest.mark.parametrize("spoil", ["cut short", "no glTF at all", "empty"])
+def test_a_damaged_mesh_is_refused(views: ViewSet, tmp_path: Path, spoil: str) -> None:
+    path, data = tmp_path / "tree.glb", (DATA / "tree.glb").read_bytes()
+    path.write_bytes({"cut short": data[: len(data) // 2], "no glTF at all": bytes(range(256)), "empty": b""}[spoil])
+    with pytest.raises(InputError, match=r"^tree: .*tree\.glb " + ("is empty" if spoil == "empty" else "cannot be read")):
+        mesh_points(path, views)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("points.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n"),
+        ("flat.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"),  # a triangle without an area
+        ("points.ply", PLY_OF_POINTS),
+    ],
+)
+def test_a_mesh_without_triangles_is_refused(views: ViewSet, tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text, encoding="ascii")
+    with pytest.raises(InputError, match=rf"^tree: .*{name} has no triangles"):
+        mesh_points(tmp_path / name, views)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda mesh: mesh.apply_translation([1.0, 0.0, 0.0]),
+        lambda mesh: mesh.apply_translation([0.0, 1.0, 0.0]),
+        lambda mesh: mesh.apply_scale(2.0),
+        lambda mesh: mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi, [0, 1, 0])),
+        lambda mesh: mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])),
+    ],
+    ids=["beside", "above", "twice as large", "turned round", "lying down"],
+)
+def test_a_mesh_that_the_views_do_not_show_is_refused(
+    views: ViewSet, tree: trimesh.Trimesh, tmp_path: Path, change: Callable[[trimesh.Trimesh], object]
+) -> None:
+    other = tree.copy()
+    change(other)
+    other.export(tmp_path / "other.glb")
+    with pytest.raises(InputError, match=r"^tree: .*other\.glb is not where the views show a tree"):
+        mesh_points(tmp_path / "other.glb", views)
+
+
+def test_a_mesh_of_another_tree_is_refused(views: ViewSet, tree: trimesh.Trimesh, tmp_path: Path) -> None:
+    """A dense crown of the same width and height, since its outline is fuller than the tree's."""
+    box(*(tuple(corner) for corner in tree.bounds)).export(tmp_path / "other.glb")
+    with pytest.raises(InputError, match="is not where the views show a tree"):
+        mesh_points(tmp_path / "other.glb", views)
+
+
+# Hull
+
+
+def on_background(points: Tensor, views: ViewSet, index: int) -> Tensor:
+    """Which points lie in a pixel of one view that is fully transparent."""
+    pixels = views.cameras[index].project(points)
+    assert pixels.isfinite().all()
+    x, y = (pixels + 0.5).floor().long().unbind(-1)
+    alpha = torch.nn.functional.pad(views.image(index)[..., 3], (1, 1, 1, 1), value=255)  # beyond a picture nobody knows
+    return alpha[(y + 1).clamp(0, alpha.shape[0] - 1), (x + 1).clamp(0, alpha.shape[1] - 1)] == 0
+
+
+def test_no_view_shows_background_where_the_hull_is(hull: Tensor, on_mesh: Tensor, views: ViewSet) -> None:
+    assert hull.shape == (20_000, 3) and hull.dtype == torch.float64
+    assert not any(on_background(hull, views, index).any() for index in range(len(views)))
+    assert any(on_background(hull + torch.tensor([0.05, 0.0, 0.0]), views, index).any() for index in range(len(views)))
+
+
+def test_the_hull_holds_the_tree(hull: Tensor, on_mesh: Tensor) -> None:
+    """19 of 20 points of the mesh have one of the hull's within 7 cm (measured: 5.7), of a tree of 4.3 m; moved by 30 cm they have not."""
+    reach = [float(np.quantile(cKDTree(points.numpy()).query(on_mesh.numpy())[0], 0.95)) for points in (hull, hull + 0.3)]
+    assert reach[0] < 0.07 < 0.14 < reach[1], reach
+    low, high = on_mesh.amin(0), on_mesh.amax(0)
+    assert (hull.amin(0) < low + 0.1).all() and (hull.amax(0) > high - 0.1).all()
+
+
+def test_points_of_the_hull_are_seeded(hull: Tensor, views: ViewSet) -> None:
+    assert torch.equal(hull_points(views, seed=0), hull)
+    other = hull_points(views, seed=1, count=500)
+    assert other.shape == (500, 3)
+    assert not (other[:, None] == hull[None, :1000]).all(-1).any()
+
+
+def ball_views(count: int, width: int, height: int, radius: float, *, elevation: float = 0.0) -> ViewSet:
+    """Exact silhouettes of a ball about the origin."""
+    cameras = ring_around_origin(count, width, height, elevation=elevation)
+    y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    rays = torch.stack([x, y, torch.ones_like(x)], -1) @ torch.linalg.inv(cameras.intrinsics[0]).mT
+    distance = float(cameras.position[0].norm())
+    sine = rays[..., :2].norm(dim=-1) / rays.norm(dim=-1)  # every camera looks straight at the ball
+    mask = (sine <= radius / distance).to(torch.uint8) * 255
+    return viewset(mask[None, ..., None].expand(count, -1, -1, 4), cameras)
+
+
+BEYOND_ALL_PICTURES = pytest.mark.xfail(strict=True, reason="what lies beyond the edges of all pictures is taken for the tree")
+
+
+@pytest.mark.parametrize(
+    ("width", "height"),
+    [
+        (64, 64),
+        (48, 64),
+        pytest.param(64, 48, marks=BEYOND_ALL_PICTURES),
+        (512, 600),
+    ],
+)
+def test_the_hull_of_a_ball_is_little_more_than_the_ball(width: int, height: int) -> None:
+    """Also where pictures are so large that they are carved from shrunk ones, and where they are not square.
+
+    What twelve cameras at its height leave of the ball is a round-edged prism of at most 24 sides around it.
+    """
+    radius = 0.7
+    points = hull_points(ball_views(12, width, height, radius), count=4000)
+    assert len(points) == 4000
+    pixel = 2 / min(min(width, height), 256)  # metres, of the pictures that are carved from
+    across, up = points[:, ::2].norm(dim=-1), points[:, 1].abs()
+    assert radius - 0.05 < across.max() < radius / math.cos(math.pi / 12) + pixel
+    assert radius - 0.1 < up.max() < radius * 1.03 + pixel  # a cone around the ball is a little higher above its middle
+    # Even: half of the ball's volume lies within radius / 2 ** (1 / 3) of its middle, and on either side of each plane through it.
+    inner = points[points.norm(dim=-1) < radius]
+    allowed = 4 * 0.5 / len(inner) ** 0.5
+    assert len(inner) > 2000
+    assert abs(float((inner.norm(dim=-1) < radius * 0.5 ** (1 / 3)).double().mean()) - 0.5) < allowed
+    assert ((inner > 0).double().mean(0) - 0.5).abs().max() < allowed
+
+
+def test_nothing_is_lost_of_silhouettes_that_are_shrunk() -> None:
+    """Pictures are carved at half their size; one pixel in every block of four is as good as all of them."""
+    small = ball_views(4, 256, 256, 0.5)
+    mask = small.images(range(4))
+    full = mask.repeat_interleave(2, 1).repeat_interleave(2, 2)
+    dots = full.clone()
+    dots[:, ::2] = 0
+    dots[:, :, ::2] = 0
+    cameras = small.cameras.resized(512, 512)
+    whole, dotted, expected = (hull_points(views, count=500) for views in (viewset(full, cameras), viewset(dots, cameras), small))
+    assert torch.equal(whole, dotted)
+    torch.testing.assert_close(whole, expected, atol=1e-9, rtol=0)
+
+
+def test_a_hull_that_few_points_hit_is_found_in_several_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One in a hundred of the first round lies in this ball; later rounds look around where these were, and as evenly."""
+    monkeypatch.setattr("bbfit.fitting.points._CARVED", 1 << 14)
+    radius = 0.3
+    points = hull_points(ball_views(12, 64, 64, radius), count=4000)
+    assert len(points) == 4000
+    low, high = points.amin(0), points.amax(0)
+    assert (low < -radius + 0.03).all() and (high > radius - 0.03).all()
+    assert points.mean(0).abs().max() < 4 * float(points.std(0).max()) / 4000**0.5
+    inner = points[points.norm(dim=-1) < radius]
+    assert abs(float((inner.norm(dim=-1) < radius * 0.5 ** (1 / 3)).double().mean()) - 0.5) < 4 * 0.5 / len(inner) ** 0.5
+
+
+@pytest.mark.parametrize("elevation", [pytest.param(-30.0, marks=BEYOND_ALL_PICTURES), pytest.param(20.0, marks=BEYOND_ALL_PICTURES)])
+def test_seen_from_above_or_below_the_hull_of_a_ball_is_not_much_more_either(elevation: float) -> None:
+    """The cones of one ring of cameras meet in a tip above and below the ball, at its radius divided by the elevation's cosine."""
+    radius = 0.9
+    points = hull_points(ball_views(12, 64, 64, radius, elevation=elevation), count=4000)
+    assert radius < points.norm(dim=-1).max() < 1.1 * radius / math.cos(math.radians(elevation))
+
+
+def test_silhouettes_that_contradict_each_other_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing can be on the left from all sides."""
+    monkeypatch.setattr("bbfit.fitting.points._CARVED", 1 << 16)  # sixteen vain rounds take a while
+    pictures = torch.zeros(4, 32, 32, 4, dtype=torch.uint8)
+    pictures[:, 8:24, 2:10] = 255
+    with pytest.raises(InputError, match=r"^views: .*no point in common"):
+        hull_points(viewset(pictures, ring_around_origin(4, 32, 32)))
+
+
+# Colours
+
+
+def colour_scene() -> tuple[Tensor, ViewSet, Tensor]:
+    """Points one above another on the ring's axis, so that each keeps its row in all four views, the views, and pictures with nothing."""
+    cameras = ring_around_origin(4, 32, 32)
+    points = torch.tensor([[0.0, y, 0.0] for y in (-0.6, 0.0, 0.6)], dtype=torch.float64)
+    return points, viewset(torch.zeros(4, 32, 32, 4, dtype=torch.uint8), cameras), torch.zeros(4, 32, 32, 4)
+
+
+def paint(pictures: Tensor, camera: Camera, view: int, point: Tensor, straight: tuple[float, float, float], alpha: float) -> None:
+    """Give the pixel of a point a premultiplied colour in one view."""
+    x, y = (camera[view].project(point[None])[0] + 0.5).floor().long().tolist()
+    pictures[view, y, x] = torch.tensor([*(alpha * c for c in straight), alpha])
+
+
+def test_a_points_colour_is_the_mean_of_what_the_views_show_weighted_by_alpha() -> None:
+    points, views, pictures = colour_scene()
+    red, blue = (0.8, 0.1, 0.0), (0.0, 0.3, 0.9)
+    for view, alpha in enumerate((1.0, 0.5, 0.25, 0.01)):
+        paint(pictures, views.cameras, view, points[0], red, alpha)
+    for view, colour, alpha in ((0, red, 0.25), (2, blue, 0.75)):  # and background in the other two, which has no say
+        paint(pictures, views.cameras, view, points[1], colour, alpha)
+    colours = point_colours(points, views, views.cameras, pictures)
+    assert colours.dtype == torch.float32
+    expected = torch.tensor([red, tuple(0.25 * r + 0.75 * b for r, b in zip(red, blue, strict=True)), (0.0, 0.0, 0.0)])
+    torch.testing.assert_close(colours, expected, atol=1e-5, rtol=0)
+
+
+def test_views_that_do_not_see_a_point_have_no_say() -> None:
+    """Beyond a picture's edge, and behind a camera."""
+    pose = look_at(torch.tensor([[0.0, 0, 1], [0, 0, -3], [0, 0, 3]]).double(), torch.zeros(3).double())
+    pose[1, 0, 3] += 3.0  # its picture lies to the side of everything
+    cameras = Camera(pose, pinhole_intrinsics(40, 16, 16).repeat(3, 1, 1), 16, 16)
+    pictures = torch.ones(3, 16, 16, 4) * torch.tensor([[1.0, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]])[:, None, None]
+    views = viewset(torch.zeros(3, 16, 16, 4, dtype=torch.uint8), cameras)
+    points = torch.tensor([[0.0, 0, 0], [0, 0, 2], [0, 50, 0]], dtype=torch.float64)  # the second is behind the first camera
+    colours = point_colours(points, views, cameras, pictures)
+    torch.testing.assert_close(colours, torch.tensor([[0.5, 0, 0.5], [0, 0, 1], [0, 0, 0]]), atol=1e-6, rtol=0)
