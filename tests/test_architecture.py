@@ -45,7 +45,7 @@ ONLY_IN = {
     "xatlas": {"exporting/atlas.py"},
     "warp": {
         *(f"rendering/{name}.py" for name in ("launching", "sampling", "kernels", "fused")),
-        *(f"fitting/{name}.py" for name in ("adam", "fused_ssim", "ssim_kernels")),
+        *(f"fitting/{name}.py" for name in ("adam", "fused_sharpness", "fused_ssim", "ssim_kernels")),
     },
     "ray": {"sweep.py"},
 }

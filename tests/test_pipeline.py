@@ -20,7 +20,7 @@ from bbfit.images import read_rgba
 from bbfit.pipeline import RunConfig, RunResult, run
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
-CONFIG = RunConfig(fit=FitConfig(billboards=2, steps=20, checkpoint_every=5))
+CONFIG = RunConfig(fit=FitConfig(billboards=2, candidates=2, relocations=0, steps=20, checkpoint_every=5))
 FILES = ("cloud.safetensors", "comparison.png", "loss.csv", "loss.png", "metrics.json", "run.json")
 MODELS = ("model.glb", "model.mtl", "model.obj", "model.png")
 
@@ -141,7 +141,9 @@ def test_out_must_be_a_folder_that_can_be_written(views_folder: Path, tmp_path: 
 
 def test_from_a_tree_to_a_model(tmp_path: Path) -> None:
     """The whole job with Blender, on the tree that comes with bbfit; a second run does nothing."""
-    config = RunConfig(views=ViewsConfig(count=8, size=48, samples=2, denoise=False), fit=FitConfig(billboards=2, steps=10))
+    config = RunConfig(
+        views=ViewsConfig(count=8, size=48, samples=2, denoise=False), fit=FitConfig(billboards=2, candidates=2, relocations=0, steps=10)
+    )
     told = []
     run(TREE, tmp_path, config, on_progress=lambda stage, done, total, note="": told.append((stage, done, total)))
     assert [event for event in told if event[0] == "views"] == [("views", done, 8) for done in range(9)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -17,6 +18,8 @@ from bbfit.views import ViewSet
 _OBLIQUE = math.cos(math.radians(60))
 # Alpha from which a texel counts as being something.
 _OPAQUE = 0.05
+# Alpha that does not round to 0 in 8 bits.
+_VISIBLE = 0.5 / 255
 # Billboards whose cosines differ by less face a view equally well.
 _TIE = 1e-3
 
@@ -91,6 +94,30 @@ def opaque_bounds(cloud: BillboardCloud) -> Tensor:
     return torch.stack(bounds)
 
 
+def trimmed(cloud: BillboardCloud) -> BillboardCloud:
+    """The same picture with rectangles cut, texel by texel, to what eight bits of alpha show of them, and a margin of one texel."""
+    parts, middles, texels, sizes = [], [], [], []
+    for texture in cloud.textures():
+        mask = (texture[..., 3].amax(0) >= _VISIBLE).numpy().astype(np.uint8)
+        x, y, width, height = cv2.boundingRect(mask)
+        left, top = max(x - 1, 0), max(y - 1, 0)
+        right, bottom = min(x + width + 1, mask.shape[1]), min(y + height + 1, mask.shape[0])
+        if not width:
+            left, top, right, bottom = 0, 0, 1, 1
+        parts.append([(right - left) / mask.shape[1], (bottom - top) / mask.shape[0]])
+        middles.append([(left + right) / mask.shape[1] - 1, 1 - (top + bottom) / mask.shape[0]])
+        sizes.append([bottom - top, right - left])
+        texels.append(texture[:, top:bottom, left:right].reshape(-1, 4))
+    middle = torch.tensor(middles, dtype=cloud.centers.dtype) * cloud.half_extents
+    return replace(
+        cloud,
+        centers=cloud.centers + middle[:, :1] * cloud.rights + middle[:, 1:] * cloud.ups,
+        half_extents=cloud.half_extents * torch.tensor(parts, dtype=cloud.half_extents.dtype),
+        texture_sizes=torch.tensor(sizes),
+        texels=torch.cat(texels),
+    )
+
+
 def _union(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(torch.tensor([True, False, True, False]), torch.minimum(a, b), torch.maximum(a, b))
 
@@ -129,10 +156,10 @@ def smallest_rectangle(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     low, high = points.amin(0), points.amax(0)
     upright = torch.tensor([1.0, 0.0], dtype=points.dtype)
     (x, y), (width, height), degrees = cv2.minAreaRect(points.float().numpy())
-    if width * height > 0.8 * float((high - low).prod()):
+    if width * height >= 0.8 * float((high - low).prod()):
         return (low + high) / 2, upright, (high - low) / 2
-    if degrees > 45:
-        width, height, degrees = height, width, degrees - 90
+    while abs(degrees) > 45:
+        width, height, degrees = height, width, degrees - math.copysign(90, degrees)
     turn = math.radians(degrees)
     axis = torch.tensor([math.cos(turn), math.sin(turn)], dtype=points.dtype)
     return torch.tensor([x, y], dtype=points.dtype), axis, torch.tensor([width / 2, height / 2], dtype=points.dtype)

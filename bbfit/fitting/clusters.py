@@ -125,7 +125,7 @@ def rectangles(points: Tensor, planes: Planes, texels_a_metre: float, margin: fl
             halves,
             torch.ones(len(centers), 2, dtype=torch.int64),
             torch.full((len(centers),), two_sided),
-            torch.zeros(len(centers), 4),
+            torch.zeros(len(centers) * (1 + two_sided), 4),
         ),
         texels_a_metre,
     )

@@ -65,14 +65,16 @@ def resize_textures(cloud: BillboardCloud, sizes: Tensor) -> BillboardCloud:
 
     The colour of what is fully transparent is filtered as it is, since a fit goes on from it.
     """
-    textures = []
-    for texture, size in zip(cloud.textures(), sizes.tolist(), strict=True):
-        shrinks = size[0] <= texture.shape[1] and size[1] <= texture.shape[2]
-        both = torch.cat([premultiply(texture), texture], -1).permute(0, 3, 1, 2)
-        both = interpolate(both, size, mode="area" if shrinks else "bilinear").permute(0, 2, 3, 1)
-        filtered = torch.where(both[..., 3:4] > 1e-3, unpremultiply(both[..., :4]), both[..., 4:])
-        textures.append(filtered.reshape(-1, 4))
+    textures = [_resized(texture, size).reshape(-1, 4) for texture, size in zip(cloud.textures(), sizes.tolist(), strict=True)]
     return replace(cloud, texture_sizes=sizes, texels=torch.cat(textures))
+
+
+def _resized(texture: Tensor, size: list[int]) -> Tensor:
+    """Textures of one billboard, [S, h, w, 4], in another size."""
+    shrinks = size[0] <= texture.shape[1] and size[1] <= texture.shape[2]
+    both = torch.cat([premultiply(texture), texture], -1).permute(0, 3, 1, 2)
+    both = interpolate(both, size, mode="area" if shrinks else "bilinear").permute(0, 2, 3, 1)
+    return torch.where(both[..., 3:4] > 1e-3, unpremultiply(both[..., :4]), both[..., 4:])
 
 
 def resampled(cloud: BillboardCloud, onto: BillboardCloud, sizes: Tensor) -> BillboardCloud:
@@ -86,9 +88,13 @@ def resampled(cloud: BillboardCloud, onto: BillboardCloud, sizes: Tensor) -> Bil
         return resize_textures(cloud, sizes)
     textures = []
     for n, (texture, size) in enumerate(zip(cloud.textures(), sizes.tolist(), strict=True)):
+        scale = onto.half_extents[n] / cloud.half_extents[n]
+        finer = torch.tensor(texture.shape[1:3]) * scale.flip(0) / torch.tensor(size)  # texels of the old one to a new one, down and across
+        if float(finer.amax()) > 1:
+            coarse = [max(1, round(count / max(1.0, float(more)))) for count, more in zip(texture.shape[1:3], finer, strict=True)]
+            texture = _resized(texture, coarse)
         shift = onto.centers[n] - cloud.centers[n]
         across = torch.stack([shift @ cloud.rights[n], -shift @ cloud.ups[n]]) / cloud.half_extents[n]  # middle of the new one in [-1, 1]
-        scale = onto.half_extents[n] / cloud.half_extents[n]
         steps = [(2 * torch.arange(count, dtype=torch.float64) + 1) / count - 1 for count in size]
         grid = torch.stack(torch.meshgrid(across[1] + scale[1] * steps[0], across[0] + scale[0] * steps[1], indexing="ij")[::-1], -1)
         grid = grid[None].expand(len(texture), -1, -1, -1).to(texture)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bbfit.checks import InputTypeError, check_file, fail
 from bbfit.files import write_tensors
-from bbfit.fitting.bounds import opaque_bounds
+from bbfit.fitting.bounds import opaque_bounds, trimmed
 from bbfit.fitting.clusters import sized
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import bounded, pixels_a_metre, random_textures, start_cloud, tree_radius
@@ -157,7 +157,8 @@ def fit(
     assert fitted is not None
     # No view determines the colour of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
     bled = [bleed_colour(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
-    return FitResult(fitted.with_texels(torch.cat(bled)), losses, config, time.perf_counter() - begun)
+    fitted = fitted.with_texels(torch.cat(bled))
+    return FitResult(fitted if config.placement == "even" else trimmed(fitted), losses, config, time.perf_counter() - begun)
 
 
 def _begin(views: ViewDataset, config: FitConfig, tree: str | Path | None, on_place: Callable[[int, int], None] | None) -> _Progress:
@@ -238,7 +239,7 @@ def _save(path: Path, mark: str, progress: _Progress) -> None:
     for prefix, cloud in {_START: progress.start, _FOUND: progress.found}.items():
         for field in fields(cloud) if cloud is not None else ():
             if prefix == _FOUND or field.name != "texels":
-                tensors[prefix + field.name] = getattr(cloud, field.name).contiguous()
+                tensors[prefix + field.name] = getattr(cloud, field.name).clone()  # no two may share memory
     write_tensors(path, tensors, {"fit": mark, "seconds": repr(progress.seconds)})
 
 

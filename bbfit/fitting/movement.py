@@ -61,11 +61,11 @@ class Movement:
 
     def tensors(self) -> dict[str, Tensor]:
         """All that changes from step to step."""
-        return {"movement": self._kept}
+        return {"movement": self._kept, "movement_steps": torch.tensor([self._steps])}
 
-    def restore(self, tensors: dict[str, Tensor], steps: int) -> None:
-        """Go on from :meth:`tensors` as they were after so many steps."""
-        self._kept, self._steps = tensors["movement"].clone(), steps
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from :meth:`tensors`."""
+        self._kept, self._steps = tensors["movement"].clone(), int(tensors["movement_steps"])
 
 
 def _cross_matrices(vectors: Tensor) -> Tensor:

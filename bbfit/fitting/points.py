@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from bbfit.blender.sources import UP_AXIS
-from bbfit.checks import check_file, fail
+from bbfit.blender.sources import UP_AXIS, check_tree
+from bbfit.checks import fail
 from bbfit.fitting.initialize import pixels_a_metre
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, convergence_point
 from bbfit.views import ViewSet
@@ -20,7 +20,7 @@ COUNT = 20_000
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 """Endings of tree files whose triangles can be read without Blender."""
 # Points of a mesh that must lie on the tree in a training view, on average, for the two to belong together.
-_AGREEMENT = 0.7
+_AGREEMENT = 0.95
 # Random points that the hull is carved from at a time, and how often at most.
 _CARVED, _ROUNDS = 1 << 20, 16
 # Side of the silhouettes that the hull is carved with, in pixels, at least.
@@ -42,12 +42,12 @@ def mesh_points(path: str | Path, views: ViewSet, *, count: int = COUNT, seed: i
     """
     import trimesh
 
-    path = check_file("tree", path)
+    path = check_tree(path)[0]
     if path.suffix.lower() not in MESH_SUFFIXES:
         fail("tree", f"{path} has triangles that only Blender can read", f"give one of {' '.join(MESH_SUFFIXES)}, or no tree")
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # whatever a damaged file makes trimesh raise
+    except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:
         fail("tree", f"{path} cannot be read ({error})", "expected a mesh")
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not mesh.area > 0:
         fail("tree", f"{path} has no triangles", "expected a mesh")
@@ -55,8 +55,11 @@ def mesh_points(path: str | Path, views: ViewSet, *, count: int = COUNT, seed: i
     points = torch.tensor(sampled, dtype=torch.float64)
     if UP_AXIS[path.suffix.lower()] == "z":
         points = points @ torch.tensor(Z_UP_TO_Y_UP, dtype=torch.float64)[:3, :3].mT
-    chosen = range(0, len(views), max(1, len(views) // 8))
-    seen = [_inside(points, views.cameras[i], views.targets([i])[0, ..., 3] > 0).double().mean() for i in chosen]
+    seen = []
+    for index in range(0, len(views), max(1, len(views) // 8)):
+        # A pixel more on every side, since thin parts can be missed by a pixel's few samples.
+        mask = max_pool2d((views.image(index)[..., 3] > 0).float()[None], 3, 1, 1)[0] > 0
+        seen.append(_inside(points, views.cameras[index], mask, beyond=True).double().mean())
     if float(torch.stack(seen).mean()) < _AGREEMENT:
         fail("tree", f"{path} is not where the views show a tree", "give the mesh that they were rendered from, or no mesh")
     return points
@@ -77,6 +80,8 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
     for index in range(len(views)):
         alpha = (views.image(index)[..., 3] > 0).float()
         masks.append(max_pool2d(alpha[None], side, ceil_mode=True)[0] > 0)
+    # Beyond the picture there is nothing either, unless the tree is cut off by its border.
+    cropped = [bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()) for mask in masks]
     cameras = cameras.resized(masks[0].shape[1], masks[0].shape[0])
     centre, extent = convergence_point(cameras), max(cameras.width, cameras.height) / float(pixels_a_metre(cameras))
     low, high = centre - extent / 2, centre + extent / 2
@@ -84,7 +89,7 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
     for _ in range(_ROUNDS):
         points = low + (high - low) * torch.rand(_CARVED, 3, dtype=torch.float64, generator=generator)
         for index, mask in enumerate(masks):
-            points = points[_inside(points, cameras[index], mask, beyond=True)]
+            points = points[_inside(points, cameras[index], mask, beyond=cropped[index])]
         found.append(points)
         if sum(map(len, found)) >= count:
             break

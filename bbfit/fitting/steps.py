@@ -72,7 +72,7 @@ class ReferenceStepper:
         """See :class:`Stepper`."""
         self._start(tensors["texels"], tensors["first_moment"], tensors["second_moment"], steps)
         if self._movement:
-            self._movement.restore(tensors, steps)
+            self._movement.restore(tensors)
 
     @property
     def cloud(self) -> BillboardCloud:
@@ -85,8 +85,8 @@ class ReferenceStepper:
         device = self.texels.device
         self._adam.param_groups[0]["lr"] = rate
         cloud, moved = self._cloud.with_texels(self.texels), None
-        if self._movement and placement_rate:
-            moved = self._movement.parameters.clone().requires_grad_()
+        if self._movement:
+            moved = self._movement.parameters.clone().requires_grad_(bool(placement_rate))
             cloud = self._movement.placed(moved, self.texels).to(torch.float32).to(device)
         image = render_reference(cloud, self._targets.cameras[list(chosen)].to(device))
         config = self._config
@@ -98,8 +98,8 @@ class ReferenceStepper:
         self._adam.step()
         with torch.no_grad():
             self.texels.clamp_(0, 1)
-        if moved is not None:
-            assert self._movement is not None and moved.grad is not None
+        if moved is not None and moved.grad is not None:
+            assert self._movement is not None
             self._movement.update(moved.grad, placement_rate)
         return loss.detach()
 
@@ -135,7 +135,7 @@ class FusedStepper:
         """See :class:`Stepper`."""
         self.state, self.steps = self.state.restored({name: tensors[name] for name in self.state.tensors()}), steps
         if self._movement:
-            self._movement.restore(tensors, steps)
+            self._movement.restore(tensors)
 
     def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0) -> Tensor:
         """See :class:`Stepper`."""

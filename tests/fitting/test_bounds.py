@@ -224,16 +224,13 @@ def test_the_smallest_rectangle_holds_all_points_and_is_turned_if_that_makes_it_
     assert 3 < turned < 30
 
 
-TURNED_FOR_NOTHING = pytest.mark.xfail(strict=True, reason="of points in a row OpenCV's angles are others, and no rectangle is smaller")
-
-
 @pytest.mark.parametrize(
     "points",
     [
         [[0.3, 0.7]],
-        pytest.param([[0.0, 0.0], [2.0, 0.0], [1.0, 0.0]], marks=TURNED_FOR_NOTHING),
-        pytest.param([[0.0, 0.0], [0.0, 2.0]], marks=TURNED_FOR_NOTHING),
-        pytest.param([[0.0, 0.0], [1.0, 1.0]], marks=TURNED_FOR_NOTHING),
+        pytest.param([[0.0, 0.0], [2.0, 0.0], [1.0, 0.0]]),
+        pytest.param([[0.0, 0.0], [0.0, 2.0]]),
+        pytest.param([[0.0, 0.0], [1.0, 1.0]]),
         [[0.0, 0.0], [1.0, -1.0]],
     ],
     ids=["one", "along x", "along y", "rising", "falling"],

@@ -189,7 +189,7 @@ def test_going_on_from_what_was_kept_is_going_on() -> None:
         first.update(gradient_of(step), rate_of(step))
     kept = {name: tensor.clone() for name, tensor in first.tensors().items()}
     resumed = Movement(cloud, REACH)
-    resumed.restore(kept, 11)
+    resumed.restore(kept)
     given = {name: tensor.clone() for name, tensor in kept.items()}
     for step in range(11, 30):
         resumed.update(gradient_of(step), rate_of(step))
@@ -198,7 +198,7 @@ def test_going_on_from_what_was_kept_is_going_on() -> None:
         assert torch.equal(resumed.tensors()[name], tensor), name
         assert torch.equal(kept[name], given[name])  # what was kept does not follow
     wrong = Movement(cloud, REACH)
-    wrong.restore(kept, 0)
+    wrong.restore(kept | {"movement_steps": torch.tensor([0])})
     for step in range(11, 30):
         wrong.update(gradient_of(step), rate_of(step))
     assert not torch.equal(wrong.parameters, whole.parameters)  # the number of steps matters

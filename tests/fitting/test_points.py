@@ -159,7 +159,7 @@ def test_a_missing_mesh_is_said_to_be_missing(views: ViewSet, tmp_path: Path) ->
         mesh_points(tmp_path / "tree.glb", views)
 
 
-@pytest.mark.parametrize("ending", ["fbx", "blend", "usdz", "txt"])
+@pytest.mark.parametrize("ending", ["fbx", "blend", "usdz"])
 def test_what_only_blender_reads_is_refused(views: ViewSet, tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"tree.{ending}"
     path.write_bytes(b"Kaydara FBX Binary")
@@ -171,7 +171,9 @@ def test_what_only_blender_reads_is_refused(views: ViewSet, tmp_path: Path, endi
 def test_a_damaged_mesh_is_refused(views: ViewSet, tmp_path: Path, spoil: str) -> None:
     path, data = tmp_path / "tree.glb", (DATA / "tree.glb").read_bytes()
     path.write_bytes({"cut short": data[: len(data) // 2], "no glTF at all": bytes(range(256)), "empty": b""}[spoil])
-    with pytest.raises(InputError, match=r"^tree: .*tree\.glb " + ("is empty" if spoil == "empty" else "cannot be read")):
+    with pytest.raises(
+        InputError, match=r"^tree: .*tree\.glb " + {"cut short": "is cut short", "no glTF at all": "is no glTF", "empty": "is empty"}[spoil]
+    ):
         mesh_points(path, views)
 
 
@@ -261,15 +263,12 @@ def ball_views(count: int, width: int, height: int, radius: float, *, elevation:
     return viewset(mask[None, ..., None].expand(count, -1, -1, 4), cameras)
 
 
-BEYOND_ALL_PICTURES = pytest.mark.xfail(strict=True, reason="what lies beyond the edges of all pictures is taken for the tree")
-
-
 @pytest.mark.parametrize(
     ("width", "height"),
     [
         (64, 64),
         (48, 64),
-        pytest.param(64, 48, marks=BEYOND_ALL_PICTURES),
+        pytest.param(64, 48),
         (512, 600),
     ],
 )
@@ -320,7 +319,7 @@ def test_a_hull_that_few_points_hit_is_found_in_several_rounds(monkeypatch: pyte
     assert abs(float((inner.norm(dim=-1) < radius * 0.5 ** (1 / 3)).double().mean()) - 0.5) < 4 * 0.5 / len(inner) ** 0.5
 
 
-@pytest.mark.parametrize("elevation", [pytest.param(-30.0, marks=BEYOND_ALL_PICTURES), pytest.param(20.0, marks=BEYOND_ALL_PICTURES)])
+@pytest.mark.parametrize("elevation", [pytest.param(-30.0), pytest.param(20.0)])
 def test_seen_from_above_or_below_the_hull_of_a_ball_is_not_much_more_either(elevation: float) -> None:
     """The cones of one ring of cameras meet in a tip above and below the ball, at its radius divided by the elevation's cosine."""
     radius = 0.9
