@@ -21,6 +21,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "billboards": 8,
         "placement": "clusters",
         "placement_rate": 0.015,
+        "texel_density": 1.5,
         "bounds": "silhouette",
         "loss": "backgrounds",
         "ssim_weight": 0.02,
@@ -37,6 +38,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "billboards": 4,
         "placement": "even",
         "placement_rate": 0.0,
+        "texel_density": 1.0,
         "bounds": "viewport",
         "loss": "l2",
         "ssim_weight": 0.0,
@@ -76,8 +78,8 @@ class FitConfig:
     bounds: Bounds | None = None
     """Evenly placed rectangles that cover the viewport (viewport), the silhouette in the facing view (thesis) or the silhouettes in all
     training views (silhouette); clustered ones are bounded by what they carry. Preset: silhouette; thesis: viewport."""
-    texel_density: float = 1.0
-    """Texels per pixel where the tree's axis is seen face on."""
+    texel_density: float | None = None
+    """Texels per pixel, both ways, where the tree's axis is seen face on. Preset: 1.5; thesis: 1."""
     loss: Loss | None = None
     """Absolute (l1) or squared (l2) difference of premultiplied RGBA, summed over channels and averaged over pixels, or the squared
     difference over random backgrounds in expectation (backgrounds). Preset: backgrounds; thesis: l2."""
@@ -120,7 +122,8 @@ class FitConfig:
             check_range("placement_rate", self.placement_rate, 0, 1)
         check_choice("sides", self.sides, ("one", "two", "pair"))
         check_choice("bounds", self.bounds, (None, "viewport", "thesis", "silhouette"))
-        check_range("texel_density", self.texel_density, 0, 16, open_low=True)
+        if self.texel_density is not None:
+            check_range("texel_density", self.texel_density, 0, 16, open_low=True)
         check_choice("loss", self.loss, (None, "l1", "l2", "backgrounds"))
         check_choice("schedule", self.schedule, (None, "cosine", "growth"))
         check_count("seed", self.seed, 0)

@@ -25,7 +25,7 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
     that faces them (thesis, sections 4.2 and 6.3).
     """
     camera, config = views.cameras, config.resolve()
-    assert config.billboards is not None
+    assert config.billboards is not None and config.texel_density is not None
     axis, focal = convergence_point(camera), pixels_a_metre(camera)
     density = config.texel_density * focal
     size = torch.tensor([camera.height, camera.width])

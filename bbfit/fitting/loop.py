@@ -131,6 +131,7 @@ def fit(
     begun -= done.seconds
 
     start, fitted, losses = done.start, done.found, done.losses
+    assert config.texel_density is not None
     density, radius = config.texel_density * pixels_a_metre(views.train.cameras), tree_radius(views.train)
     for level in (levels := levels_of(config, views.train.cameras)):
         if len(losses) > level.end:
@@ -169,6 +170,7 @@ def _begin(views: ViewDataset, config: FitConfig, tree: str | Path | None, on_pl
         points = hull_points(views.train, seed=config.seed)
     else:
         points = mesh_points(tree, views.train, seed=config.seed)
+    assert config.texel_density is not None
     found = find_placement(views.train, points, config, on_place)
     return _Progress([], sized(found, float(config.texel_density * pixels_a_metre(views.train.cameras))), found, {}, 0.0)
 

@@ -77,6 +77,7 @@ class _Search:
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))
         cameras = self._targets.cameras
+        assert config.texel_density is not None
         self._density = float(pixels_a_metre(cameras)) * config.texel_density
         self._seen = seen_across(cameras)
         self._colours = point_colours(points, views, cameras, self._pictures)
