@@ -21,6 +21,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import write_png
 from bbfit.trees.species import figures_file, known_species
 
+DATA = Path(__file__).resolve().parents[1] / "data"
 QUICK = ["--billboards", "2", "--candidates", "2", "--relocations", "0", "--steps", "3"]
 
 
@@ -85,6 +86,9 @@ def test_export(fitted: Path, tmp_path: Path, name: str, capsys: pytest.CaptureF
         (["fit", "{tmp}", "--out", "{tmp}/o"], "no transforms_train.json"),
         (["fit", "{views}", "--out", "{tmp}/o", "--billboards", "0"], "at least 1"),
         (["fit", "{views}", "--out", "{views}/transforms_train.json"], "is a file"),
+        (["fit", "{views}", "--out", "{tmp}/o", "--sides", "pair"], "--placement even"),
+        (["fit", "{views}", "--out", "{tmp}/o", "--tree", "{tmp}/none.glb"], "none.glb"),
+        (["fit", "{views}", "--out", "{tmp}/o", "--tree", "{data}/tree.glb"], "not where the views show a tree"),
         (["run", "{tmp}/none.glb", "--out", "{tmp}/o"], "none.glb"),
         (["run", "{tmp}/empty.glb", "--out", "{tmp}/o"], "is empty"),
         (["run", "{tmp}/tree.docx", "--out", "{tmp}/o"], ".glb"),
@@ -102,7 +106,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
 ) -> None:
     (tmp_path / "empty.glb").touch()
     (tmp_path / "tree.docx").write_text("not a tree")
-    places = {"tmp": tmp_path, "views": views_folder, "cloud": fitted / "cloud.safetensors"}
+    places = {"data": DATA, "tmp": tmp_path, "views": views_folder, "cloud": fitted / "cloud.safetensors"}
     assert says.format(**places) in refused([part.format(**places) for part in arguments], capsys)
     assert not (tmp_path / "o" / "cloud.safetensors").exists()
 

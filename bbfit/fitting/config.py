@@ -24,12 +24,12 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "texel_density": 1.5,
         "bounds": "silhouette",
         "loss": "backgrounds",
-        "ssim_weight": 0.02,
-        "sharpness_weight": 20.0,
-        "crispness_weight": 0.02,
+        "ssim_weight": 0.01,
+        "sharpness_weight": 12.0,
+        "crispness_weight": 0.003,
         "levels": 4,
-        "steps": 300,
-        "views_per_step": 2,
+        "steps": 600,
+        "views_per_step": 4,
         "learning_rate": 0.15,
         "schedule": "cosine",
     },
@@ -84,19 +84,19 @@ class FitConfig:
     """Absolute (l1) or squared (l2) difference of premultiplied RGBA, summed over channels and averaged over pixels, or the squared
     difference over random backgrounds in expectation (backgrounds). Preset: backgrounds; thesis: l2."""
     ssim_weight: float | None = None
-    """Weight of 1 - SSIM beside the loss. Preset: 0.02; thesis: 0."""
+    """Weight of 1 - SSIM beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: float | None = None
-    """Weight, at full resolution, of the squared difference in mean contrast of neighbouring pixels. Preset: 20; thesis: 0."""
+    """Weight, at full resolution, of the squared difference in mean contrast of neighbouring pixels. Preset: 12; thesis: 0."""
     crispness_weight: float | None = None
     """Weight, at full resolution, of alpha * (1 - alpha), summed over texels and divided by a view's pixels, which makes leaves opaque and
-    the air between them clear. Preset: 0.02; thesis: 0."""
+    the air between them clear. Preset: 0.003; thesis: 0."""
     levels: int | None = None
     """Resolutions of views and textures, coarse to fine, sides doubling from each to the next; the steps are shared out evenly.
     Preset: 4; thesis: 1."""
     steps: int | None = None
-    """Optimiser steps. Preset: 300; thesis: 10000."""
+    """Optimiser steps. Preset: 600; thesis: 10000."""
     views_per_step: int | None = None
-    """Training views in every step at full resolution; twice as many at each coarser level. Preset: 2; thesis: 1."""
+    """Training views in every step at full resolution; twice as many at each coarser level. Preset: 4; thesis: 1."""
     learning_rate: float | None = None
     """Adam's initial rate. Preset: 0.15; thesis: 0.01."""
     schedule: Schedule | None = None

@@ -136,3 +136,23 @@ def test_same_bytes_with_any_number_of_threads() -> None:
     for other in states[1:]:
         assert all(torch.equal(a, b) for a, b in zip(states[0].tensors().values(), other.tensors().values(), strict=True))
         assert torch.equal(states[0].occupied, other.occupied)
+
+
+def test_crispness_is_a_gradient_of_alphas_that_are_not_zero() -> None:
+    texels = start(40)
+    plain, crisp = AdamState.start(texels), AdamState.start(texels)
+    for step in range(1, 4):
+        gradient = gradient_of(step, 40)
+        crisp.gradient[:40] = gradient
+        alpha = plain.texels[:40, 3]
+        plain.gradient[:40] = gradient
+        woken = (gradient.view(-1, BLOCK, 4) != 0).flatten(1).any(-1) | (step - plain.last <= REST_AFTER)
+        plain.gradient[:40, 3] += torch.where((alpha > 0) & woken.repeat_interleave(BLOCK), 0.3 * (1 - 2 * alpha), 0)
+        plain.update(step, 0.05)
+        crisp.update(step, 0.05, crispness=0.3)
+    torch.testing.assert_close(crisp.texels, plain.texels, atol=1e-6, rtol=0)
+    untouched = AdamState.start(texels)
+    for step in range(1, 4):
+        untouched.gradient[:40] = gradient_of(step, 40)
+        untouched.update(step, 0.05)
+    assert (untouched.texels[:, 3] - crisp.texels[:, 3]).abs().max() > 0.01

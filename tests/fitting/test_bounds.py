@@ -9,12 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from bbfit.fitting.bounds import facing, facing_view_bounds, opaque_bounds, smallest_rectangle
+from bbfit.fitting.bounds import facing, facing_view_bounds, opaque_bounds, smallest_rectangle, trimmed
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
-from bbfit.geometry.camera import convergence_point
+from bbfit.geometry.camera import Camera, convergence_point
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.homography import texel_to_pixel
+from bbfit.rendering.reference import render_reference
 from bbfit.views import ViewDataset
 
 
@@ -54,7 +55,7 @@ def test_thesis_bounds_are_the_alpha_box_of_the_facing_view(views: ViewDataset) 
 @pytest.mark.parametrize("sides", ["one", "two", "pair"])
 def test_silhouette_bounds_cut_nothing_off(views: ViewDataset, count: int, sides: str) -> None:
     """Every opaque pixel of every training view within 60 degrees of a billboard's normal lies on that billboard."""
-    cloud = start_cloud(views.train, FitConfig(billboards=count, placement="even", sides=sides, bounds="silhouette"))
+    cloud = start_cloud(views.train, FitConfig(billboards=count, placement="even", sides=sides, bounds="silhouette", texel_density=1))
     camera = views.train.cameras.to(torch.float32)
     cosines = facing(camera, cloud.normals, convergence_point(views.train.cameras).float()).abs()
     matrices = torch.linalg.inv(texel_to_pixel(cloud, camera))
@@ -75,7 +76,7 @@ def test_silhouette_bounds_cut_nothing_off(views: ViewDataset, count: int, sides
 
 def test_silhouette_bounds_are_tight(views: ViewDataset) -> None:
     """Each of a billboard's four edges is touched, to a texel, by the silhouette of some view that the billboard faces best."""
-    cloud = start_cloud(views.train, FitConfig(billboards=2, bounds="silhouette"))
+    cloud = start_cloud(views.train, FitConfig(billboards=2, bounds="silhouette", texel_density=1))
     camera = views.train.cameras.to(torch.float32)
     cosines = facing(camera, cloud.normals, convergence_point(views.train.cameras).float()).abs()
     matrices = torch.linalg.inv(texel_to_pixel(cloud, camera))
@@ -103,7 +104,7 @@ def test_bounds_save_texels_and_keep_their_density(views: ViewDataset) -> None:
 
 
 def test_unbounded_billboards_fill_the_viewport_of_a_facing_camera(views: ViewDataset) -> None:
-    cloud = start_cloud(views.train, FitConfig(billboards=4, bounds="viewport"))
+    cloud = start_cloud(views.train, FitConfig(billboards=4, bounds="viewport", texel_density=1))
     camera = views.train.cameras.to(torch.float32)
     size = torch.tensor([camera.width, camera.height])
     assert cloud.texture_sizes.tolist() == [[camera.height, camera.width]] * 4
@@ -243,3 +244,19 @@ def test_the_smallest_rectangle_of_points_in_a_row_is_turned_by_45_degrees_at_mo
     assert axis[0] > axis[1].abs() - 1e-6
     upright = float((row.amax(0) - row.amin(0)).prod()) == 0
     assert not upright or axis.tolist() == [1, 0]
+
+
+def test_trimming_leaves_the_picture(known_cloud: BillboardCloud, ring: Camera) -> None:
+    texels = known_cloud.texels.clone()
+    textures = known_cloud.with_texels(texels).textures()
+    textures[0][:, :5, :, 3] = 0
+    textures[0][:, :, -9:, 3] = 0.001  # rounds to 0 in eight bits
+    textures[1][..., 3] = 0
+    cloud = known_cloud.with_texels(texels)
+    cut = trimmed(cloud)
+    seen = torch.nonzero(textures[0][0, ..., 3] >= 0.5 / 255)
+    assert cut.texture_sizes.tolist() == [(seen.amax(0) - seen.amin(0) + 3).tolist(), [1, 1]]
+    density = cloud.texture_sizes.flip(-1) / cloud.half_extents
+    torch.testing.assert_close(cut.texture_sizes.flip(-1) / cut.half_extents, density, rtol=1e-5, atol=0)
+    difference = render_reference(cut, ring) - render_reference(cloud, ring)
+    assert difference.abs().max() < 2e-3 and render_reference(cut, ring)[..., 3].max() > 0.5
