@@ -5,17 +5,21 @@ the rows about steps come once for each device. Rows by name:
 
 grow      a tree grown and written as GLB, in a process of its own; seconds count importing bbfit
 copy      bytes a second of a plain copy in memory (read plus written)
-step      one training step of one view (render, loss, gradient, update) at the default fit's last level, by the reference renderer and by
-          the fused kernels; bound_s is how long the bytes that it must move take at the speed of a copy
+step      one training step of one view (render, loss, gradient, update) at the default fit's last level, of evenly placed billboards
+          with a texel a pixel, by the reference renderer and by the fused kernels; bound_s is how long the bytes that it must move
+          take at the speed of a copy
 thesis    the same of the thesis preset, whose billboards fill the viewport
 views     steps of more views
 quality   for each folder of views: the thesis preset's 10,000 steps by the fused kernels, what they would take by the reference
-          renderer (a step's time over 50 steps, times 10,000), and the default preset; reached_s is when the default fit, looked at
-          every 25 steps, was first as good as the thesis preset's result in PSNR on the held-out views
+          renderer (a step's time over 50 steps, times 10,000), and the default preset with as many billboards, without a
+          mesh; reached_s is when that fit, looked at every 25 steps, was first as good as the thesis preset's result in PSNR on the
+          held-out views, the search for a placement counted
+placement for each folder of views: the thesis preset with four two-sided billboards, by L2 and by L1, and the default preset, which has
+          as many vertices; only when asked for
 memory    the peak resident memory of a default fit of 360 views at 1024 x 1024, in a process of its own
 
 ``--quick`` takes under a minute and leaves out the willow, the thesis, most numbers of billboards, quality and memory. ``--views`` are the
-folders for quality; without any it takes data/views. bound_s leaves out what SSIM moves.
+folders for quality; without any it takes data/views. bound_s leaves out what SSIM and sharpness move.
 """
 
 from __future__ import annotations
@@ -209,7 +213,7 @@ def steps(quick: bool) -> list[Row]:
         for size in (256, 512, 1024):
             large = enlarged(views, size)
             turns = 2 if quick else 7
-            default = bbfit.FitConfig(views_per_step=1, levels=1)
+            default = bbfit.FitConfig(views_per_step=1, levels=1, placement="even", texel_density=1)
             for count in (4,) if quick else (2, 4, 8, 16):
                 rows.append(step_row(large, replace(default, billboards=count), "step", device=device, turns=turns, copy=copy))
                 show(rows[-1])
@@ -225,7 +229,7 @@ def steps(quick: bool) -> list[Row]:
 def views_rows(views: ViewSet, device: torch.device) -> list[Row]:
     """Rows ``views``: fused steps of more than one view."""
     rows = []
-    stepper = warm(views, bbfit.FitConfig(levels=1).resolve(), device)
+    stepper = warm(views, bbfit.FitConfig(billboards=4, levels=1, placement="even", texel_density=1).resolve(), device)
     for count in (1, 2, 4, 8):
         chosen = list(range(count))
         seconds = statistics.median(seconds_of(lambda chosen=chosen: stepper.step(chosen, 0.01), device) for _ in range(20))  # type: ignore[misc]
@@ -241,7 +245,7 @@ def quality(folders: list[Path]) -> list[Row]:
         views = bbfit.ViewDataset.load(folder)
         views.train.check()
         views.test.check()
-        thesis, default = bbfit.FitConfig(preset="thesis"), bbfit.FitConfig()
+        thesis, default = bbfit.FitConfig(preset="thesis"), bbfit.FitConfig(billboards=4)
         bbfit.fit(views, replace(default, steps=4))  # compiles the kernels
         slow = reference_step(views.train, thesis)
         row: Row = {
@@ -264,6 +268,23 @@ def quality(folders: list[Path]) -> list[Row]:
                     break
         rows.append(row)
         show(row)
+    return rows
+
+
+def placement(folders: list[Path]) -> list[Row]:
+    """Rows ``placement``."""
+    rows = []
+    thesis = bbfit.FitConfig(preset="thesis", sides="two")
+    for folder in folders:
+        views = bbfit.ViewDataset.load(folder)
+        for name, config in {"thesis l2": thesis, "thesis l1": replace(thesis, loss="l1"), "default": bbfit.FitConfig()}.items():
+            result = bbfit.fit(views, config)
+            report = bbfit.evaluate(result.cloud, views.test).to_json()
+            scores = {**report["over_white"], "sharpness": report["sharpness"], "brightness": report["brightness"]}
+            row: Row = {"name": "placement", "views": folder.name, "fit": name, "vertices": result.cloud.vertex_count}
+            row |= {"texels": len(result.cloud.texels), "fit_s": round(result.seconds, 1)}
+            rows.append(row | {key: round(value, 4) for key, value in scores.items()})
+            show(rows[-1])
     return rows
 
 
@@ -320,7 +341,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="under a minute")
     parser.add_argument("--json", type=Path, help="file for the rows, a JSON list")
     parser.add_argument("--views", type=Path, nargs="*", help="folders of views for the rows about quality")
-    parser.add_argument("--only", nargs="*", choices=["grow", "steps", "quality", "memory"], help="measure these only")
+    parser.add_argument("--only", nargs="*", choices=["grow", "steps", "quality", "placement", "memory"], help="measure these only")
     arguments = parser.parse_args()
     wanted = arguments.only or (["grow", "steps"] if arguments.quick else ["grow", "steps", "quality", "memory"])
     rows: list[Row] = [
@@ -330,6 +351,8 @@ def main() -> None:
         rows += steps(arguments.quick)
     if "quality" in wanted:
         rows += quality(arguments.views or [DATA / "views"])
+    if "placement" in wanted:
+        rows += placement(arguments.views or [DATA / "views"])
     for name, measured in {"grow": lambda: grow(arguments.quick), "memory": memory}.items():
         if name in wanted:
             for row in measured():

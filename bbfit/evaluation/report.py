@@ -10,6 +10,9 @@ from typing import Any
 from bbfit.checks import check_file, fail
 from bbfit.files import read_json, write_json
 
+RING_GAP = 1.0
+"""Degrees between the elevations of two rings of views, at least."""
+
 
 @dataclass(frozen=True)
 class OverWhite:
@@ -80,6 +83,21 @@ class ViewScore:
 
 
 @dataclass(frozen=True)
+class RingScore:
+    """The views that look from about one elevation, and the plain means of their measures."""
+
+    elevation_degrees: float
+    """Their mean elevation."""
+    views: int
+    """How many there are."""
+    measures: Measures
+
+    def to_json(self) -> dict[str, Any]:
+        """Elevation, number of views and the groups of measures side by side."""
+        return {"elevation_degrees": self.elevation_degrees, "views": self.views} | asdict(self.measures)
+
+
+@dataclass(frozen=True)
 class Cost:
     """A count of the model beside that of the original tree; ``None`` where it is not known."""
 
@@ -122,6 +140,23 @@ class Report:
         """
         return _mean(Measures, [view.measures for view in self.views])
 
+    @property
+    def rings(self) -> tuple[RingScore, ...]:
+        """Means by elevation, from low to high: views whose elevations follow each other within :data:`RING_GAP` degrees are one ring."""
+        rings: list[list[ViewScore]] = []
+        for view in sorted(self.views, key=lambda view: view.elevation_degrees):
+            if not rings or view.elevation_degrees - rings[-1][-1].elevation_degrees > RING_GAP:
+                rings.append([])
+            rings[-1].append(view)
+        return tuple(
+            RingScore(
+                round(sum(view.elevation_degrees for view in ring) / len(ring), 3),
+                len(ring),
+                _mean(Measures, [view.measures for view in ring]),
+            )
+            for ring in rings
+        )
+
     def to_json(self) -> dict[str, Any]:
         """The contents of ``metrics.json``; every number is finite, what is unknown or undefined is ``None``.
 
@@ -129,12 +164,14 @@ class Report:
         -------
         ``{"over_white": {"psnr", "ssim", "flip"}, "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
         "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "seconds": {stage: ..},
+        "rings": [{"elevation_degrees", "views", and the measures as above}],
         "views": [{"name", "azimuth_degrees", "elevation_degrees", and the measures as above}]}``
         """
         return asdict(self.mean) | {
             "vertices": self.vertices.to_json(),
             "bytes": self.bytes.to_json(),
             "seconds": dict(self.seconds),
+            "rings": [ring.to_json() for ring in self.rings],
             "views": [view.to_json() for view in self.views],
         }
 

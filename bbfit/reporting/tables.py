@@ -11,6 +11,8 @@ from bbfit.trees.species import Species
 if TYPE_CHECKING:
     from rich.table import Table
 
+# Views from more elevations than this stand in no rings.
+_MOST_RINGS = 8
 _UP, _DOWN, _ONE = "↑", "↓", "→ 1"
 
 
@@ -55,6 +57,13 @@ def report_table(report: Report, title: str = "Held-out views") -> Table:
     table.add_row("silhouette IoU", _UP, "", f"{rgba.iou:.4f}", "")
     table.add_row("sharpness", _ONE, _share(mean.sharpness), "", "")
     table.add_row("brightness", _ONE, "", _share(mean.brightness), "")
+
+    if 1 < len(report.rings) <= _MOST_RINGS:
+        table.add_section()
+        for ring in report.rings:
+            white, rgba, thesis = ring.measures.over_white, ring.measures.rgba, ring.measures.thesis_scale
+            name = f"PSNR, dB, at {ring.elevation_degrees:.0f}°"
+            table.add_row(name, _UP, f"{white.psnr:.2f}", f"{rgba.psnr:.2f}", f"{thesis.psnr:.3f}")
 
     table.add_section()
     table.add_row("[bold]cost[/]", "", "[bold]model[/]", "[bold]original[/]", "[bold not dim]ratio[/]")

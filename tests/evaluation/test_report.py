@@ -34,6 +34,14 @@ def test_means_are_plain_and_leave_out_what_is_undefined() -> None:
     assert replace(REPORT, views=(score("b", 1, None),)).mean.sharpness is None
 
 
+def test_rings_are_views_of_about_one_elevation() -> None:
+    elevations = [30.4, 0.0, 29.8, 90.0, 0.0]
+    views = tuple(replace(score("a", 1 + index), elevation_degrees=elevation) for index, elevation in enumerate(elevations))
+    rings = replace(REPORT, views=views).rings
+    assert [(ring.elevation_degrees, ring.views) for ring in rings] == [(0.0, 2), (pytest.approx(30.1), 2), (90.0, 1)]
+    assert [ring.measures.over_white.psnr for ring in rings] == [70.0, 40.0, 80.0]
+
+
 def test_ratio_is_table_1s() -> None:
     """Acer, four single-sided billboards: 16 vertices are 0.0141 % of the original (thesis, table 1)."""
     assert REPORT.vertices.ratio is not None
@@ -43,9 +51,10 @@ def test_ratio_is_table_1s() -> None:
 
 def test_schema() -> None:
     content = REPORT.to_json()
-    assert list(content) == [*MEASURES, "sharpness", "brightness", "vertices", "bytes", "seconds", "views"]
+    assert list(content) == [*MEASURES, "sharpness", "brightness", "vertices", "bytes", "seconds", "rings", "views"]
     assert list(content["views"][0]) == ["name", "azimuth_degrees", "elevation_degrees", *MEASURES, "sharpness", "brightness"]
-    for part in (content, *content["views"]):
+    assert list(content["rings"][0]) == ["elevation_degrees", "views", *MEASURES, "sharpness", "brightness"]
+    for part in (content, *content["views"], *content["rings"]):
         assert {group: set(part[group]) for group in MEASURES} == MEASURES
     for cost in ("vertices", "bytes"):
         assert set(content[cost]) == {"model", "original", "ratio"}

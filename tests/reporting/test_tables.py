@@ -39,3 +39,13 @@ def test_every_figure_is_there_and_nothing_is_cut(width: int) -> None:
 
 def test_one_view() -> None:
     assert report_table(Report(REPORT.views[:1])).title == "Held-out views: one view"
+
+
+def test_rings_have_rows_of_their_own_if_there_are_some() -> None:
+    console = Console(width=100)
+    several = tuple(ViewScore(str(elevation), 0, elevation, MEASURES) for elevation in (0, 30, 60))
+    for report, rows in ((REPORT, 0), (Report(several), 3)):
+        with console.capture() as capture:
+            console.print(report_table(report))
+        assert capture.get().count("°") == rows
+    assert "PSNR, dB, at 60°" in capture.get()
