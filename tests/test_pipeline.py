@@ -142,7 +142,8 @@ def test_out_must_be_a_folder_that_can_be_written(views_folder: Path, tmp_path: 
 def test_from_a_tree_to_a_model(tmp_path: Path) -> None:
     """The whole job with Blender, on the tree that comes with bbfit; a second run does nothing."""
     config = RunConfig(
-        views=ViewsConfig(count=8, size=48, samples=2, denoise=False), fit=FitConfig(billboards=2, placement="even", steps=10)
+        views=ViewsConfig(count=8, size=48, samples=2, denoise=False),
+        fit=FitConfig(billboards=2, placement="even", placement_rate=0, steps=10),
     )
     told = []
     run(TREE, tmp_path, config, on_progress=lambda stage, done, total, note="": told.append((stage, done, total)))

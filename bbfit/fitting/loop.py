@@ -159,7 +159,8 @@ def fit(
     # No view determines the colour of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
     bled = [bleed_colour(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
-    return FitResult(fitted if config.placement == "even" else trimmed(fitted), losses, config, time.perf_counter() - begun)
+    stand = config.placement == "even" and not config.placement_rate
+    return FitResult(fitted if stand else trimmed(fitted), losses, config, time.perf_counter() - begun)
 
 
 def _begin(views: ViewDataset, config: FitConfig, tree: str | Path | None, on_place: Callable[[int, int], None] | None) -> _Progress:
