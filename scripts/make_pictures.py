@@ -1,7 +1,12 @@
-"""Make docs/species.png, one view of every species that bbfit grows: python scripts/make_pictures.py (needs Blender)"""
+"""Make the pictures in docs/: python scripts/make_pictures.py [species] [acer] (needs Blender)
+
+species.png has one view of every species that bbfit grows; acer.png held-out views of an acer, what the thesis preset makes of them, and
+what the default preset does with as many vertices.
+"""
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from pathlib import Path
 
@@ -28,19 +33,49 @@ def picture(name: str, folder: Path) -> np.ndarray:
     return over_colour(views.train.targets([0])[0], 1.0).numpy()
 
 
-def main() -> None:
-    """Draw all of them in two rows."""
+def acer() -> None:
+    """Draw acer.png: a column of views, one of the thesis preset's four two-sided billboards, one of the default preset's eight."""
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder) / "acer.glb"
+        bbfit.write_tree(bbfit.grow("acer", seed=2), tree)
+        bbfit.render_views(tree, Path(folder) / "views", bbfit.ViewsConfig(count=60, size=512, samples=16))
+        views = bbfit.ViewDataset.load(Path(folder) / "views")
+        thesis = bbfit.fit(views, bbfit.FitConfig(preset="thesis", sides="two")).cloud
+        default = bbfit.fit(views, tree=tree).cloud
+        draw_acer(views, thesis, default)
+
+
+def draw_acer(views: bbfit.ViewDataset, thesis: bbfit.BillboardCloud, default: bbfit.BillboardCloud) -> None:
+    """Draw acer.png from what has been fitted."""
+    columns = {"held-out view": None, "thesis preset": thesis, "default preset": default}
+    figure, axes = plt.subplots(2, 3, figsize=(12, 8.4))
+    for column, (title, cloud) in zip(axes.T, columns.items(), strict=True):
+        if cloud is not None:
+            mean = bbfit.evaluate(cloud, views.test).mean.over_white
+            title += f": {cloud.vertex_count} vertices, {mean.psnr:.2f} dB, FLIP {mean.flip:.3f}"
+        column[0].set_title(title, fontsize=10)
+        for axis, index in zip(column, (0, len(views.test) // 3), strict=True):
+            image = views.test.targets([index])[0] if cloud is None else bbfit.render(cloud, views.test.cameras[index])
+            axis.imshow(over_colour(image.clamp(0, 1), 1.0).numpy()[40:472, 40:472])
+            axis.axis("off")
+    figure.tight_layout()
+    figure.savefig(DOCS / "acer.png", dpi=100)
+
+
+def species() -> None:
+    """Draw species.png: all of them in two rows."""
     names = known_species()
     figure, axes = plt.subplots(2, len(names) // 2, figsize=(12, 6.9))
     with tempfile.TemporaryDirectory() as folder:
         for axis, name in zip(axes.flat, names, strict=True):
-            species = bbfit.load_species(name)
+            figures = bbfit.load_species(name)
             axis.imshow(picture(name, Path(folder)))
-            axis.set_title(f"{name}, {species.scale:g} ± {species.scale_v:g} m", fontsize=11)
+            axis.set_title(f"{name}, {figures.scale:g} ± {figures.scale_v:g} m", fontsize=11)
             axis.axis("off")
     figure.tight_layout()
     figure.savefig(DOCS / "species.png", dpi=100)
 
 
 if __name__ == "__main__":
-    main()
+    for name in sys.argv[1:] or ["species", "acer"]:
+        {"species": species, "acer": acer}[name]()
