@@ -136,7 +136,10 @@ def sized(cloud: BillboardCloud, texels_a_metre: float) -> BillboardCloud:
     sizes = (2 * cloud.half_extents * texels_a_metre).flip(-1).ceil().long().clamp_min(1)
     count = int((sizes.prod(-1) * (1 + cloud.two_sided.long())).sum())
     return replace(
-        cloud, half_extents=sizes.flip(-1).to(cloud.half_extents) / texels_a_metre / 2, texture_sizes=sizes, texels=torch.zeros(count, 4)
+        cloud,
+        half_extents=sizes.flip(-1).to(cloud.half_extents) / texels_a_metre / 2,
+        texture_sizes=sizes,
+        texels=torch.zeros(1, 4).expand(count, 4),
     )
 
 

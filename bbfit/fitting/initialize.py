@@ -85,7 +85,7 @@ def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_metre: Tensor) -> B
         centers=planes.centers + middle[:, :1] * planes.rights + middle[:, 1:] * planes.ups,
         half_extents=size.flip(-1) / texels_a_metre / 2,
         texture_sizes=size,
-        texels=torch.zeros(texels, 4, dtype=planes.texels.dtype),
+        texels=torch.zeros(1, 4, dtype=planes.texels.dtype).expand(texels, 4),
     )
 
 

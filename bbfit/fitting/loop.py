@@ -153,6 +153,7 @@ def fit(
             if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
                 _save(checkpoint, mark, _Progress(losses, start, None, stepper.tensors(), time.perf_counter() - begun))
         fitted = stepper.cloud
+        del stepper, cloud  # their memory is wanted for the next level
         if movement is not None:
             start = bounded(fitted, opaque_bounds(fitted), density).to(torch.float32)
     assert fitted is not None
@@ -265,6 +266,6 @@ def _load(path: Path, mark: str) -> _Progress | None:
         for prefix in (_START, _FOUND)
     }
     texels = parts[_START]["texture_sizes"].prod(-1) * (1 + parts[_START]["two_sided"].long())
-    start = BillboardCloud(**parts[_START], texels=torch.zeros(int(texels.sum()), 4))
+    start = BillboardCloud(**parts[_START], texels=torch.zeros(1, 4).expand(int(texels.sum()), 4))
     found = BillboardCloud(**parts[_FOUND]) if parts[_FOUND] else None
     return _Progress(tensors.pop("losses").tolist(), start, found, tensors, float(metadata["seconds"]))

@@ -81,7 +81,9 @@ class _Search:
         self._density = float(pixels_a_metre(cameras)) * config.texel_density
         self._seen = seen_across(cameras)
         self._colours = point_colours(points, views, cameras, self._pictures)
-        self._pixels = cameras.project(points).nan_to_num(nan=-1).round().long()  # [V, P, 2]
+        # One view after the other: of all at once the intermediate results take a gigabyte.
+        pixels = [cameras[index].project(points).nan_to_num(nan=-1).round().clamp(-1, 1 << 20).int() for index in range(len(cameras))]
+        self._pixels = torch.stack(pixels)  # [V, P, 2]
         self._radius = tree_radius(views)
         self._survivors = max(1, round(_SURVIVORS * config.candidates))
         self._done, self._total = 0, config.candidates + self._survivors + config.relocations
