@@ -71,6 +71,10 @@ class ViewSet:
         """File names without folder and ending."""
         return [path.stem for path in self.paths]
 
+    def take(self, indices: Sequence[int]) -> ViewSet:
+        """Some of the views, with the same memory of pictures."""
+        return ViewSet(tuple(self.paths[index] for index in indices), self.cameras[list(indices)], self._cache)
+
     def image(self, index: int) -> Tensor:
         """One picture, uint8 [H, W, 4], straight alpha. Do not write to it: it may be cached.
 

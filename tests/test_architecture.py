@@ -30,6 +30,7 @@ GROUPS = (
     ("rendering",),
     ("fitting",),
     ("evaluation", "exporting"),
+    ("budget",),
     ("reporting",),
     ("pipeline",),
     ("sweep",),
@@ -44,7 +45,7 @@ ONLY_IN = {
     "cv2": {"images.py", "fitting/bounds.py"},
     "xatlas": {"exporting/atlas.py"},
     "warp": {
-        *(f"rendering/{name}.py" for name in ("launching", "sampling", "kernels", "fused")),
+        *(f"rendering/{name}.py" for name in ("launching", "sampling", "kernels", "fused", "fused_projection")),
         *(f"fitting/{name}.py" for name in ("adam", "fused_sharpness", "fused_ssim", "ssim_kernels")),
     },
     "ray": {"sweep.py"},

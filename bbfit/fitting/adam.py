@@ -75,6 +75,13 @@ def _update_blocks(
             occupied[i] = wp.where(opaque > 0.0, wp.uint8(1), wp.uint8(0))
 
 
+def padded(texels: Tensor) -> Tensor:
+    """A copy of texels [P, 4] with transparent ones after them that fill the last block."""
+    copy = texels.new_zeros(-(-len(texels) // BLOCK) * BLOCK, 4)
+    copy[: len(texels)] = texels.detach()
+    return copy
+
+
 @dataclass(frozen=True)
 class AdamState:
     """Texels and what Adam keeps of them, padded to whole blocks; all of it changes in place."""
@@ -94,11 +101,10 @@ class AdamState:
 
     @staticmethod
     def start(texels: Tensor) -> AdamState:
-        """Before the first step, for texels [P, 4]."""
-        padded = torch.nn.functional.pad(texels.detach(), (0, 0, 0, -len(texels) % BLOCK)).contiguous().clone()
-        never = torch.full((len(padded) // BLOCK,), -(1 << 30), dtype=torch.int32, device=texels.device)
-        zeros = [torch.zeros_like(padded) for _ in range(3)]
-        return AdamState(padded, zeros[0], zeros[1], zeros[2], never, occupancy(padded))
+        """Before the first step, for texels [P', 4] as :func:`padded` returns them, which from now on are the state's."""
+        never = torch.full((len(texels) // BLOCK,), -(1 << 30), dtype=torch.int32, device=texels.device)
+        zeros = [torch.zeros_like(texels) for _ in range(3)]
+        return AdamState(texels, zeros[0], zeros[1], zeros[2], never, occupancy(texels))
 
     def tensors(self) -> dict[str, Tensor]:
         """What has to be kept to go on later; the gradient is zero between steps."""

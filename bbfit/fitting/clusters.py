@@ -6,12 +6,13 @@ clouds: every point is moved onto a plane, and what is paid for is how far that 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from bbfit.fitting.bounds import smallest_rectangle
+from bbfit.fitting.initialize import sized
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 
@@ -30,8 +31,6 @@ class Planes:
     """Metres, float64 [K]."""
     labels: Tensor
     """Plane of every point, int64 [P]."""
-    cost: float
-    """Mean squared displacement as the cameras see it, square metres."""
 
 
 def seen_across(camera: Camera) -> Tensor:
@@ -71,8 +70,7 @@ def cluster_planes(points: Tensor, count: int, seen: Tensor, *, upright: bool, g
             own = points[labels == k]
             if len(own) >= 3:
                 normals[k], offsets[k] = _best_plane(own, upright=upright)
-    distance, labels = _displacement(points, normals, offsets, seen).min(-1)
-    return Planes(normals, offsets, labels, float(distance.square().mean()))
+    return Planes(normals, offsets, _displacement(points, normals, offsets, seen).argmin(-1))
 
 
 def _displacement(points: Tensor, normals: Tensor, offsets: Tensor, seen: Tensor) -> Tensor:
@@ -128,18 +126,6 @@ def rectangles(points: Tensor, planes: Planes, texels_a_metre: float, margin: fl
             torch.zeros(len(centers) * (1 + two_sided), 4),
         ),
         texels_a_metre,
-    )
-
-
-def sized(cloud: BillboardCloud, texels_a_metre: float) -> BillboardCloud:
-    """The same billboards with transparent textures of ``texels_a_metre``, rectangles rounded up to whole texels."""
-    sizes = (2 * cloud.half_extents * texels_a_metre).flip(-1).ceil().long().clamp_min(1)
-    count = int((sizes.prod(-1) * (1 + cloud.two_sided.long())).sum())
-    return replace(
-        cloud,
-        half_extents=sizes.flip(-1).to(cloud.half_extents) / texels_a_metre / 2,
-        texture_sizes=sizes,
-        texels=torch.zeros(1, 4).expand(count, 4),
     )
 
 

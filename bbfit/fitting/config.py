@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from bbfit.checks import check_choice, check_count, check_range, fail
@@ -66,10 +66,12 @@ class FitConfig:
     over clusterings of points on the mesh or, without one, in the visual hull of the views. Preset: clusters; thesis: even."""
     orientation: Orientation = "any"
     """Whether clusters are upright planes, planes that may lean any way (free), or whatever does better (any)."""
+    searches: int | None = None
+    """Independent searches, of which the best one counts. Left open, one for every four billboards, three at most."""
     candidates: int = 12
-    """Clusterings that the search compares."""
+    """Clusterings that a search compares."""
     relocations: int = 8
-    """How often the search tries to take the billboard that is missed least to where the picture is worst."""
+    """How often a search tries to take the billboard that is missed least to where the picture is worst."""
     placement_rate: float | None = None
     """How fast billboards move with their textures at first: radians a step, and shares of the tree's radius. 0: they stay.
     Preset: 0.015; thesis: 0."""
@@ -83,6 +85,8 @@ class FitConfig:
     loss: Loss | None = None
     """Absolute (l1) or squared (l2) difference of premultiplied RGBA, summed over channels and averaged over pixels, or the squared
     difference over random backgrounds in expectation (backgrounds). Preset: backgrounds; thesis: l2."""
+    max_texels: int | None = None
+    """Texels at most, for which their density is lowered; any number when left open."""
     ssim_weight: float | None = None
     """Weight of 1 - SSIM beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: float | None = None
@@ -116,6 +120,8 @@ class FitConfig:
             check_count("billboards", self.billboards)
         check_choice("placement", self.placement, (None, "even", "clusters"))
         check_choice("orientation", self.orientation, ("any", "upright", "free"))
+        if self.searches is not None:
+            check_count("searches", self.searches)
         check_count("candidates", self.candidates)
         check_count("relocations", self.relocations, 0)
         if self.placement_rate is not None:
@@ -124,6 +130,8 @@ class FitConfig:
         check_choice("bounds", self.bounds, (None, "viewport", "thesis", "silhouette"))
         if self.texel_density is not None:
             check_range("texel_density", self.texel_density, 0, 16, open_low=True)
+        if self.max_texels is not None:
+            check_count("max_texels", self.max_texels)
         check_choice("loss", self.loss, (None, "l1", "l2", "backgrounds"))
         check_choice("schedule", self.schedule, (None, "cosine", "growth"))
         check_count("seed", self.seed, 0)
@@ -144,6 +152,10 @@ class FitConfig:
         if self.learning_rate is not None:
             check_range("learning_rate", self.learning_rate, 0, 10, open_low=True)
 
+    def coarse(self) -> FitConfig:
+        """The same for less than full resolution: without the weights that count only there."""
+        return replace(self, sharpness_weight=0.0, crispness_weight=0.0)
+
     def resolve(self) -> FitConfig:
         """The same with every ``None`` replaced by the preset's value.
 
@@ -153,8 +165,11 @@ class FitConfig:
             if the values do not go together.
         """
         preset = _PRESETS[self.preset]
-        missing = {f.name: preset[f.name] for f in fields(self) if getattr(self, f.name) is None}
+        missing = {name: value for name, value in preset.items() if getattr(self, name) is None}
         resolved = replace(self, **missing)
+        if resolved.searches is None:
+            assert resolved.billboards is not None
+            resolved = replace(resolved, searches=min(3, max(1, resolved.billboards // 4)))
         if resolved.sides == "pair" and resolved.placement == "clusters":
             fail("sides", "pairs stand evenly around an axis, not in clusters", "add --placement even, or choose one or two")
         return resolved

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from bbfit.checks import fail
 from bbfit.fitting.bounds import facing_view_bounds, silhouette_bounds
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.camera import Camera, convergence_point
@@ -27,7 +28,7 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
     camera, config = views.cameras, config.resolve()
     assert config.billboards is not None and config.texel_density is not None
     axis, focal = convergence_point(camera), pixels_a_metre(camera)
-    density = config.texel_density * focal
+    density = config.texel_density * float(focal)
     size = torch.tensor([camera.height, camera.width])
     sides = config.sides
     planes = even_upright(
@@ -43,7 +44,9 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
             bounds = facing_view_bounds(planes, views, pairs=sides == "pair")
         else:
             bounds = silhouette_bounds(planes, views)
-        planes = bounded(planes, bounds, density)
+        planes = bounded(planes, bounds, density, config.max_texels)
+    elif config.max_texels is not None:
+        planes = sized(planes, density, config.max_texels)
     return random_textures(planes.to(torch.float32), planes.texture_sizes, config.seed)
 
 
@@ -71,22 +74,35 @@ def random_textures(cloud: BillboardCloud, sizes: Tensor, seed: int) -> Billboar
     return replace(cloud, texture_sizes=sizes, texels=texels)
 
 
-def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_metre: Tensor) -> BillboardCloud:
-    """Cut billboards down to ``bounds`` ([N, 4] left, right, bottom, top in metres from their centres), textures transparent.
-
-    Each keeps the texels that it covers: square ones, ``texels_a_metre`` to the metre, the rectangle rounded up to whole texels.
-    """
+def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_metre: float, most: int | None = None) -> BillboardCloud:
+    """Cut billboards down to ``bounds``, [N, 4] left, right, bottom, top in metres from their centres, and size them (:func:`sized`)."""
     left, right, bottom, top = bounds.unbind(-1)
-    size = _at_least_one(torch.stack([top - bottom, right - left], -1) * texels_a_metre)
-    middle = torch.stack([left + right, bottom + top], -1) / 2
-    texels = int((size.prod(-1) * (1 + planes.two_sided.long())).sum())
-    return replace(
-        planes,
-        centers=planes.centers + middle[:, :1] * planes.rights + middle[:, 1:] * planes.ups,
-        half_extents=size.flip(-1) / texels_a_metre / 2,
-        texture_sizes=size,
-        texels=torch.zeros(1, 4, dtype=planes.texels.dtype).expand(texels, 4),
-    )
+    middle, sides = torch.stack([left + right, bottom + top], -1) / 2, torch.stack([right - left, top - bottom], -1)
+    centers = planes.centers + middle[:, :1] * planes.rights + middle[:, 1:] * planes.ups
+    return sized(replace(planes, centers=centers, half_extents=sides / 2), texels_a_metre, most)
+
+
+def sized(cloud: BillboardCloud, texels_a_metre: float, most: int | None = None) -> BillboardCloud:
+    """The same billboards with transparent textures of ``texels_a_metre``, square texels, rectangles rounded up to whole ones.
+
+    With ``most`` there are fewer texels to the metre if it takes that to have no more of them than so many.
+
+    Raises
+    ------
+    InputError
+        if there are more textures than texels are allowed.
+    """
+    sides = 1 + cloud.two_sided.long()
+    if most is not None and most < int(sides.sum()):
+        fail("max_texels", f"{most} are too few for {int(sides.sum())} textures", "allow more")
+    while True:
+        sizes = _at_least_one(2 * cloud.half_extents * texels_a_metre).flip(-1)
+        count = int((sizes.prod(-1) * sides).sum())
+        if most is None or count <= most:
+            break
+        texels_a_metre *= min(0.995, math.sqrt(most / count))
+    half_extents = sizes.flip(-1).to(cloud.half_extents) / texels_a_metre / 2
+    return replace(cloud, half_extents=half_extents, texture_sizes=sizes, texels=cloud.texels.new_zeros(1, 4).expand(count, 4))
 
 
 def _at_least_one(size: Tensor) -> Tensor:

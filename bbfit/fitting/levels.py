@@ -41,8 +41,9 @@ class Targets:
         shrunk = torch.empty(len(views), height, width, 4, dtype=torch.uint8)
 
         def shrink(index: int) -> None:
-            picture = views.targets([index]).permute(0, 3, 1, 2)
-            shrunk[index] = (interpolate(picture, (height, width), mode="area") * 255).round()[0].permute(1, 2, 0)
+            picture = views.image(index).float()
+            picture[..., :3] *= picture[..., 3:] / 255  # in place: large pictures come in numbers
+            shrunk[index] = interpolate(picture.permute(2, 0, 1)[None], (height, width), mode="area")[0].permute(1, 2, 0).round()
 
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # each thread keeps memory of its own
             for _ in pool.map(shrink, range(len(views))):

@@ -18,9 +18,8 @@ from torch import Tensor
 from bbfit.checks import InputTypeError, check_file, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
-from bbfit.fitting.clusters import sized
 from bbfit.fitting.config import FitConfig
-from bbfit.fitting.initialize import bounded, pixels_a_metre, random_textures, start_cloud, tree_radius
+from bbfit.fitting.initialize import bounded, pixels_a_metre, random_textures, sized, start_cloud, tree_radius
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.points import hull_points, mesh_points
@@ -121,7 +120,7 @@ def fit(
     if config.placement == "even":
         tree = None  # it has no say
     mesh = None if tree is None else sha256(check_file("tree", tree).read_bytes()).hexdigest()
-    mark = sha256(json.dumps([3, asdict(config), views.train.fingerprint, mesh], sort_keys=True).encode()).hexdigest()
+    mark = sha256(json.dumps([4, asdict(config), views.train.fingerprint, mesh], sort_keys=True).encode()).hexdigest()
     checkpoint = Path(checkpoint) if checkpoint is not None else None
     done = _load(checkpoint, mark) if checkpoint is not None else None
     if done is None:
@@ -132,15 +131,17 @@ def fit(
 
     start, fitted, losses = done.start, done.found, done.losses
     assert config.texel_density is not None
-    density, radius = config.texel_density * pixels_a_metre(views.train.cameras), tree_radius(views.train)
+    density, radius = config.texel_density * float(pixels_a_metre(views.train.cameras)), tree_radius(views.train)
     for level in (levels := levels_of(config, views.train.cameras)):
         if len(losses) > level.end:
             continue  # the checkpoint is of a later level
         sizes = shrunk_sizes(start, level.halvings)
         cloud = random_textures(start, sizes, config.seed) if fitted is None else resampled(fitted, start, sizes)
         movement = Movement(cloud, radius) if config.placement_rate and (level.halvings or len(levels) == 1) else None
-        asked = config if level.halvings == 0 else replace(config, sharpness_weight=0.0, crispness_weight=0.0)
+        asked = config.coarse() if level.halvings else config
         stepper = make_stepper(cloud.to(device), Targets.at(views.train, level.halvings), asked, movement)
+        del cloud  # the stepper has its own texels, and those of large views take hundreds of megabytes
+        fitted = None
         if done.tensors and len(losses) > level.begin:
             stepper.restore(done.tensors, len(losses) - level.begin)
         for index in range(len(losses), level.end):
@@ -152,10 +153,10 @@ def fit(
                 on_step(Step(index + 1, config.steps, losses[-1], rate, partial(_cloud_of, stepper)))
             if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
                 _save(checkpoint, mark, _Progress(losses, start, None, stepper.tensors(), time.perf_counter() - begun))
-        fitted = stepper.cloud
-        del stepper, cloud  # their memory is wanted for the next level
+        fitted = stepper.finish()
+        del stepper
         if movement is not None:
-            start = bounded(fitted, opaque_bounds(fitted), density).to(torch.float32)
+            start = bounded(fitted, opaque_bounds(fitted), density, config.max_texels).to(torch.float32)
     assert fitted is not None
     # No view determines the colour of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
     bled = [bleed_colour(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
@@ -174,7 +175,8 @@ def _begin(views: ViewDataset, config: FitConfig, tree: str | Path | None, on_pl
         points = mesh_points(tree, views.train, seed=config.seed)
     assert config.texel_density is not None
     found = find_placement(views.train, points, config, on_place)
-    return _Progress([], sized(found, float(config.texel_density * pixels_a_metre(views.train.cameras))), found, {}, 0.0)
+    density = config.texel_density * float(pixels_a_metre(views.train.cameras))
+    return _Progress([], sized(found, density, config.max_texels), found, {}, 0.0)
 
 
 def _cloud_of(stepper: Stepper) -> BillboardCloud:

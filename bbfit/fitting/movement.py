@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -22,7 +23,8 @@ class Movement:
     """
 
     def __init__(self, cloud: BillboardCloud, reach: float) -> None:
-        self._cloud = cloud.to("cpu")
+        cloud = cloud.bare().to("cpu")
+        self._cloud = replace(cloud, **{name: getattr(cloud, name).double() for name in ("centers", "rights", "ups", "half_extents")})
         self._units = torch.tensor([reach] * 3 + [1.0] * 3 + [_EXTENT_RATE] * 2, dtype=torch.float64)
         self._kept = torch.zeros(3, len(cloud), 8, dtype=torch.float64)  # the numbers, and their first and second moments
         self._steps = 0
@@ -39,16 +41,43 @@ class Movement:
         cloud = self._cloud
         return replace(
             cloud,
-            centers=cloud.centers.double() + moved[:, :3],
-            rights=(turn @ cloud.rights.double()[..., None])[..., 0],
-            ups=(turn @ cloud.ups.double()[..., None])[..., 0],
-            half_extents=cloud.half_extents.double() * moved[:, 6:].exp(),
+            centers=cloud.centers + moved[:, :3],
+            rights=(turn @ cloud.rights[..., None])[..., 0],
+            ups=(turn @ cloud.ups[..., None])[..., 0],
+            half_extents=cloud.half_extents * moved[:, 6:].exp(),
             texels=texels,
         )
 
+    def placement(self) -> Tensor:
+        """Where the billboards are now: centres, rights, ups and half extents side by side, float64 [N, 11]; many times faster."""
+        moved, cloud = self.parameters * self._units, self._cloud
+        vectors = moved[:, 3:6]
+        angles = vectors.norm(dim=-1, keepdim=True)
+        first, second = torch.sinc(angles / math.pi), 0.5 * torch.sinc(angles / (2 * math.pi)).square()
+        turned = []
+        for axes in (cloud.rights, cloud.ups):  # Rodrigues' formula
+            across = torch.linalg.cross(vectors, axes)
+            turned.append(axes + first * across + second * torch.linalg.cross(vectors, across))
+        return torch.cat([cloud.centers + moved[:, :3], *turned, cloud.half_extents * moved[:, 6:].exp()], -1)
+
+    def pull_back(self, placement: Tensor, gradient: Tensor) -> Tensor:
+        """The gradient in :attr:`parameters`, [N, 8], from the one in what :meth:`placement` has returned, [N, 11] both."""
+        of_centers, of_rights, of_ups, of_extents = gradient.split((3, 3, 3, 2), -1)
+        _, rights, ups, half_extents = placement.split((3, 3, 3, 2), -1)
+        vectors = self.parameters[:, 3:6] * self._units[3:6]
+        torque = torch.linalg.cross(rights, of_rights) + torch.linalg.cross(ups, of_ups)
+        # The transpose of the left Jacobian of rotation vectors (Chirikjian 2012, equation 10.86).
+        angles = vectors.norm(dim=-1, keepdim=True)
+        second = 0.5 * torch.sinc(angles / (2 * math.pi)).square()
+        third = torch.where(angles < 1e-4, 1 / 6, (1 - torch.sinc(angles / math.pi)) / angles.square())
+        once = torch.linalg.cross(vectors, torque)
+        of_vectors = torque - second * once + third * torch.linalg.cross(vectors, once)
+        return torch.cat([of_centers, of_vectors, of_extents * half_extents], -1) * self._units
+
     def now(self, texels: Tensor) -> BillboardCloud:
         """The cloud where it is now, float32, with the given texels."""
-        return self.placed(self.parameters, texels).to(torch.float32)
+        centers, rights, ups, half_extents = self.placement().float().split((3, 3, 3, 2), -1)
+        return replace(self._cloud, centers=centers, rights=rights, ups=ups, half_extents=half_extents, texels=texels)
 
     def update(self, gradient: Tensor, rate: float) -> None:
         """Take a step against ``gradient``, [N, 8], of about ``rate`` (in units) each."""

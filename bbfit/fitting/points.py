@@ -22,7 +22,7 @@ MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 # Points of a mesh that must lie on the tree in a training view, on average, for the two to belong together.
 _AGREEMENT = 0.95
 # Random points that the hull is carved from at a time, and how often at most.
-_CARVED, _ROUNDS = 1 << 20, 16
+_CARVED, _ROUNDS = 1 << 18, 64
 # Side of the silhouettes that the hull is carved with, in pixels, at least.
 _HULL_SIDE = 256
 
@@ -102,30 +102,27 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
     return hull
 
 
-def point_colours(points: Tensor, views: ViewSet, cameras: Camera, pictures: Tensor) -> Tensor:
-    """Straight RGB of points as the views show them on average, occlusion ignored, [P, 3] float32.
+def point_colours(pixels: list[tuple[Tensor, Tensor]], pictures: Tensor) -> Tensor:
+    """Straight RGB of points as views show them on average, occlusion ignored, [P, 3] float32.
 
     Parameters
     ----------
-    pictures : premultiplied RGBA, [V, H, W, 4], of ``cameras``.
+    pixels : :func:`pixels_of` the points, of each view.
+    pictures : premultiplied RGBA, [V, H, W, 4].
     """
-    total = torch.zeros(len(points), 4)
-    for index in range(len(views)):
-        x, y, inside = _pixels(points, cameras[index])
-        total[inside] += pictures[index, y[inside], x[inside]]
+    total = torch.zeros(len(pixels[0][0]), 4)
+    for (index, inside), picture in zip(pixels, pictures, strict=True):
+        total += picture.view(-1, 4)[torch.where(inside, index, 0)] * inside[:, None]
     return total[:, :3] / total[:, 3:].clamp_min(1e-6)
 
 
-def _pixels(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Column, row and whether it is in the picture, of the pixel of every point, [P] each."""
-    pixel = camera.project(points).nan_to_num(nan=-1e6).round()
-    x, y = pixel.clamp(-1e6, 1e6).long().unbind(-1)
-    return x, y, (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+def pixels_of(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """The pixel in which a single camera sees each point, counted row by row, int32 [P], and whether that is in the picture, bool [P]."""
+    x, y = camera.project(points).nan_to_num(nan=-1).round().clamp(-1, max(camera.width, camera.height)).int().unbind(-1)
+    return y * camera.width + x, (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
 
 
 def _inside(points: Tensor, camera: Camera, mask: Tensor, *, beyond: bool = False) -> Tensor:
     """Which points one camera sees on a mask [H, W]; ``beyond`` is the answer for those outside the picture."""
-    x, y, inside = _pixels(points, camera)
-    on = torch.full((len(points),), beyond)
-    on[inside] = mask[y[inside], x[inside]]
-    return on
+    index, inside = pixels_of(points, camera)
+    return torch.where(inside, mask.flatten()[torch.where(inside, index, 0)], beyond)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import torch
@@ -16,6 +17,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.reference import render_reference
 
 if TYPE_CHECKING:
+    from bbfit.fitting.adam import AdamState
     from bbfit.rendering.fused import PixelLoss
     from bbfit.rendering.projection import Projection
 
@@ -31,6 +33,9 @@ class Stepper(Protocol):
     def cloud(self) -> BillboardCloud:
         """The cloud as it is now, on the CPU, with texels of its own."""
 
+    def finish(self) -> BillboardCloud:
+        """The same as :attr:`cloud` without a copy; no step may follow."""
+
     def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0) -> Tensor:
         """Take the next step on the chosen views; return the loss before the update, a scalar."""
 
@@ -41,16 +46,27 @@ class Stepper(Protocol):
         """Go on from :meth:`tensors` as they were after so many steps."""
 
 
-def make_stepper(cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None) -> Stepper:
-    """A stepper for a resolved configuration, which starts from the cloud's texels on their device."""
-    return (ReferenceStepper if config.backend == "reference" else FusedStepper)(cloud, targets, config, movement)
+def make_stepper(
+    cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None, *, groups: int = 1
+) -> Stepper:
+    """A stepper for a resolved configuration, which starts from the cloud's texels on their device.
+
+    With ``groups``, so many equal parts of the billboards are fitted side by side, each as if it were alone; their losses are added up.
+    """
+    return (ReferenceStepper if config.backend == "reference" else FusedStepper)(cloud, targets, config, movement, groups)
+
+
+def _copied(cloud: BillboardCloud) -> BillboardCloud:
+    return cloud.with_texels(cloud.texels.clone())
 
 
 class ReferenceStepper:
     """The specification: kornia's warp, autograd and torch's Adam."""
 
-    def __init__(self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None) -> None:
-        self._cloud, self._targets, self._config, self._movement = cloud, targets, config, movement
+    def __init__(
+        self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None, groups: int = 1
+    ) -> None:
+        self._cloud, self._targets, self._config, self._movement, self._groups = cloud.bare(), targets, config, movement, groups
         self._start(cloud.texels.clone(), torch.zeros_like(cloud.texels), torch.zeros_like(cloud.texels), 0)
 
     def _start(self, texels: Tensor, first_moment: Tensor, second_moment: Tensor, steps: int) -> None:
@@ -77,7 +93,11 @@ class ReferenceStepper:
     @property
     def cloud(self) -> BillboardCloud:
         """See :class:`Stepper`."""
-        texels = self.texels.detach().cpu().clone()
+        return _copied(self.finish())
+
+    def finish(self) -> BillboardCloud:
+        """See :class:`Stepper`."""
+        texels = self.texels.detach().cpu()
         return self._movement.now(texels) if self._movement else self._cloud.to("cpu").with_texels(texels)
 
     def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0) -> Tensor:
@@ -88,11 +108,12 @@ class ReferenceStepper:
         if self._movement:
             moved = self._movement.parameters.clone().requires_grad_(bool(placement_rate))
             cloud = self._movement.placed(moved, self.texels).to(torch.float32).to(device)
-        image = render_reference(cloud, self._targets.cameras[list(chosen)].to(device))
-        config = self._config
+        config, cameras = self._config, self._targets.cameras[list(chosen)].to(device)
         assert config.loss is not None
-        target = self._targets.pictures(chosen).to(device)
-        loss = image_loss(image, target, config.loss, config.ssim_weight or 0.0, config.sharpness_weight or 0.0)
+        target, loss = self._targets.pictures(chosen).to(device), torch.zeros((), device=device)
+        for group in cloud.parts(self._groups):
+            image = render_reference(group, cameras)
+            loss = loss + image_loss(image, target, config.loss, config.ssim_weight or 0.0, config.sharpness_weight or 0.0)
         self._adam.zero_grad()
         (loss + (config.crispness_weight or 0.0) * blending(self.texels) / (target.shape[1] * target.shape[2])).backward()
         self._adam.step()
@@ -107,14 +128,25 @@ class ReferenceStepper:
 class FusedStepper:
     """The same by Warp kernels: one pass over the pixels and one over the texels."""
 
-    def __init__(self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None) -> None:
-        from bbfit.fitting.adam import AdamState
+    def __init__(
+        self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None, groups: int = 1
+    ) -> None:
+        from bbfit.fitting.adam import padded
+        from bbfit.rendering.fused_projection import Projector
         from bbfit.rendering.projection import project
 
-        self._cloud, self._targets, self._config, self._movement = cloud, targets, config, movement
-        self.state, self.steps = AdamState.start(cloud.texels), 0
+        self._cloud, self._targets, self._config, self._movement, self._groups = cloud.bare(), targets, config, movement, groups
+        self._begin, self.steps = padded(cloud.texels), 0
         self._scratch: list[Tensor] | None = None
-        self._standing = None if movement else project(cloud, targets.cameras.to(cloud.texels.device))
+        self._standing = None if movement else project(self._cloud, targets.cameras.to(cloud.texels.device))
+        self._projector = Projector(self._cloud, targets.cameras) if movement else None
+
+    @cached_property
+    def state(self) -> AdamState:
+        """Texels and Adam's moments; made by the first step, when the caller may have let go of the texels that they begin with."""
+        from bbfit.fitting.adam import AdamState
+
+        return AdamState.start(self._begin)
 
     @property
     def texels(self) -> Tensor:
@@ -124,7 +156,11 @@ class FusedStepper:
     @property
     def cloud(self) -> BillboardCloud:
         """See :class:`Stepper`."""
-        texels = self.texels.cpu().clone()
+        return _copied(self.finish())
+
+    def finish(self) -> BillboardCloud:
+        """See :class:`Stepper`."""
+        texels = self.texels.cpu()
         return self._movement.now(texels) if self._movement else self._cloud.to("cpu").with_texels(texels)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -141,35 +177,40 @@ class FusedStepper:
         """See :class:`Stepper`."""
         from bbfit.rendering.fused import PixelLoss, differentiate
 
-        state, config, device = self.state, self._config, self.state.texels.device
-        moved = self._movement.parameters.clone().requires_grad_(bool(placement_rate)) if self._movement else None
-        projection = self._project(chosen, moved)
+        state, config, device, movement = self.state, self._config, self.state.texels.device, self._movement
+        if movement is not None:
+            assert self._projector is not None
+            placement = movement.placement()
+            projection = self._projector.project(placement, chosen)
+        else:
+            assert self._standing is not None
+            projection = self._standing.take(torch.tensor(chosen, device=device))
+        projection, groups = projection.grouped(self._groups), self._groups
         pixels = len(chosen) * projection.width * projection.height
         assert config.loss is not None
-        loss = PixelLoss(self._targets.packed(chosen).to(device), self._targets.shrunk is None, config.loss, 1 / pixels)
+        target = self._targets.packed(chosen).to(device)
+        if groups > 1:
+            target = target.repeat(groups, 1, 1, 1)
+        loss = PixelLoss(target, self._targets.shrunk is None, config.loss, 1 / pixels)
         lost, of_image = self._perceived(projection, loss)
-        wanted = projection.to_texel.requires_grad
+        moves = movement is not None and placement_rate > 0
         sums, of_matrices = differentiate(
-            state.texels, projection, state.gradient, image_gradient=of_image, loss=loss, occupied=state.occupied, placement=wanted
+            state.texels,
+            projection,
+            state.gradient,
+            image_gradient=of_image,
+            loss=loss,
+            occupied=state.occupied,
+            placement=moves,
         )
         assert sums is not None
-        if moved is not None and of_matrices is not None:
-            assert self._movement is not None
-            (gradient,) = torch.autograd.grad(projection.to_texel, moved, of_matrices.to(projection.to_texel))
-            self._movement.update(gradient, placement_rate)
+        if of_matrices is not None:
+            assert movement is not None and self._projector is not None
+            of_matrices = of_matrices.unflatten(0, (groups, -1)).transpose(0, 1).flatten(1, 2)
+            movement.update(movement.pull_back(placement, self._projector.pull_back(of_matrices).cpu()), placement_rate)
         self.steps += 1
         state.update(self.steps, rate, (config.crispness_weight or 0.0) / (projection.width * projection.height))
         return sums.sum() / pixels + lost
-
-    def _project(self, chosen: Sequence[int], moved: Tensor | None) -> Projection:
-        """Where the chosen views see the billboards, after a movement if there is one."""
-        from bbfit.rendering.projection import project
-
-        device = self.state.texels.device
-        if self._standing is not None:
-            return self._standing.take(torch.tensor(chosen, device=device))
-        assert self._movement is not None and moved is not None
-        return project(self._movement.placed(moved, self._cloud.texels).to(device), self._targets.cameras[list(chosen)].to(device))
 
     def _perceived(self, projection: Projection, loss: PixelLoss) -> tuple[Tensor | float, Tensor | None]:
         """What is lost in structure and sharpness against the loss's target, weighted, and its gradient in the picture, [B, H, W, 4]."""
@@ -177,7 +218,10 @@ class FusedStepper:
         from bbfit.fitting.fused_ssim import similarity_and_gradient
         from bbfit.rendering.fused import draw, unpacked
 
-        ssim_weight, sharpness_weight = self._config.ssim_weight or 0.0, self._config.sharpness_weight or 0.0
+        # Both are means over views, and groups are to be added up.
+        ssim_weight, sharpness_weight = (
+            self._groups * (weight or 0.0) for weight in (self._config.ssim_weight, self._config.sharpness_weight)
+        )
         if not ssim_weight and not sharpness_weight:
             return 0.0, None
         # Memory that is kept: fresh pages for a few large pictures a step would cost as much as drawing them.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -90,6 +91,27 @@ class BillboardCloud:
     def with_texels(self, texels: Tensor) -> BillboardCloud:
         """The same rectangles with other texels, [P, 4]."""
         return replace(self, texels=texels)
+
+    def bare(self) -> BillboardCloud:
+        """The same rectangles with transparent texels, which take no memory; do not write to them."""
+        return self.with_texels(self.texels.new_zeros(1, 4).expand(len(self.texels), 4))
+
+    def take(self, kept: Iterable[int]) -> BillboardCloud:
+        """Some of the billboards, in the given order."""
+        kept, textures = list(kept), self.textures()
+        texels = [textures[n].reshape(-1, 4) for n in kept]
+        others = {name: getattr(self, name)[kept] for name in _TENSORS if name != "texels"}
+        return BillboardCloud(**others, texels=torch.cat(texels) if texels else self.texels[:0])
+
+    def parts(self, count: int) -> list[BillboardCloud]:
+        """The billboards in ``count`` clouds of equal numbers."""
+        each = len(self) // count
+        return [self.take(range(part * each, (part + 1) * each)) for part in range(count)] if count > 1 else [self]
+
+    @staticmethod
+    def joined(clouds: Sequence[BillboardCloud]) -> BillboardCloud:
+        """The billboards of several clouds in one."""
+        return BillboardCloud(**{name: torch.cat([getattr(cloud, name) for cloud in clouds]) for name in _TENSORS})
 
     def save(self, path: str | Path) -> None:
         """Write one ``.safetensors`` file, completely or not at all."""

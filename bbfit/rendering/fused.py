@@ -178,31 +178,33 @@ def differentiate(
         def launch(view: int, number: int, begin: int, end: int) -> None:
             wp.launch(kernel, (number, end - begin, pieces), [view, begin, *arguments], outputs, device=on)
 
-        for view, number, bands in _schedule(projection, device):
-            for phase in bands:
-                in_parallel(lambda begin, end, view=view, number=number: launch(view, number, begin, end), phase)  # type: ignore[misc]
+        for phase in _schedule(projection, device):
+            in_parallel(launch, phase)
     return (sums.sum(-1, dtype=torch.float64) if loss else None), (matrices.sum(1) if placement else None)
 
 
-def _schedule(projection: Projection, device: torch.device) -> list[tuple[int, int, list[list[tuple[int, int]]]]]:
-    """How launches that add to texels are cut up: a view, the number of views, and phases of bands of rows that can go at once.
+def _schedule(projection: Projection, device: torch.device) -> list[list[tuple[int, int, int, int]]]:
+    """How launches that add to texels are cut up: phases of pieces that can go at once, each a view, how many, and a band of rows.
 
     On a CPU bands of equal parity touch different texels, so no two threads ever add to the same one, and every texel's sum has one
     order. A GPU adds atomically. Small pictures are not worth the cutting.
     """
     views, height, width = len(projection), projection.height, projection.width
     if device.type == "cuda":
-        return [(0, views, [[(0, height)]])]
-    schedule: list[tuple[int, int, list[list[tuple[int, int]]]]] = []
+        return [[(0, views, 0, height)]]
+    if projection.groups > 1:
+        share = views // projection.groups
+        return [[(group * share, share, 0, height) for group in range(projection.groups)]]
+    phases = list[list[tuple[int, int, int, int]]]()
     for view, apart in enumerate(projection.rows_apart.tolist()):
         bands = pieces_of(height, max(apart, -(-LEAST_PIXELS // width)), MOST_BANDS)
         if len(bands) > 3:
-            schedule.append((view, 1, [bands[0::2], bands[1::2]]))
-        elif schedule and len(schedule[-1][2]) == 1:  # views that are not cut up go together
-            schedule[-1] = (schedule[-1][0], schedule[-1][1] + 1, schedule[-1][2])
+            phases += [[(view, 1, *band) for band in bands[parity::2]] for parity in (0, 1)]
+        elif phases and len(phases[-1]) == 1:  # views that are not cut up go together
+            phases[-1] = [(phases[-1][0][0], phases[-1][0][1] + 1, 0, height)]
         else:
-            schedule.append((view, 1, [[(0, height)]]))
-    return schedule
+            phases.append([(view, 1, 0, height)])
+    return phases
 
 
 def _capacity(count: int) -> int:
@@ -221,7 +223,7 @@ def _run(projection: Projection, device: torch.device) -> int:
 
 
 def _packed_planes(projection: Projection) -> Tensor:
-    """The memory of an array of :class:`bbfit.rendering.kernels.Plane`, int32 [V, N, 22]."""
+    """The memory of an array of :class:`bbfit.rendering.kernels.Plane`, int32 [V, N, 19]."""
     views, count = projection.boxes.shape[:2]
     numbers = [projection.to_texel.detach().reshape(views, count, 9), projection.nearness]
     return torch.cat([*(part.contiguous().view(torch.int32) for part in numbers), projection.textures, projection.boxes], -1)

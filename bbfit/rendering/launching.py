@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -44,15 +44,28 @@ def worker_count() -> int:
     return torch.get_num_threads()
 
 
-def in_parallel(launch: Callable[[int, int], None], pieces: Iterable[tuple[int, int]]) -> None:
-    """Call ``launch(begin, end)`` for every piece on :func:`worker_count` threads; return when all are done, raise what one raised."""
+def in_parallel(launch: Callable[..., None], pieces: Iterable[tuple[int, ...]]) -> None:
+    """Call ``launch(*piece)`` for every piece on :func:`worker_count` threads; return when all are done, raise what one raised.
+
+    The calling thread takes pieces like the others, and does not wait for one that has not begun: on a machine that is busy with other
+    things it then does most of the work itself, in place of waiting for its turn a thousand times a second.
+    """
     pieces = list(pieces)
-    if len(pieces) <= 1 or worker_count() == 1:
-        for begin, end in pieces:
-            launch(begin, end)
-        return
-    for _ in _pool(worker_count()).map(lambda piece: launch(*piece), pieces):
-        pass
+    left = iter(pieces)
+
+    def work() -> None:
+        for piece in left:  # each goes to one thread: the interpreter's lock is held between them
+            launch(*piece)
+
+    helpers = min(worker_count(), len(pieces)) - 1
+    others = [_pool(worker_count()).submit(work) for _ in range(helpers)]
+    try:
+        work()
+    finally:
+        begun = [other for other in others if not other.cancel()]
+        wait(begun)
+    for other in begun:
+        other.result()
 
 
 def pieces_of(count: int, least: int, most: int | None = None) -> list[tuple[int, int]]:

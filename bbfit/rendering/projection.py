@@ -38,6 +38,8 @@ class Projection:
     """Height of the picture in pixels."""
     orthographic: bool
     """Whether the views are parallel projections."""
+    groups: int = 1
+    """So many equal parts of the views, one after the other, see different texels each."""
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -51,6 +53,14 @@ class Projection:
         """The same for some of the views, int64 [B]."""
         per_view = ("to_texel", "nearness", "textures", "boxes", "rows_apart")
         return replace(self, **{name: getattr(self, name)[views] for name in per_view})
+
+    def grouped(self, groups: int) -> Projection:
+        """Each of ``groups`` equal parts of the billboards in views of its own: N / groups billboards in groups * V views, part by part."""
+        if groups == 1:
+            return self
+        per_plane = ("to_texel", "nearness", "textures", "boxes")
+        parts = {name: getattr(self, name).unflatten(1, (groups, -1)).transpose(0, 1).flatten(0, 1) for name in per_plane}
+        return replace(self, **parts, rows_apart=self.rows_apart.repeat(groups), groups=groups)
 
 
 def project(cloud: BillboardCloud, camera: Camera) -> Projection:

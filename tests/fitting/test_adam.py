@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bbfit.fitting.adam import BETAS, EPSILON, REST_AFTER, AdamState
+from bbfit.fitting.adam import BETAS, EPSILON, REST_AFTER, AdamState, padded
 from bbfit.rendering.fused import occupancy
 from bbfit.rendering.sampling import BLOCK
 
@@ -58,7 +58,7 @@ def test_hundreds_of_steps_are_torchs_adam_and_a_clamp() -> None:
     """Measured against float64: at most 7e-6 apart in any step; a step is up to 0.1. What rests misses 1e-5 of a step."""
     count = 1003
     texels = start(count)
-    state, leaf = AdamState.start(texels), texels.double().requires_grad_()
+    state, leaf = AdamState.start(padded(texels)), texels.double().requires_grad_()
     reference = torch.optim.Adam([leaf], betas=BETAS, eps=EPSILON)
     largest, rested, woken = 0.0, 0, 0
     for step in range(1, STEPS + 1):
@@ -87,7 +87,7 @@ def test_hundreds_of_steps_are_torchs_adam_and_a_clamp() -> None:
 @pytest.mark.parametrize("count", [1, 3, 4, 5, 7])
 def test_sizes_that_are_not_whole_blocks(count: int) -> None:
     texels = start(count)
-    state = AdamState.start(texels)
+    state = AdamState.start(padded(texels))
     assert len(state.texels) == -(-count // BLOCK) * BLOCK and torch.equal(state.texels[:count], texels)
     state.gradient[:count] += 1
     state.update(1, 0.1)
@@ -97,27 +97,27 @@ def test_sizes_that_are_not_whole_blocks(count: int) -> None:
 
 
 def test_no_texels_at_all() -> None:
-    state = AdamState.start(torch.zeros(0, 4))
+    state = AdamState.start(padded(torch.zeros(0, 4)))
     state.update(1, 0.1)
     assert state.texels.shape == (0, 4)
 
 
 def test_an_update_without_gradients_moves_nothing_at_first() -> None:
-    state = AdamState.start(start(100))
+    state = AdamState.start(padded(start(100)))
     for step in range(1, 5):
         state.update(step, 0.1)
-    assert torch.equal(state.texels, AdamState.start(start(100)).texels)
+    assert torch.equal(state.texels, AdamState.start(padded(start(100))).texels)
 
 
 @pytest.mark.parametrize("until", [40, 300])
 def test_going_on_from_what_was_kept_is_going_on(until: int) -> None:
     count = 203
-    whole, first = AdamState.start(start(count)), AdamState.start(start(count))
+    whole, first = AdamState.start(padded(start(count))), AdamState.start(padded(start(count)))
     advance(whole, count, range(1, STEPS))
     advance(first, count, range(1, until))
     kept = {name: tensor.clone() for name, tensor in first.tensors().items()}
     advance(first, count, range(until, until + 3))  # what was kept must not follow
-    resumed = AdamState.start(torch.rand(count, 4)).restored(kept)
+    resumed = AdamState.start(padded(torch.rand(count, 4))).restored(kept)
     assert torch.equal(resumed.occupied, occupancy(resumed.texels)) and not resumed.gradient.any()
     advance(resumed, count, range(until, STEPS))
     for name in ("texels", "gradient", "first_moment", "second_moment", "last", "occupied"):
@@ -131,7 +131,7 @@ def test_same_bytes_with_any_number_of_threads() -> None:
     states = []
     for number in (1, 2, 3):
         torch.set_num_threads(number)
-        states.append(AdamState.start(start(count)))
+        states.append(AdamState.start(padded(start(count))))
         advance(states[-1], count, range(1, 8))
     for other in states[1:]:
         assert all(torch.equal(a, b) for a, b in zip(states[0].tensors().values(), other.tensors().values(), strict=True))
@@ -140,7 +140,7 @@ def test_same_bytes_with_any_number_of_threads() -> None:
 
 def test_crispness_is_a_gradient_of_alphas_that_are_not_zero() -> None:
     texels = start(40)
-    plain, crisp = AdamState.start(texels), AdamState.start(texels)
+    plain, crisp = AdamState.start(padded(texels)), AdamState.start(padded(texels))
     for step in range(1, 4):
         gradient = gradient_of(step, 40)
         crisp.gradient[:40] = gradient
@@ -151,7 +151,7 @@ def test_crispness_is_a_gradient_of_alphas_that_are_not_zero() -> None:
         plain.update(step, 0.05)
         crisp.update(step, 0.05, crispness=0.3)
     torch.testing.assert_close(crisp.texels, plain.texels, atol=1e-6, rtol=0)
-    untouched = AdamState.start(texels)
+    untouched = AdamState.start(padded(texels))
     for step in range(1, 4):
         untouched.gradient[:40] = gradient_of(step, 40)
         untouched.update(step, 0.05)

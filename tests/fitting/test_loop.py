@@ -192,6 +192,16 @@ def test_bad_configurations_are_refused_by_name(fields: dict[str, object]) -> No
         FitConfig(**fields)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("preset", ["default", "thesis"])
+def test_at_less_than_full_resolution_sharpness_and_crispness_have_no_weight(preset: str) -> None:
+    """All else stays, and so does the configuration itself."""
+    config = FitConfig(preset=preset, billboards=5, sharpness_weight=7.0, crispness_weight=0.5, ssim_weight=0.03, seed=4)
+    coarse = config.coarse()
+    assert (coarse.sharpness_weight, coarse.crispness_weight) == (0.0, 0.0)
+    assert dataclasses.replace(coarse, sharpness_weight=7.0, crispness_weight=0.5) == config
+    assert config.resolve().coarse() == coarse.resolve() and FitConfig(preset=preset).coarse().resolve().sharpness_weight == 0.0
+
+
 def test_unknown_device_is_refused(views: ViewDataset) -> None:
     with pytest.raises(InputError, match="device"):
         fit(views, FitConfig(device="abacus"))

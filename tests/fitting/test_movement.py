@@ -130,6 +130,57 @@ def test_gradients_are_finite_differences(size: float) -> None:
     assert torch.autograd.gradcheck(placement, ((size * uniform(2, 8, seed=1)).requires_grad_(),), eps=1e-6, atol=1e-8, rtol=1e-6)
 
 
+def rotations() -> dict[str, Tensor]:
+    """Rotation vectors, [N, 3]: none, minute ones, on either side of where a formula gives way to its limit, and beyond half a turn."""
+    directions = torch.nn.functional.normalize(uniform(24, 3, seed=4), dim=-1)
+    sizes = {f"{size:g}": size for size in (0.0, 1e-160, 1e-9, 1e-6, 0.99e-4, 1.01e-4, 1e-3, 0.1, 1.0, 3.0, 3.3, 5.0, 7.0)}
+    sizes |= {"half a turn": math.pi, "a whole turn": 2 * math.pi}
+    mixed = torch.tensor([[0.0], [1e-6], [0.3], [4.0]], dtype=torch.float64).repeat(6, 1)
+    return {name: size * directions for name, size in sizes.items()} | {"of all sizes": mixed * directions}
+
+
+def turned_by(vectors: Tensor) -> tuple[BillboardCloud, Movement]:
+    """A cloud and its movement by rotations and anything else."""
+    cloud = leaning_cloud(len(vectors))
+    movement, numbers = Movement(cloud, REACH), uniform(len(vectors), 8, seed=5)
+    numbers[:, 3:6] = vectors
+    movement.restore({"movement": torch.stack([numbers, 0 * numbers, 0 * numbers]), "movement_steps": torch.tensor([0])})
+    assert torch.equal(movement.parameters, numbers)
+    return cloud, movement
+
+
+def side_by_side(cloud: BillboardCloud) -> Tensor:
+    return torch.cat([getattr(cloud, name) for name in PLACEMENT], -1)
+
+
+@pytest.mark.parametrize("vectors", rotations().values(), ids=rotations())
+def test_the_placement_is_that_of_the_placed_cloud(vectors: Tensor) -> None:
+    cloud, movement = turned_by(vectors)
+    found = movement.placement()
+    assert found.shape == (24, 11) and found.dtype == torch.float64
+    torch.testing.assert_close(found, side_by_side(movement.placed(movement.parameters, cloud.texels)), atol=1e-14, rtol=0)
+
+
+@pytest.mark.parametrize("vectors", rotations().values(), ids=rotations())
+def test_the_placements_gradient_is_autograds(vectors: Tensor) -> None:
+    cloud, movement = turned_by(vectors)
+    gradient = uniform(24, 11, seed=6)
+    leaf = movement.parameters.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(side_by_side(movement.placed(leaf, cloud.texels)), leaf, gradient)
+    placement = movement.placement()
+    before, given = movement.parameters.clone(), (placement.clone(), gradient.clone())
+    found = movement.pull_back(placement, gradient)
+    assert found.shape == (24, 8) and found.dtype == torch.float64
+    torch.testing.assert_close(found, expected, atol=2e-14, rtol=0)  # measured 5e-15
+    assert torch.equal(movement.parameters, before) and torch.equal(placement, given[0]) and torch.equal(gradient, given[1])
+
+
+def test_the_placement_and_its_gradient_of_no_billboards() -> None:
+    movement = Movement(leaning_cloud(0), REACH)
+    assert movement.placement().shape == (0, 11)
+    assert movement.pull_back(movement.placement(), torch.zeros(0, 11, dtype=torch.float64)).shape == (0, 8)
+
+
 def gradient_of(step: int, count: int = 4) -> Tensor:
     """Gradients of all magnitudes from 1e-6 to 10, some of them zero for a while."""
     gradient = uniform(count, 8, seed=step) * 10.0 ** torch.arange(-6, 2, dtype=torch.float64)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bbfit.checks import InputError, MissingFileError
-from bbfit.fitting.points import hull_points, mesh_points, point_colours
+from bbfit.fitting.points import hull_points, mesh_points, pixels_of, point_colours
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.orbit import Orbit
 from bbfit.views import ViewDataset, ViewSet
@@ -329,7 +329,7 @@ def test_seen_from_above_or_below_the_hull_of_a_ball_is_not_much_more_either(ele
 
 def test_silhouettes_that_contradict_each_other_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing can be on the left from all sides."""
-    monkeypatch.setattr("bbfit.fitting.points._CARVED", 1 << 16)  # sixteen vain rounds take a while
+    monkeypatch.setattr("bbfit.fitting.points._CARVED", 1 << 14)  # dozens of vain rounds take a while
     pictures = torch.zeros(4, 32, 32, 4, dtype=torch.uint8)
     pictures[:, 8:24, 2:10] = 255
     with pytest.raises(InputError, match=r"^views: .*no point in common"):
@@ -339,11 +339,82 @@ def test_silhouettes_that_contradict_each_other_are_refused(monkeypatch: pytest.
 # Colours
 
 
-def colour_scene() -> tuple[Tensor, ViewSet, Tensor]:
-    """Points one above another on the ring's axis, so that each keeps its row in all four views, the views, and pictures with nothing."""
-    cameras = ring_around_origin(4, 32, 32)
+def square_on(width: int, height: int) -> Camera:
+    """A parallel projection from above that shows the point (x, y, z) at column x and row z, exactly."""
+    pose = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]).double()
+    return Camera(pose, torch.eye(3).double(), width, height, orthographic=True)
+
+
+def test_a_points_pixel_is_the_nearest_counted_row_by_row() -> None:
+    camera = square_on(5, 3)
+    y, x = torch.meshgrid(torch.arange(3).double(), torch.arange(5).double(), indexing="ij")
+    for off_x, off_y in ((0, 0), (0.45, 0), (0, -0.45), (-0.49, 0.49)):
+        points = torch.stack([x + off_x, torch.full_like(x, 7.0), y + off_y], -1).view(-1, 3)
+        index, inside = pixels_of(points, camera)
+        assert index.dtype == torch.int32 and inside.dtype == torch.bool
+        assert index.tolist() == list(range(15)) and inside.all()
+
+
+@pytest.mark.parametrize(("width", "height"), [(5, 3), (3, 5), (1, 1)])
+def test_points_beyond_a_pictures_edges_are_not_in_it(width: int, height: int) -> None:
+    """Pixels reach half a pixel beyond their centres; far away is outside as well."""
+    right, bottom = width - 1, height - 1
+    at = {
+        (0, 0): True,
+        (right, bottom): True,
+        (-0.49, 0): True,
+        (0, -0.49): True,
+        (right + 0.49, bottom): True,
+        (right, bottom + 0.49): True,
+        (-0.51, 0): False,
+        (0, -0.51): False,
+        (right + 0.51, bottom): False,
+        (right, bottom + 0.51): False,
+        (-1, bottom): False,
+        (right, -1): False,
+        (right + 1, 0): False,
+        (0, bottom + 1): False,
+    }
+    for far in (10.0, 1e4, 1e10, 1e300):
+        at |= {(far, 0): False, (-far, 0): False, (0, far): False, (0, -far): False}
+    points = torch.tensor([[x, 0.0, y] for x, y in at], dtype=torch.float64)
+    index, inside = pixels_of(points, square_on(width, height))
+    assert inside.tolist() == list(at.values())
+    assert ((index[inside] >= 0) & (index[inside] < width * height)).all()
+    assert index[:2].tolist() == [0, width * height - 1]
+
+
+def test_points_behind_a_camera_are_not_in_its_picture() -> None:
+    """Even those that would be in its middle; and those right beside it, whose projection is infinitely far away."""
+    camera = ring_around_origin(1, 9, 7)[0]
+    before = camera.position + torch.tensor([[1.0], [0.1], [1e-3]], dtype=torch.float64) * camera.forward
+    behind = camera.position - torch.tensor([[0.0], [1e-3], [1.0]], dtype=torch.float64) * camera.forward
+    beside = camera.position + camera.world_to_camera[:2, :3]
+    index, inside = pixels_of(torch.cat([before, behind, beside, beside + 1e-12 * camera.forward]), camera)
+    assert inside.tolist() == [True] * 3 + [False] * 7
+    assert index[:3].tolist() == [3 * 9 + 4] * 3
+
+
+def test_pixels_are_where_the_camera_projects_to() -> None:
+    """Of a picture wider than it is high, by a pinhole."""
+    camera = ring_around_origin(3, 40, 22, elevation=25.0)[1]
+    points = 6 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 3
+    x, y = (camera.project(points) + 0.5).floor().long().unbind(-1)
+    inside = (x >= 0) & (x < 40) & (y >= 0) & (y < 22)
+    found, shown = pixels_of(points, camera)
+    assert torch.equal(shown, inside) and 500 < int(inside.sum()) < 1800
+    assert torch.equal(found[inside].long(), (40 * y + x)[inside])
+
+
+def seen_by(points: Tensor, cameras: Camera) -> list[tuple[Tensor, Tensor]]:
+    """The pixels of points in every view."""
+    return [pixels_of(points, cameras[view]) for view in range(len(cameras))]
+
+
+def colour_scene() -> tuple[Tensor, Camera, Tensor]:
+    """Points one above another on the ring's axis, so that each keeps its row in all four views, the cameras, and pictures with nothing."""
     points = torch.tensor([[0.0, y, 0.0] for y in (-0.6, 0.0, 0.6)], dtype=torch.float64)
-    return points, viewset(torch.zeros(4, 32, 32, 4, dtype=torch.uint8), cameras), torch.zeros(4, 32, 32, 4)
+    return points, ring_around_origin(4, 32, 24), torch.zeros(4, 24, 32, 4)
 
 
 def paint(pictures: Tensor, camera: Camera, view: int, point: Tensor, straight: tuple[float, float, float], alpha: float) -> None:
@@ -353,13 +424,13 @@ def paint(pictures: Tensor, camera: Camera, view: int, point: Tensor, straight: 
 
 
 def test_a_points_colour_is_the_mean_of_what_the_views_show_weighted_by_alpha() -> None:
-    points, views, pictures = colour_scene()
+    points, cameras, pictures = colour_scene()
     red, blue = (0.8, 0.1, 0.0), (0.0, 0.3, 0.9)
     for view, alpha in enumerate((1.0, 0.5, 0.25, 0.01)):
-        paint(pictures, views.cameras, view, points[0], red, alpha)
+        paint(pictures, cameras, view, points[0], red, alpha)
     for view, colour, alpha in ((0, red, 0.25), (2, blue, 0.75)):  # and background in the other two, which has no say
-        paint(pictures, views.cameras, view, points[1], colour, alpha)
-    colours = point_colours(points, views, views.cameras, pictures)
+        paint(pictures, cameras, view, points[1], colour, alpha)
+    colours = point_colours(seen_by(points, cameras), pictures)
     assert colours.dtype == torch.float32
     expected = torch.tensor([red, tuple(0.25 * r + 0.75 * b for r, b in zip(red, blue, strict=True)), (0.0, 0.0, 0.0)])
     torch.testing.assert_close(colours, expected, atol=1e-5, rtol=0)
@@ -371,7 +442,11 @@ def test_views_that_do_not_see_a_point_have_no_say() -> None:
     pose[1, 0, 3] += 3.0  # its picture lies to the side of everything
     cameras = Camera(pose, pinhole_intrinsics(40, 16, 16).repeat(3, 1, 1), 16, 16)
     pictures = torch.ones(3, 16, 16, 4) * torch.tensor([[1.0, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]])[:, None, None]
-    views = viewset(torch.zeros(3, 16, 16, 4, dtype=torch.uint8), cameras)
     points = torch.tensor([[0.0, 0, 0], [0, 0, 2], [0, 50, 0]], dtype=torch.float64)  # the second is behind the first camera
-    colours = point_colours(points, views, cameras, pictures)
+    colours = point_colours(seen_by(points, cameras), pictures)
     torch.testing.assert_close(colours, torch.tensor([[0.5, 0, 0.5], [0, 0, 1], [0, 0, 0]]), atol=1e-6, rtol=0)
+
+
+def test_every_view_has_its_own_pixels() -> None:
+    with pytest.raises(ValueError, match="zip"):
+        point_colours(seen_by(torch.zeros(1, 3).double(), ring_around_origin(3, 8, 8)), torch.zeros(4, 8, 8, 4))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,11 +12,12 @@ import torch
 from torch import Tensor
 
 from bbfit.fitting.config import FitConfig
-from bbfit.fitting.levels import Targets
-from bbfit.fitting.losses import image_loss
+from bbfit.fitting.levels import Targets, resize_textures
+from bbfit.fitting.losses import blending, image_loss
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.steps import FusedStepper, ReferenceStepper, Stepper, make_stepper
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.rendering import fused
 from bbfit.rendering.reference import render_reference
 from bbfit.views import ViewDataset, ViewSet
 
@@ -213,3 +216,119 @@ def test_the_backend_chooses_the_stepper(displaced: BillboardCloud, views: ViewS
     assert type(stepper) is kind
     stepper.step([0], 1e-3, 0.02)
     assert movement.parameters.any()
+
+
+GROUPED = CONFIGS | {
+    "all weights": FitConfig(ssim_weight=0.05, sharpness_weight=20, crispness_weight=0.1),
+    "only sharpness": FitConfig(preset="thesis", sharpness_weight=20),
+}
+
+
+@pytest.fixture(scope="module")
+def several(known_cloud: BillboardCloud) -> list[BillboardCloud]:
+    """Three clouds of two billboards each, all displaced, repainted and of other sizes, the last one with a back as well.
+
+    All but the second fill their last block of texels.
+    """
+    clouds = []
+    for n, sizes in enumerate(([[36, 30], [36, 30]], [[21, 17], [23, 15]], [[30, 32], [24, 22]])):
+        generator = torch.Generator().manual_seed(n)
+        numbers = 0.2 * torch.rand(2, 8, generator=generator, dtype=torch.float64) - 0.1
+        cloud = Movement(known_cloud, REACH).placed(numbers, known_cloud.texels).to(torch.float32)
+        cloud = resize_textures(cloud, torch.tensor(sizes))
+        if n == 2:
+            first, second = (texture.reshape(-1, 4) for texture in cloud.textures())
+            cloud = replace(cloud, two_sided=torch.tensor([True, False]), texels=torch.cat([first, first.flip(0), second]))
+        noise = torch.rand(cloud.texels.shape, generator=generator)
+        clouds.append(cloud.with_texels(torch.where(cloud.texels[:, 3:] > 0, 0.7 * cloud.texels + 0.2 * noise, 0)))
+    return clouds
+
+
+def of_group(cloud: BillboardCloud, number: int) -> BillboardCloud:
+    """One of several clouds of two billboards that are joined."""
+    return cloud.take([2 * number, 2 * number + 1])
+
+
+@pytest.mark.parametrize("backend", ["reference", "fused"])
+@pytest.mark.parametrize("moving", [True, False])
+@pytest.mark.parametrize("halvings", [0, 1])
+@pytest.mark.parametrize("config", GROUPED.values(), ids=GROUPED.keys())
+def test_clouds_side_by_side_step_as_each_alone(
+    several: list[BillboardCloud], views: ViewSet, config: FitConfig, halvings: int, moving: bool, backend: str
+) -> None:
+    """To the bit, textures and placement alike; the losses are added up."""
+    config, targets = replace(config, backend=backend).resolve(), Targets.at(views, halvings)
+    if config.crispness_weight:  # what no view shows becomes crisp with what it shares a block with
+        several = [several[0], several[2], several[1]]
+
+    def fitted(cloud: BillboardCloud, groups: int) -> tuple[BillboardCloud, list[float]]:
+        stepper = make_stepper(cloud, targets, config, Movement(cloud, REACH) if moving else None, groups=groups)
+        losses = advance(stepper, views, range(5), 60, rate=0.05)
+        return stepper.cloud, [float(loss) for loss in losses]
+
+    together, losses = fitted(BillboardCloud.joined(several), 3)
+    alone = [fitted(cloud, 1) for cloud in several]
+    for number, (cloud, _) in enumerate(alone):
+        for name in (*PLACEMENT, "texels"):
+            assert torch.equal(getattr(of_group(together, number), name), getattr(cloud, name)), (number, name)
+        assert float((cloud.texels - several[number].texels).abs().max()) > 0.1
+        assert (off(cloud, several[number]) > 0.05) == moving
+    assert losses == pytest.approx([sum(those) for those in zip(*(each for _, each in alone), strict=True)], rel=1e-6)
+    assert len({round(each[0], 5) for _, each in alone}) == 3
+
+
+@pytest.mark.parametrize("backend", ["reference", "fused"])
+def test_crispness_is_the_same_side_by_side(several: list[BillboardCloud], views: ViewSet, backend: str) -> None:
+    """It is a sum over texels and no mean over views: beside others a cloud becomes as crisp as alone, and crisper than without."""
+    clouds = []
+    for weight in (1.0, 0.0):
+        config = FitConfig(preset="thesis", crispness_weight=weight, backend=backend).resolve()
+        for joined, groups in (([several[2], several[0], several[1]], 3), ([several[2]], 1)):
+            stepper = make_stepper(BillboardCloud.joined(joined), Targets.at(views, 0), config, groups=groups)
+            advance(stepper, views, range(10), 60, rate=0.02)
+            clouds.append(of_group(stepper.cloud, 0))
+    blends = [float(blending(cloud.texels)) for cloud in clouds]
+    assert blends[0] == blends[1] < 0.9 * blends[2] and blends[2] == blends[3]
+
+
+@pytest.mark.parametrize("backend", ["reference", "fused"])
+def test_groups_go_on_from_what_was_kept(several: list[BillboardCloud], views: ViewSet, backend: str) -> None:
+    config = FitConfig(preset="thesis", ssim_weight=0.02, backend=backend).resolve()
+    joined, targets = BillboardCloud.joined(several), Targets.at(views, 1)
+    whole, first, resumed = (make_stepper(joined, targets, config, Movement(joined, REACH), groups=3) for _ in range(3))
+    advance(whole, views, range(6), 60, rate=0.05)
+    advance(first, views, range(3), 60, rate=0.05)
+    resumed.restore({name: tensor.clone() for name, tensor in first.tensors().items()}, 3)
+    advance(resumed, views, range(3, 6), 60, rate=0.05)
+    for name in (*PLACEMENT, "texels"):
+        assert torch.equal(getattr(resumed.cloud, name), getattr(whole.cloud, name)), name
+
+
+@pytest.mark.parametrize("config", GROUPED.values(), ids=GROUPED.keys())
+def test_groups_have_the_same_bytes_with_any_number_of_threads(several: list[BillboardCloud], views: ViewSet, config: FitConfig) -> None:
+    joined, targets, before, results = BillboardCloud.joined(several), Targets.at(views, 0), torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            stepper = make_stepper(joined, targets, config.resolve(), Movement(joined, REACH), groups=3)
+            losses = advance(stepper, views, range(4), 60, rate=0.05)
+            results.append([*losses, *stepper.tensors().values()])
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(ours, first) for ours, first in zip(other, results[0], strict=True))
+
+
+def test_groups_are_differentiated_at_once(several: list[BillboardCloud], views: ViewSet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every group's four views are a piece for a thread."""
+    launched, original = [], fused.in_parallel
+
+    def watched(launch: Callable[..., None], pieces: Iterable[tuple[int, ...]]) -> None:
+        launched.append(list(pieces))
+        original(launch, launched[-1])
+
+    monkeypatch.setattr(fused, "in_parallel", watched)
+    joined = BillboardCloud.joined(several)
+    stepper = make_stepper(joined, Targets.at(views, 0), FitConfig(preset="thesis").resolve(), Movement(joined, REACH), groups=3)
+    advance(stepper, views, range(1), 60)
+    assert launched == [[(0, 4, 0, 40), (4, 4, 0, 40), (8, 4, 0, 40)]]

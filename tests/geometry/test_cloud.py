@@ -47,6 +47,85 @@ def test_dtype_conversion_leaves_whole_numbers_alone() -> None:
     assert set(kinds.values()) == {torch.float64}
 
 
+def mixed_cloud(count: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> BillboardCloud:
+    """Billboards that all differ in place and size, every third of them two-sided, with random texels."""
+    generator = torch.Generator().manual_seed(seed)
+    vectors = [torch.randn(count, n, generator=generator, dtype=dtype) for n in (3, 3, 3, 2)]
+    sizes = torch.randint(1, 6, (count, 2), generator=generator)
+    two_sided = torch.arange(count) % 3 == 1
+    texels = torch.rand(int((sizes.prod(-1) * (1 + two_sided.long())).sum()), 4, generator=generator, dtype=dtype)
+    return BillboardCloud(*vectors, sizes, two_sided, texels)
+
+
+def assert_same(a: BillboardCloud, b: BillboardCloud) -> None:
+    for field in fields(BillboardCloud):
+        ours, theirs = getattr(a, field.name), getattr(b, field.name)
+        assert ours.dtype == theirs.dtype and torch.equal(ours, theirs), field.name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bare_rectangles_have_transparent_texels_that_take_no_memory(dtype: torch.dtype) -> None:
+    cloud = small_cloud(dtype)
+    tracked = cloud.with_texels(cloud.texels.clone().requires_grad_())
+    bare = tracked.bare()
+    assert_same(bare, cloud.with_texels(torch.zeros_like(cloud.texels)))
+    assert bare.texels.untyped_storage().nbytes() == 4 * cloud.texels.element_size() and not bare.texels.requires_grad
+    with pytest.raises(RuntimeError):
+        bare.texels.add_(1)
+    assert [texture.shape for texture in bare.textures()] == [texture.shape for texture in cloud.textures()]
+    assert tracked.texels.any()
+
+
+@pytest.mark.parametrize("kept", [[0], [4], [1, 2], [3, 1], [2, 2, 0], [5, 4, 3, 2, 1, 0], []])
+def test_taken_billboards_keep_all_that_is_theirs_in_the_given_order(kept: list[int]) -> None:
+    cloud = mixed_cloud(6)
+    some = cloud.take(number for number in kept)
+    assert len(some) == len(kept) and len(some.textures()) == len(kept)
+    for ours, number in zip(range(len(kept)), kept, strict=True):
+        for field in fields(cloud):
+            if field.name != "texels":
+                assert torch.equal(getattr(some, field.name)[ours], getattr(cloud, field.name)[number]), field.name
+        assert torch.equal(some.textures()[ours], cloud.textures()[number])
+    assert_same(cloud, mixed_cloud(6))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6])
+def test_parts_are_equal_numbers_of_billboards_in_order(count: int) -> None:
+    cloud = mixed_cloud(6)
+    parts, each = cloud.parts(count), 6 // count
+    assert [len(part) for part in parts] == [each] * count
+    for number, part in enumerate(parts):
+        assert_same(part, cloud.take(range(each * number, each * number + each)))
+    assert_same(BillboardCloud.joined(parts), cloud)
+
+
+def test_joined_clouds_are_the_clouds_one_after_the_other() -> None:
+    """Of any number of billboards each, also none."""
+    clouds = [mixed_cloud(3, 1), mixed_cloud(1, 2), mixed_cloud(4, 3).take([]), mixed_cloud(4, 4)]
+    whole = BillboardCloud.joined(clouds)
+    assert len(whole) == 8
+    assert_same(whole.take(range(3)), clouds[0])
+    assert_same(whole.take([3]), clouds[1])
+    assert_same(whole.take(range(4, 8)), clouds[3])
+    assert_same(BillboardCloud.joined(clouds[:1]), clouds[0])
+    nothing = BillboardCloud.joined([cloud.take([]) for cloud in clouds])
+    assert len(nothing) == 0 and nothing.texels.shape == (0, 4)
+
+
+def test_gradients_pass_through_parts_and_joins() -> None:
+    cloud = mixed_cloud(4)
+    leaves = {name: getattr(cloud, name).clone().requires_grad_() for name in ("centers", "texels")}
+    second, first = replace(cloud, **leaves).parts(2)[::-1]
+    whole = BillboardCloud.joined([second, first, second])
+    weights = torch.arange(1.0, len(whole.texels) + 1)
+    ((whole.texels.sum(-1) * weights).sum() + (whole.centers.sum(-1) * weights[: len(whole)]).sum()).backward()
+    assert leaves["centers"].grad is not None and leaves["texels"].grad is not None
+    assert leaves["centers"].grad[:, 0].tolist() == [3, 4, 1 + 5, 2 + 6]
+    n, m = len(second.texels), len(first.texels)
+    expected = torch.cat([weights[n : n + m], weights[:n] + weights[n + m :]])
+    assert torch.equal(leaves["texels"].grad, expected[:, None].expand(-1, 4))
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
 def test_upright_billboards_stand_evenly_around_the_axis(count: int) -> None:
     axis = torch.tensor([1.0, 2, 3], dtype=torch.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,6 +14,8 @@ from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
 
 PLACEMENT = ("centers", "rights", "ups", "half_extents")
+CORNERS = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).numpy()
+"""Of a cube of two metres around the origin."""
 
 
 def cloud_of(
@@ -76,6 +79,16 @@ def tracked(cloud: BillboardCloud) -> tuple[BillboardCloud, dict[str, Tensor]]:
     return replace(cloud, **leaves), leaves
 
 
+def placement_of(cloud: BillboardCloud) -> Tensor:
+    """Centres, rights, ups and half extents side by side, float64 [N, 11]."""
+    return torch.cat([getattr(cloud, name) for name in PLACEMENT], -1).double()
+
+
+def placed_at(cloud: BillboardCloud, placement: Tensor) -> BillboardCloud:
+    """The cloud with a placement as :func:`placement_of` gives it."""
+    return replace(cloud, **dict(zip(PLACEMENT, placement.split((3, 3, 3, 2), -1), strict=True)))
+
+
 def noise(cloud: BillboardCloud, seed: int = 0) -> BillboardCloud:
     """The cloud with random texels of its dtype."""
     generator = torch.Generator().manual_seed(seed)
@@ -85,6 +98,29 @@ def noise(cloud: BillboardCloud, seed: int = 0) -> BillboardCloud:
 def ring_of(size: int, billboards: int = 4, views: int = 2) -> tuple[BillboardCloud, Camera]:
     """Upright billboards with noise on them, and some views of them as a fit has them, float32."""
     cloud = even_upright(billboards, axis=torch.zeros(3), half_extents=torch.ones(2), texture_sizes=torch.tensor([size, size]))
-    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).numpy()
-    cameras = Orbit(7, (10.0,)).frame(corners, target=torch.zeros(3).double(), width=size, height=size)
+    cameras = Orbit(7, (10.0,)).frame(CORNERS, target=torch.zeros(3).double(), width=size, height=size)
     return noise(cloud), cameras[1 : 1 + views]
+
+
+def scenes(count: int) -> list[tuple[BillboardCloud, Camera]]:
+    """Tilted planes, near, far and partly behind, with textures finer and coarser than pixels, pinhole and parallel."""
+    made = []
+    for seed in range(count):
+        cloud, camera = random_scene(seed, 3, orthographic=seed % 2 == 1)
+        sizes = cloud.texture_sizes * (1 + 7 * (seed % 3))
+        cloud = replace(cloud, texture_sizes=sizes, texels=torch.zeros(int((sizes.prod(-1) * (1 + cloud.two_sided.long())).sum()), 4))
+        made.append((cloud, camera.resized(24, 40)))
+        for fov in (35.0, None):
+            elevation, extent = -50.0 + 25 * (seed % 5), 1.0 + seed % 3
+            made.append((cloud, ring(extent * CORNERS, 31, 60, elevation, fov)))
+    return made
+
+
+def ring(points: np.ndarray, width: int, height: int, elevation: float = 0.0, fov: float | None = 35.0) -> Camera:
+    """Three cameras around the origin."""
+    return Orbit(3, (elevation,)).frame(points, target=torch.zeros(3).double(), width=width, height=height, fov_x_degrees=fov)
+
+
+def upright(size: int, count: int = 4) -> BillboardCloud:
+    """Billboards as a fit starts with."""
+    return even_upright(count, axis=torch.zeros(3), half_extents=torch.ones(2), texture_sizes=torch.tensor([size, size]))

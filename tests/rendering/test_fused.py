@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from scenes import PLACEMENT, camera_on_z, cloud_of, facing_cloud, noise, random_scene, ring_of, rolled, tracked
+from scenes import CORNERS, PLACEMENT, camera_on_z, cloud_of, facing_cloud, noise, random_scene, ring, ring_of, rolled, tracked
 from torch import Tensor
 
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
@@ -16,8 +16,8 @@ from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
 from bbfit.rendering import fused
 from bbfit.rendering.dispatch import render
-from bbfit.rendering.fused import differentiate, render_fused
-from bbfit.rendering.projection import project
+from bbfit.rendering.fused import PixelLoss, differentiate, render_fused
+from bbfit.rendering.projection import Projection, project
 from bbfit.rendering.reference import render_reference
 
 # Relative L2 of a picture and of each of its gradients, for all scenes here. Float32 rounds texel coordinates to about 1e-7 of the texture,
@@ -236,7 +236,7 @@ def test_bands_of_rows_lose_nothing(seed: int, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(fused, "LEAST_PIXELS", 1)
     torch.set_num_threads(4)
     cloud, _ = random_scene(seed, 3, orthographic=False)
-    corners = 2 * torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).numpy()
+    corners = 2 * CORNERS
     camera = Orbit(5, (30.0,)).frame(corners, target=torch.zeros(3).double(), width=45, height=150, fov_x_degrees=None if seed == 1 else 40)
     assert (project(cloud, camera).rows_apart < 35).any()
     results = [drawn(render_fused, cloud.to(torch.float32), camera) for _ in range(3)]
@@ -252,6 +252,63 @@ def test_the_gradient_in_the_placement_costs_the_texels_nothing() -> None:
         sums, matrices = differentiate(cloud.texels, projection, gradient, image_gradient=of_image, placement=placement)
         assert sums is None and (matrices is not None) == placement
     assert gradients[0].any() and torch.equal(*gradients)
+
+
+class Backward(NamedTuple):
+    texels: Tensor
+    sums: Tensor
+    matrices: Tensor
+
+
+def backward(texels: Tensor, projection: Projection, pictures: Tensor, norm: str = "l2") -> Backward:
+    """All that the backward pass tells of a loss against pictures, plus a linear functional made of them."""
+    of_texels, of_image = torch.zeros_like(texels), pictures.float().roll(3, 1) - 100
+    loss = PixelLoss(pictures, True, norm, 30.0)
+    sums, matrices = differentiate(texels, projection, of_texels, image_gradient=of_image, loss=loss, placement=True)
+    assert sums is not None and matrices is not None
+    return Backward(of_texels, sums, matrices)
+
+
+def six_in_groups(groups: int, width: int, height: int) -> tuple[BillboardCloud, Camera, Tensor]:
+    """One- and two-sided billboards with textures of all sizes, three views, and other random pictures for each group, partly empty."""
+    cloud, camera = random_scene(4, 6, orthographic=False)[0].to(torch.float32), ring(2 * CORNERS, width, height, 20.0)
+    pictures = torch.randint(0, 256, (3 * groups, height, width, 4), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    pictures[:, : height // 3] = 0
+    return cloud, camera, pictures
+
+
+def one_by_one(cloud: BillboardCloud, camera: Camera, pictures: Tensor, norm: str, groups: int) -> Backward:
+    """What groups tell that are not side by side, put side by side."""
+    parts = zip(cloud.parts(groups), pictures.split(3), strict=True)
+    alone = [backward(part.texels, project(part, camera), own, norm) for part, own in parts]
+    return Backward(*(torch.cat(tensors) for tensors in zip(*alone, strict=True)))
+
+
+@pytest.mark.parametrize("norm", ["l1", "l2", "backgrounds"])
+@pytest.mark.parametrize("groups", [2, 3, 6])
+def test_groups_side_by_side_are_the_groups_one_by_one(groups: int, norm: str) -> None:
+    """To the bit, in pictures too small to be cut up."""
+    cloud, camera, pictures = six_in_groups(groups, 40, 30)
+    found = backward(cloud.texels, project(cloud, camera).grouped(groups), pictures, norm)
+    expected = one_by_one(cloud, camera, pictures, norm, groups)
+    assert expected.texels.any() and expected.matrices.flatten(1).any(-1).all() and len(expected.sums.unique()) == 3 * groups
+    for name, ours, theirs in zip(Backward._fields, found, expected, strict=True):
+        assert torch.equal(ours, theirs), name
+
+
+@pytest.mark.usefixtures("threads")
+def test_groups_have_the_same_bytes_with_any_number_of_threads() -> None:
+    """In pictures so large that those of a group on its own are cut up, whose sums then have another order."""
+    cloud, camera, pictures = six_in_groups(3, 256, 256)
+    results = []
+    for number in (1, 2, 3, 2):
+        torch.set_num_threads(number)
+        results.append(backward(cloud.texels, project(cloud, camera).grouped(3), pictures))
+    for other in results[1:]:
+        assert all(torch.equal(ours, first) for ours, first in zip(other, results[0], strict=True))
+    expected = one_by_one(cloud, camera, pictures, "l2", 3)
+    assert torch.equal(results[0].sums, expected.sums) and torch.equal(results[0].matrices, expected.matrices)
+    assert error(results[0].texels, expected.texels) < 1e-5
 
 
 def test_only_what_is_asked_for_gets_a_gradient() -> None:

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, replace
+from itertools import pairwise
 
-import numpy as np
 import pytest
 import torch
-from scenes import camera_on_z, cloud_of, facing_cloud, random_scene
+from scenes import CORNERS, camera_on_z, cloud_of, facing_cloud, random_scene, ring, scenes, upright
 from torch import Tensor
 
 from bbfit.geometry.camera import Camera
-from bbfit.geometry.cloud import BillboardCloud, even_upright
+from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.orbit import Orbit
 from bbfit.rendering import fused
 from bbfit.rendering.fused import differentiate
 from bbfit.rendering.projection import Projection, project
-
-CORNERS = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).numpy()
 
 
 def samples(cloud: BillboardCloud, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -76,30 +74,6 @@ def touched(cloud: BillboardCloud, camera: Camera) -> list[Tensor]:
                 found.append(torch.stack([first[n] + y * width + x, rows], -1))
         pairs.append(torch.cat(found))
     return pairs
-
-
-def scenes(count: int) -> list[tuple[BillboardCloud, Camera]]:
-    """Tilted planes, near, far and partly behind, with textures finer and coarser than pixels, pinhole and parallel."""
-    made = []
-    for seed in range(count):
-        cloud, camera = random_scene(seed, 3, orthographic=seed % 2 == 1)
-        sizes = cloud.texture_sizes * (1 + 7 * (seed % 3))
-        cloud = replace(cloud, texture_sizes=sizes, texels=torch.zeros(int((sizes.prod(-1) * (1 + cloud.two_sided.long())).sum()), 4))
-        made.append((cloud, camera.resized(24, 40)))
-        for fov in (35.0, None):
-            elevation, extent = -50.0 + 25 * (seed % 5), 1.0 + seed % 3
-            made.append((cloud, ring(extent * CORNERS, 31, 60, elevation, fov)))
-    return made
-
-
-def ring(points: np.ndarray, width: int, height: int, elevation: float = 0.0, fov: float | None = 35.0) -> Camera:
-    """Three cameras around the origin."""
-    return Orbit(3, (elevation,)).frame(points, target=torch.zeros(3).double(), width=width, height=height, fov_x_degrees=fov)
-
-
-def upright(size: int, count: int = 4) -> BillboardCloud:
-    """Billboards as a fit starts with."""
-    return even_upright(count, axis=torch.zeros(3), half_extents=torch.ones(2), texture_sizes=torch.tensor([size, size]))
 
 
 def test_every_pixel_that_hits_lies_in_its_box() -> None:
@@ -183,13 +157,17 @@ def test_upright_planes_on_a_ring_need_few_rows_apart(fov: float | None) -> None
         assert project(upright(64), camera).rows_apart.max() <= 35  # measured 29
 
 
+Pieces = list[tuple[int, int, int, int]]
+"""A view, how many, and a band of rows, each."""
+
+
 @pytest.fixture
-def phases(monkeypatch: pytest.MonkeyPatch) -> list[list[tuple[int, int]]]:
+def phases(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Pieces]]:
     """The pieces that were launched at once, in order; two threads."""
-    recorded: list[list[tuple[int, int]]] = []
+    recorded: list[Pieces] = []
     original, before = fused.in_parallel, torch.get_num_threads()
 
-    def watched(launch: Callable[[int, int], None], pieces: Iterable[tuple[int, int]]) -> None:
+    def watched(launch: Callable[..., None], pieces: Iterable[tuple[int, int, int, int]]) -> None:
         recorded.append(list(pieces))
         original(launch, recorded[-1])
 
@@ -206,17 +184,43 @@ def accumulate(cloud: BillboardCloud, projection: Projection) -> None:
     differentiate(texels, projection, torch.zeros_like(texels), image_gradient=of_image)
 
 
-def test_the_backward_pass_of_an_ordinary_view_runs_on_all_cores(phases: list[list[tuple[int, int]]]) -> None:
+def test_the_backward_pass_of_an_ordinary_view_runs_on_all_cores(phases: list[Pieces]) -> None:
     projection = project(upright(512), ring(CORNERS, 512, 512))
     for v in range(len(projection)):
         phases.clear()
         accumulate(upright(512), projection.take(torch.tensor([v])))
-        assert sorted(piece for phase in phases for piece in phase)[0][0] == 0
-        assert sum(end - begin for phase in phases for begin, end in phase) == 512
+        bands = sorted((begin, end) for phase in phases for _, _, begin, end in phase)
+        assert bands[0][0] == 0 and bands[-1][1] == 512 and all(end == begin for (_, end), (begin, _) in pairwise(bands))
+        assert all(piece[:2] == (0, 1) for phase in phases for piece in phase)
         assert all(len(phase) >= 2 for phase in phases)
 
 
-def test_bands_that_run_at_once_touch_different_texels(phases: list[list[tuple[int, int]]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_row_of_every_view_is_launched_once(phases: list[Pieces], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views that are not worth cutting up go together, next to others that are cut up, or part by part where each part has its texels."""
+    cloud, camera = upright(64), ring(CORNERS, 64, 64)
+    wide = replace(project(cloud, camera), rows_apart=torch.tensor([7, 64, 64], dtype=torch.int32))
+    monkeypatch.setattr(fused, "LEAST_PIXELS", 1)
+    for order, expected in (([0, 1, 2], 3), ([1, 2, 0], 3), ([1, 0, 2], 4), ([0, 0, 1], 5), ([1, 2, 1], 1)):
+        phases.clear()
+        accumulate(cloud, wide.take(torch.tensor(order)))
+        assert launched(phases, 3) == [[(0, 64)]] * 3 and len(phases) == expected
+    phases.clear()
+    accumulate(cloud, wide.grouped(2))
+    assert phases == [[(0, 3, 0, 64), (3, 3, 0, 64)]]
+
+
+def launched(phases: list[Pieces], views: int) -> list[list[tuple[int, int]]]:
+    """The rows of each view that were launched, with bands that meet joined."""
+    rows: list[list[tuple[int, int]]] = [[] for _ in range(views)]
+    for view, number, begin, end in sorted(piece for phase in phases for piece in phase):
+        for v in range(view, view + number):
+            if rows[v] and rows[v][-1][1] == begin:
+                begin = rows[v].pop()[0]
+            rows[v].append((begin, end))
+    return rows
+
+
+def test_bands_that_run_at_once_touch_different_texels(phases: list[Pieces], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fused, "LEAST_PIXELS", 1)
     parallel = 0
     for cloud, camera in scenes(10):
@@ -225,7 +229,7 @@ def test_bands_that_run_at_once_touch_different_texels(phases: list[list[tuple[i
             accumulate(cloud, project(cloud, camera.batch()[v : v + 1]))
             texel, row = touched(cloud, camera.batch()[v : v + 1])[0].unbind(-1)
             for phase in phases:
-                seen = [set(texel[(row >= begin) & (row < end)].tolist()) for begin, end in phase]
+                seen = [set(texel[(row >= begin) & (row < end)].tolist()) for _, _, begin, end in phase]
                 assert len(set().union(*seen)) == sum(map(len, seen))
                 parallel += len(phase) > 1
     assert parallel >= 20
@@ -271,6 +275,26 @@ def test_taking_views() -> None:
     for field in fields(Projection):
         ours, theirs = getattr(some, field.name), getattr(expected, field.name)
         assert torch.equal(ours, theirs) if isinstance(ours, Tensor) else ours == theirs
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("groups", [1, 2, 3, 6])
+def test_groups_are_parts_of_the_billboards_in_views_of_their_own(groups: int, orthographic: bool) -> None:
+    """Part by part: all views of the first, then all of the second. Textures stay where they are among all texels."""
+    cloud, _ = random_scene(4, 6, orthographic=False)
+    camera = ring(2 * CORNERS, 24, 40, 20.0, None if orthographic else 35.0)
+    whole, first = project(cloud, camera), 0
+    found = whole.grouped(groups)
+    assert len(found) == 3 * groups and found.count == 6 // groups
+    assert (found.width, found.height, found.orthographic) == (24, 40, orthographic)
+    for number, part in enumerate(cloud.parts(groups)):
+        own, alone = found.take(torch.arange(3 * number, 3 * number + 3)), project(part, camera)
+        assert torch.equal(own.to_texel, alone.to_texel) and torch.equal(own.nearness, alone.nearness)
+        assert torch.equal(own.textures - torch.tensor([first, 0, 0]), alone.textures) and torch.equal(own.boxes, alone.boxes)
+        assert torch.equal(own.rows_apart, whole.rows_apart) and (own.rows_apart >= alone.rows_apart).all()
+        first += len(part.texels)
+    assert all(getattr(found, field.name).dtype == getattr(whole, field.name).dtype for field in fields(found)[:5])
+    assert first == len(cloud.texels)
 
 
 def test_gradients_of_homographies_reach_the_placement_only() -> None:
