@@ -18,6 +18,7 @@ import tyro
 from rich.console import Console
 
 from bbfit.blender.config import ViewsConfig
+from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, fail
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
@@ -37,6 +38,7 @@ def _run(
     grow: Annotated[GrowConfig, tyro.conf.arg(name="")] = GrowConfig(detail=0.5),  # noqa: B008
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
     fit: FitConfig = FitConfig(),  # noqa: B008
+    budget: BudgetConfig = BudgetConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
     """Do everything: grow a tree or take yours, render it, fit billboards to the views, write the models, score them on held-out views.
@@ -50,12 +52,14 @@ def _run(
         grow: How a tree is grown.
         views: How the tree is rendered.
         fit: How the billboards are fitted.
+        budget: What the result may cost; chooses what the fit leaves open, with short fits first.
         export: How the models are written.
     """
     from bbfit.pipeline import RunConfig, run
 
+    config = RunConfig(species=species, grow=grow, views=views, fit=fit, budget=budget, export=export)
     with _progress() as tell:
-        result = run(tree, out, RunConfig(species=species, grow=grow, views=views, fit=fit, export=export), on_progress=tell)
+        result = run(tree, out, config, on_progress=tell)
     _show(result)
 
 
@@ -123,6 +127,7 @@ def _fit(
     out: Path,
     tree: Path | None = None,
     config: Annotated[FitConfig, tyro.conf.arg(name="")] = FitConfig(),  # noqa: B008
+    budget: Annotated[BudgetConfig, tyro.conf.arg(name="")] = BudgetConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
     """Fit billboards to a folder of views, write the models and the score on held-out views.
@@ -132,6 +137,7 @@ def _fit(
         out: Folder for the results.
         tree: The mesh that the views show (.glb .gltf .obj .ply .stl), to place billboards by; without it the views tell where the tree is.
         config: How the billboards are fitted.
+        budget: What the result may cost; chooses what is left open, with short fits first.
         export: How the models are written.
     """
     from bbfit.checks import check_folder
@@ -139,7 +145,7 @@ def _fit(
 
     check_folder("views", views)
     with _progress() as tell:
-        result = run(views, out, RunConfig(tree=tree, fit=config, export=export), on_progress=tell)
+        result = run(views, out, RunConfig(tree=tree, fit=config, budget=budget, export=export), on_progress=tell)
     _show(result)
 
 
@@ -267,6 +273,11 @@ def _show(result: RunResult) -> None:
     _out.print(report_table(result.report))
     if result.skipped:
         _out.print(f"unchanged, not done again: {', '.join(result.skipped)}", style="dim")
+    if result.missed is not None:
+        _out.print(
+            f"no short fit within the budget reached {result.missed:g} dB on validation views; this is the best one, fitted for longer",
+            style="yellow",
+        )
     _out.print(
         f"results in {result.folder}: comparison.png, model.glb, model.obj, metrics.json, cloud.safetensors, loss.png", soft_wrap=True
     )

@@ -1,4 +1,4 @@
-"""The main job: grow -> views -> fit -> export -> evaluate, every stage done once and only again when its inputs change."""
+"""The main job: grow -> views -> (budget ->) fit -> export -> evaluate, every stage done once and only again when its inputs change."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ import io
 import json
 import platform
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from bbfit.blender.config import ViewsConfig
+from bbfit.budget.choice import Choice, Trial, choose, within_bytes
+from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, check_file, fail
 from bbfit.evaluation.report import Report
 from bbfit.evaluation.scoring import OriginalTree, evaluate
@@ -24,7 +26,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
 from bbfit.fitting.points import MESH_SUFFIXES
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.reporting.plots import comparison_picture, loss_plot
+from bbfit.reporting.plots import comparison_picture, loss_plot, pareto_plot
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.growth import grow
 from bbfit.trees.species import Species, load_species
@@ -33,7 +35,7 @@ from bbfit.views import ViewDataset
 
 RECORD_FILE = "run.json"
 # Raise a stage's number when its results change for the same inputs, so that old results are made anew.
-_STAGE_VERSIONS = {"grow": 1, "fit": 3, "export": 1, "evaluate": 3}
+_STAGE_VERSIONS = {"grow": 1, "budget": 1, "fit": 4, "export": 1, "evaluate": 3}
 _PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headless", "bpy", "trimesh", "xatlas", "scikit-image", "warp-lang")
 
 
@@ -51,6 +53,8 @@ class RunConfig:
     """Rendering the tree."""
     fit: FitConfig = field(default_factory=FitConfig)
     """Fitting the billboards."""
+    budget: BudgetConfig = field(default_factory=BudgetConfig)
+    """What the result may cost; decides over what ``fit`` leaves open."""
     export: ExportConfig = field(default_factory=ExportConfig)
     """Writing the model."""
 
@@ -74,6 +78,8 @@ class RunResult:
     """Their score on the held-out views."""
     skipped: tuple[str, ...]
     """Stages whose results stood."""
+    missed: float | None = None
+    """The target PSNR, if the trials for the budget did not reach it on validation views."""
 
 
 def run(
@@ -125,10 +131,15 @@ def run(
                 tree = None  # only Blender can read it; the views tell enough
     views.train.check()
     views.test.check()
-    cloud = _fit(views, tree, record, config.fit, tell)
-    _export(cloud, record, export_config(views, config.export), tell)
+    asked, missed, exported = config.fit, None, export_config(views, config.export)
+    if config.budget.given:
+        choice = _choose(views, tree, record, config, exported, tell)
+        asked, missed = choice.config, None if choice.met else config.budget.target_psnr
+        record.decided(asked)
+    cloud = _fit(views, tree, record, asked, tell, (config.budget.most_bytes, exported))
+    _export(cloud, record, exported, tell)
     report = _evaluate(cloud, views, record, tell)
-    return RunResult(record.folder, cloud, report, tuple(record.skipped))
+    return RunResult(record.folder, cloud, report, tuple(record.skipped), missed)
 
 
 def original_tree(views: ViewDataset) -> OriginalTree:
@@ -164,6 +175,7 @@ class _Record:
             "tree": str(config.tree.resolve()) if config.tree else None,
             "views": None if isinstance(source, Path) and source.is_dir() else asdict(config.views),
             "fit": asdict(config.fit.resolve()),
+            "budget": asdict(config.budget),
             "export": asdict(config.export),
         }
         self._head = {
@@ -173,6 +185,10 @@ class _Record:
             "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
             "machine": platform.platform(),
         }
+
+    def decided(self, config: FitConfig) -> None:
+        """Note what is fitted where that was left to a budget."""
+        self._head["config"]["fit"] = json.loads(json.dumps(asdict(config), default=str))
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -236,12 +252,45 @@ def _render(tree: Path, record: _Record, config: ViewsConfig, tell: Progress) ->
     return views
 
 
-def _fit(views: ViewDataset, tree: Path | None, record: _Record, config: FitConfig, tell: Progress) -> BillboardCloud:
+def _choose(views: ViewDataset, tree: Path | None, record: _Record, config: RunConfig, export: ExportConfig, tell: Progress) -> Choice:
+    """What the budget's trials speak for; ``pareto.json`` holds those done, so that none is done twice."""
+    path, budget = record.folder / "pareto.json", config.budget
+    mesh = None if tree is None else _hash_file(check_file("tree", tree))
+    asked = {**asdict(config.fit), "checkpoint_every": None}
+    inputs = _hash("budget", asked, asdict(budget), asdict(export), views.train.fingerprint, mesh)
+    stands = record.stands("budget", inputs)
+    earlier = read_json("budget", path) if path.is_file() else {}
+    known = (
+        [Trial(**{f.name: trial[f.name] for f in fields(Trial)}) for trial in earlier["trials"]] if earlier.get("inputs") == inputs else []
+    )
+    begun = time.perf_counter()
+
+    def on_trial(trials: list[Trial], total: int) -> None:
+        write_json(path, {"inputs": inputs, "trials": [asdict(trial) for trial in trials]})
+        last = trials[-1]
+        tell("budget", len(trials), max(total, len(trials)), f"{last.vertices} vertices {last.psnr:.2f} dB")
+
+    if not stands:
+        tell("budget", 0, 1)
+    choice = choose(views, config.fit, budget, tree=tree, export=export, known=known, on_trial=None if stands else on_trial)
+    if not stands:
+        limits = {name: value for name, value in asdict(budget).items() if value}
+        write_json(path, {"inputs": inputs, "budget": limits, **choice.to_json()})
+        cost: Literal["vertices", "texels", "bytes"] = "bytes" if budget.bytes else "texels" if budget.texels else "vertices"
+        pareto_plot(choice, path.with_suffix(".png"), cost=cost)
+        record.done("budget", inputs, [path.name, "pareto.png"], time.perf_counter() - begun)
+    return choice
+
+
+def _fit(
+    views: ViewDataset, tree: Path | None, record: _Record, config: FitConfig, tell: Progress, limit: tuple[int | None, ExportConfig]
+) -> BillboardCloud:
+    """``limit`` is the most bytes that the model may have, and how it will be exported."""
     config, path = config.resolve(), record.folder / "cloud.safetensors"
     if config.placement == "even":
         tree = None  # it has no say
     mesh = None if tree is None else _hash_file(check_file("tree", tree))
-    inputs = _hash("fit", {**asdict(config), "checkpoint_every": None}, views.train.fingerprint, mesh)
+    inputs = _hash("fit", {**asdict(config), "checkpoint_every": None}, views.train.fingerprint, mesh, limit if limit[0] else None)
     if record.stands("fit", inputs):
         return BillboardCloud.load(path)
 
@@ -250,12 +299,13 @@ def _fit(views: ViewDataset, tree: Path | None, record: _Record, config: FitConf
 
     checkpoint = record.folder / "fit.checkpoint"
     result = fit(views, config, tree=tree, checkpoint=checkpoint, on_step=on_step, on_place=lambda done, total: tell("place", done, total))
-    result.cloud.save(path)
+    cloud = within_bytes(result.cloud, *limit)
+    cloud.save(path)
     write_bytes(record.folder / "loss.csv", _loss_table(result.losses))
     loss_plot(result.losses, record.folder / "loss.png")
     record.done("fit", inputs, [path.name, "loss.csv", "loss.png"], result.seconds)
     checkpoint.unlink(missing_ok=True)
-    return result.cloud
+    return cloud
 
 
 def _export(cloud: BillboardCloud, record: _Record, config: ExportConfig, tell: Progress) -> None:

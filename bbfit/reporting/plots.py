@@ -1,15 +1,16 @@
-"""Pictures of a result: ``comparison.png`` (targets beside renders) and ``loss.png``."""
+"""Pictures of a result: ``comparison.png`` (targets beside renders), ``loss.png`` and ``pareto.png``."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bbfit.budget.choice import Choice, pareto_front
 from bbfit.checks import check_count, fail
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import held_out, view_angles
@@ -160,6 +161,62 @@ def loss_plot(losses: Sequence[float], path: str | Path, *, label: str = "loss")
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.set_xlabel("step")
     axes.set_ylabel(label)
+    axes.grid(True, color="#e4e7ea", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    buffer = io.BytesIO()
+    canvas.print_png(buffer, metadata={"Software": None})
+    write_bytes(path, buffer.getvalue())
+
+
+def pareto_plot(choice: Choice, path: str | Path, *, cost: Literal["vertices", "texels", "bytes"] = "vertices") -> None:
+    """Write a PNG of the validation PSNR of every trial against what it cost, with the front and the choice marked.
+
+    Parameters
+    ----------
+    path : the PNG to write, completely or not at all.
+    cost : on the horizontal axis.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import NullLocator, StrMethodFormatter
+
+    trials = choice.trials
+    points = [(float(getattr(trial, cost)), trial.psnr) for trial in trials]
+    figure = Figure(figsize=(9, 5), dpi=120, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    front = [points[index] for index in pareto_front(points)]
+    axes.plot(*zip(*front, strict=True), color="#a9c6da", linewidth=2, zorder=1, label="best for its cost")
+    kinds = {"clusters": ("o", "where the tree is"), "even": ("s", "even")}
+    for placement, (marker, where) in kinds.items():
+        for sides in ("one", "two", "pair"):
+            own = [point for point, trial in zip(points, trials, strict=True) if (trial.placement, trial.sides) == (placement, sides)]
+            if own:
+                face = "#1f5f8b" if sides == "one" else "white"
+                label = f"{where}, one side" if sides == "one" else f"{where}, {sides} sides" if sides == "two" else f"{where}, pairs"
+                xs, ys = zip(*own, strict=True)
+                axes.scatter(xs, ys, s=36, marker=marker, facecolor=face, edgecolor="#1f5f8b", zorder=2, label=label)
+    axes.scatter(
+        points[choice.chosen][0],
+        points[choice.chosen][1],
+        s=220,
+        facecolor="none",
+        edgecolor="#c8501e",
+        linewidth=2.5,
+        zorder=3,
+        label="chosen",
+    )
+    for (x, y), trial in zip(points, trials, strict=True):
+        axes.annotate(str(trial.billboards), (x, y), (0, 8), textcoords="offset points", ha="center", fontsize=8, color="#70767e")
+    axes.set_xscale("log", base=2 if cost == "vertices" else 10)
+    ticks = sorted({point[0] for point in points})
+    axes.set_xticks(ticks if cost == "vertices" or len(ticks) < 8 else ticks[::2])
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel(cost)
+    axes.set_ylabel("PSNR over white of validation views, dB")
+    axes.set_title("Short fits; numbers are billboards", loc="left", fontsize=11)
+    axes.legend(frameon=False, fontsize=9)
     axes.grid(True, color="#e4e7ea", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     buffer = io.BytesIO()
