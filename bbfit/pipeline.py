@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.budget.choice import Choice, Trial, choose, within_bytes
@@ -26,7 +26,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
 from bbfit.fitting.points import MESH_SUFFIXES
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.reporting.plots import comparison_picture, loss_plot, pareto_plot
+from bbfit.reporting.plots import Cost, comparison_picture, loss_plot, pareto_plot
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.growth import grow
 from bbfit.trees.species import Species, load_species
@@ -276,7 +276,7 @@ def _choose(views: ViewDataset, tree: Path | None, record: _Record, config: RunC
     if not stands:
         limits = {name: value for name, value in asdict(budget).items() if value}
         write_json(path, {"inputs": inputs, "budget": limits, **choice.to_json()})
-        cost: Literal["vertices", "texels", "bytes"] = "bytes" if budget.bytes else "texels" if budget.texels else "vertices"
+        cost: Cost = "bytes" if budget.bytes else "texels" if budget.texels else "vertices"
         pareto_plot(choice, path.with_suffix(".png"), cost=cost)
         record.done("budget", inputs, [path.name, "pareto.png"], time.perf_counter() - begun)
     return choice

@@ -5,9 +5,9 @@ the rows about steps come once for each device. Rows by name:
 
 grow      a tree grown and written as GLB, in a process of its own; seconds count importing bbfit
 copy      bytes a second of a plain copy in memory (read plus written)
-step      one training step of one view (render, loss, gradient, update) at the default fit's last level, of evenly placed billboards
-          with a texel a pixel, by the reference renderer and by the fused kernels; bound_s is how long the bytes that it must move
-          take at the speed of a copy
+step      one training step (render, loss, gradient, update) at the default fit's last level, of evenly placed billboards with a texel a
+          pixel, by the reference renderer and by the fused kernels, of one view and, at 1024 x 1024, of the four that the preset takes;
+          bound_s is how long the bytes that it must move take at the speed of a copy
 thesis    the same of the thesis preset, whose billboards fill the viewport
 views     steps of more views
 quality   for each folder of views: the thesis preset's 10,000 steps by the fused kernels, what they would take by the reference
@@ -169,19 +169,21 @@ def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torc
     reference = ReferenceStepper(start.with_texels(fused.texels.clone()), targets, config)
     reference.step([0], 0.01)
     times: dict[str, list[float]] = {"reference": [], "fused": []}
+    batch = config.views_per_step or 1
     for turn in range(turns):
-        chosen = [turn % len(views)]
+        chosen = [(turn * batch + index) % len(views) for index in range(batch)]
         times["reference"].append(seconds_of(lambda chosen=chosen: reference.step(chosen, 0.01), device))  # type: ignore[misc]
         for index in range(4):
-            chosen = [(4 * turn + index) % len(views)]
+            chosen = [((4 * turn + index) * batch + view) % len(views) for view in range(batch)]
             times["fused"].append(seconds_of(lambda chosen=chosen: fused.step(chosen, 0.01), device))  # type: ignore[misc]
     slow, fast = (statistics.median(times[which]) for which in ("reference", "fused"))
-    moved = bytes_of_a_step(fused, views)
+    moved = bytes_of_a_step(fused, views, batch)
     return {
         "name": name,
         "device": device.type,
         "size": views.cameras.width,
         "billboards": config.billboards,
+        "views": batch,
         "texels": len(start.texels),
         "reference_s": round(slow, 5),
         "fused_s": round(fast, 5),
@@ -192,15 +194,15 @@ def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torc
     }
 
 
-def bytes_of_a_step(stepper: FusedStepper, views: ViewSet) -> int:
-    """Bytes that a step of one view must move: the target once, touched texels read and their gradients added, awake blocks updated."""
+def bytes_of_a_step(stepper: FusedStepper, views: ViewSet, batch: int) -> int:
+    """Bytes that a step must move: targets once, touched texels read and their gradients added for each view, awake blocks updated."""
     state, steps = stepper.state, stepper.steps
     touched = int((state.last == steps).sum()) * 4
     awake = int((steps - state.last <= REST_AFTER).sum()) * 4
     pixels = views.cameras.width * views.cameras.height
     # RGBA in float32 is 16 bytes. Touched texels are read, their gradient is read, written, and cleared; of awake ones three arrays are
     # read and written; every gradient is looked at.
-    return 4 * pixels + 64 * touched + 96 * awake + 16 * len(state.texels)
+    return batch * (4 * pixels + 64 * touched) + 96 * awake + 16 * len(state.texels)
 
 
 def steps(quick: bool) -> list[Row]:
@@ -216,6 +218,11 @@ def steps(quick: bool) -> list[Row]:
             default = bbfit.FitConfig(views_per_step=1, levels=1, placement="even", texel_density=1)
             for count in (4,) if quick else (2, 4, 8, 16):
                 rows.append(step_row(large, replace(default, billboards=count), "step", device=device, turns=turns, copy=copy))
+                show(rows[-1])
+            if size == 1024:
+                rows.append(
+                    step_row(large, replace(default, billboards=4, views_per_step=None), "step", device=device, turns=turns, copy=copy)
+                )
                 show(rows[-1])
             if not quick:
                 thesis = bbfit.FitConfig(preset="thesis")

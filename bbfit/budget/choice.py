@@ -32,10 +32,14 @@ WORTH_DB = 0.75
 # One in so many training views is for validation.
 _SHARE = 5
 # Short fits: what they change, and how many billboards more in vain end the trials of a budget of texels or bytes.
-_SHORT: dict[str, Any] = {"steps": 160, "views_per_step": 2, "candidates": 8, "relocations": 4}
+_SHORT: dict[str, Any] = {"steps": 160, "views_per_step": 2, "searches": 1}
 _IN_VAIN = 2
-# Bytes a texel before any are known; a longer fit is sharper and packs less well; how near to its limit in bytes a trial is to be.
-_BYTES_A_TEXEL, _SHARPER, _NEAR = 2.5, 0.92, 0.8
+# What two short fits may differ by for no reason, in dB.
+_LUCK = 0.15
+# Shares of a limit in texels or bytes that are tried as well, for the curve.
+_LESS = (0.5, 0.25)
+# Bytes a texel before any are known; a longer fit is crisper and packs better; how near to its limit in bytes a trial is to be.
+_BYTES_A_TEXEL, _CRISPER, _NEAR = 2.0, 1.05, 0.6
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,8 @@ def choose(
     """Choose number, sides, placement and texel density of billboards for a budget; the test views are not looked at.
 
     Every fifth training view is kept for validation. Short fits of the others with more and more billboards show what each would be worth,
-    until the budget is reached, the target is met, or more do not pay. Then as many vertices are tried two-sided, and evenly placed.
+    until the budget is reached, the target is met, or more do not pay. Then as many vertices are tried two-sided, and evenly placed, and,
+    for the curve of a budget of texels or bytes, a half and a quarter of it.
 
     Parameters
     ----------
@@ -175,7 +180,7 @@ class _Trials:
         if most < 1:
             fail("vertices", f"{budget.vertices} are too few for one billboard of sides {config.sides!r}", "allow more, or sides one")
         self._counts = sorted({count for count in COUNTS if count < most} | {most})
-        self._total = len(self._counts) + 2
+        self._total = len(self._counts) + 2 + len(_LESS) * (budget.texels is not None or budget.bytes is not None)
 
     def choice(self) -> Choice:
         """See :func:`choose`."""
@@ -194,9 +199,12 @@ class _Trials:
             if config.placement is None:
                 self._try(count, config.sides, "even")
             best = self._best(self._vertices(count, config.sides))
+            if budget.texels is not None or budget.bytes is not None:  # what less would do
+                for share in _LESS:
+                    self._trial_of(best.billboards, best.sides, best.placement, max(2 * count, int(share * best.texels)))
         most = best.max_texels
         if budget.most_bytes is not None:
-            most = min(int(_SHARPER * budget.most_bytes / best.bytes * best.texels), budget.most_texels or 1 << 40)
+            most = min(int(_CRISPER * budget.most_bytes / best.bytes * best.texels), budget.most_texels or 1 << 40)
         asked = replace(config, billboards=best.billboards, sides=best.sides, placement=best.placement, max_texels=most)
         met = budget.target_psnr is None or best.psnr >= budget.target_psnr
         return Choice(asked.resolve(), tuple(self._trials), self._trials.index(best), met, tuple(self._views.test.names))
@@ -226,6 +234,9 @@ class _Trials:
         best = max(fitting, key=lambda trial: trial.psnr)
         if vertices is not None:
             return max((trial for trial in fitting if trial.vertices <= vertices), key=lambda trial: trial.psnr)
+        as_good = [trial for trial in fitting if trial.psnr >= best.psnr - _LUCK]
+        dear = 1 if budget.vertices is not None else -1  # what is allowed is made use of; otherwise the fewer, the cheaper to draw
+        best = max(as_good, key=lambda trial: (dear * trial.vertices, trial.psnr))
         if budget.target_psnr is not None:
             enough = [trial for trial in fitting if trial.psnr >= budget.target_psnr]
             return min(enough, key=lambda trial: (trial.vertices, -trial.psnr), default=best)
@@ -244,12 +255,16 @@ class _Trials:
             most, limit = self._budget.most_texels, self._budget.most_bytes
             if limit is not None:
                 most = max(2 * count, min(int(0.95 * limit / rate), most or 1 << 40))
-            trial = self._trial(count, sides, placement, most)
-            self._trials.append(trial)
-            self._on_trial(list(self._trials), self._total)
+            trial = self._trial_of(count, sides, placement, most)
             rate = trial.bytes / trial.texels
             if limit is None or (trial.bytes <= limit and (trial.bytes > _NEAR * limit or trial.texels < _NEAR * (most or 0))):
                 break
+        return trial
+
+    def _trial_of(self, count: int, sides: Sides, placement: Placement, most: int | None) -> Trial:
+        trial = self._trial(count, sides, placement, most)
+        self._trials.append(trial)
+        self._on_trial(list(self._trials), self._total)
         return trial
 
     def _trial(self, count: int, sides: Sides, placement: Placement, most: int | None) -> Trial:
@@ -257,9 +272,7 @@ class _Trials:
             if (trial.billboards, trial.sides, trial.placement, trial.max_texels) == (count, sides, placement, most):
                 return trial
         begun = time.perf_counter()
-        short = {
-            name: value for name, value in _SHORT.items() if name not in ("steps", "views_per_step") or getattr(self._config, name) is None
-        }
+        short = {name: value for name, value in _SHORT.items() if getattr(self._config, name) is None}
         config = replace(self._config, billboards=count, sides=sides, placement=placement, max_texels=most, **short)
         cloud = fit(self._views, config, tree=self._tree).cloud
         size, seconds = model_bytes(cloud, self._export), time.perf_counter() - begun

@@ -95,7 +95,13 @@ def opaque_bounds(cloud: BillboardCloud) -> Tensor:
 
 
 def trimmed(cloud: BillboardCloud) -> BillboardCloud:
-    """The same picture with rectangles cut, texel by texel, to what eight bits of alpha show of them, and a margin of one texel."""
+    """The same picture with rectangles cut, texel by texel, to what eight bits of alpha show of them, and a margin of one texel.
+
+    Billboards that show nothing are left out, but for one if none shows anything.
+    """
+    shown = [n for n, texture in enumerate(cloud.textures()) if (texture[..., 3] >= _VISIBLE).any()]
+    if len(shown) < len(cloud):
+        cloud = cloud.take(shown or [0])
     parts, middles, texels, sizes = [], [], [], []
     for texture in cloud.textures():
         mask = (texture[..., 3].amax(0) >= _VISIBLE).numpy().astype(np.uint8)

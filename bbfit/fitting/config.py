@@ -26,9 +26,9 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "loss": "backgrounds",
         "ssim_weight": 0.01,
         "sharpness_weight": 12.0,
-        "crispness_weight": 0.003,
+        "crispness_weight": 0.004,
         "levels": 4,
-        "steps": 600,
+        "steps": 750,
         "views_per_step": 4,
         "learning_rate": 0.15,
         "schedule": "cosine",
@@ -67,7 +67,7 @@ class FitConfig:
     orientation: Orientation = "any"
     """Whether clusters are upright planes, planes that may lean any way (free), or whatever does better (any)."""
     searches: int | None = None
-    """Independent searches, of which the best one counts. Left open, one for every four billboards, three at most."""
+    """Independent searches, of which the best one counts. Left open, one for every four billboards, two at most."""
     candidates: int = 12
     """Clusterings that a search compares."""
     relocations: int = 8
@@ -93,12 +93,12 @@ class FitConfig:
     """Weight, at full resolution, of the squared difference in mean contrast of neighbouring pixels. Preset: 12; thesis: 0."""
     crispness_weight: float | None = None
     """Weight, at full resolution, of alpha * (1 - alpha), summed over texels and divided by a view's pixels, which makes leaves opaque and
-    the air between them clear. Preset: 0.003; thesis: 0."""
+    the air between them clear. Preset: 0.004; thesis: 0."""
     levels: int | None = None
     """Resolutions of views and textures, coarse to fine, sides doubling from each to the next; the steps are shared out evenly.
     Preset: 4; thesis: 1."""
     steps: int | None = None
-    """Optimiser steps. Preset: 600; thesis: 10000."""
+    """Optimiser steps. Preset: 750; thesis: 10000."""
     views_per_step: int | None = None
     """Training views in every step at full resolution; twice as many at each coarser level. Preset: 4; thesis: 1."""
     learning_rate: float | None = None
@@ -169,7 +169,7 @@ class FitConfig:
         resolved = replace(self, **missing)
         if resolved.searches is None:
             assert resolved.billboards is not None
-            resolved = replace(resolved, searches=min(3, max(1, resolved.billboards // 4)))
+            resolved = replace(resolved, searches=min(2, max(1, resolved.billboards // 4)))
         if resolved.sides == "pair" and resolved.placement == "clusters":
             fail("sides", "pairs stand evenly around an axis, not in clusters", "add --placement even, or choose one or two")
         return resolved

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
+Cost = Literal["vertices", "texels", "bytes"]
+"""What a budget can limit."""
 _INK, _FAINT, _LINE, _PAPER = (32, 36, 42), (112, 118, 126), (214, 217, 222), (242, 243, 245)
 _CELL_LEAST = 220  # pixels: what the writing under a small picture needs
 
@@ -168,60 +170,56 @@ def loss_plot(losses: Sequence[float], path: str | Path, *, label: str = "loss")
     write_bytes(path, buffer.getvalue())
 
 
-def pareto_plot(choice: Choice, path: str | Path, *, cost: Literal["vertices", "texels", "bytes"] = "vertices") -> None:
-    """Write a PNG of the validation PSNR of every trial against what it cost, with the front and the choice marked.
+def pareto_plot(choice: Choice, path: str | Path, *, cost: Cost = "vertices") -> None:
+    """Write a PNG of the validation PSNR of every trial against its vertices, with the front and the choice marked.
 
     Parameters
     ----------
     path : the PNG to write, completely or not at all.
-    cost : on the horizontal axis.
+    cost : what the budget limits; if that is not vertices it gets a second panel.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.ticker import NullLocator, StrMethodFormatter
 
-    trials = choice.trials
-    points = [(float(getattr(trial, cost)), trial.psnr) for trial in trials]
-    figure = Figure(figsize=(9, 5), dpi=120, layout="constrained")
+    costs: list[Cost] = ["vertices"] if cost == "vertices" else ["vertices", cost]
+    figure = Figure(figsize=(9 if len(costs) == 1 else 14, 5), dpi=120, layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    front = [points[index] for index in pareto_front(points)]
-    axes.plot(*zip(*front, strict=True), color="#a9c6da", linewidth=2, zorder=1, label="best for its cost")
-    kinds = {"clusters": ("o", "where the tree is"), "even": ("s", "even")}
-    for placement, (marker, where) in kinds.items():
-        for sides in ("one", "two", "pair"):
-            own = [point for point, trial in zip(points, trials, strict=True) if (trial.placement, trial.sides) == (placement, sides)]
-            if own:
-                face = "#1f5f8b" if sides == "one" else "white"
-                label = f"{where}, one side" if sides == "one" else f"{where}, {sides} sides" if sides == "two" else f"{where}, pairs"
-                xs, ys = zip(*own, strict=True)
-                axes.scatter(xs, ys, s=36, marker=marker, facecolor=face, edgecolor="#1f5f8b", zorder=2, label=label)
-    axes.scatter(
-        points[choice.chosen][0],
-        points[choice.chosen][1],
-        s=220,
-        facecolor="none",
-        edgecolor="#c8501e",
-        linewidth=2.5,
-        zorder=3,
-        label="chosen",
-    )
-    for (x, y), trial in zip(points, trials, strict=True):
-        axes.annotate(str(trial.billboards), (x, y), (0, 8), textcoords="offset points", ha="center", fontsize=8, color="#70767e")
-    axes.set_xscale("log", base=2 if cost == "vertices" else 10)
-    ticks = sorted({point[0] for point in points})
-    axes.set_xticks(ticks if cost == "vertices" or len(ticks) < 8 else ticks[::2])
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.set_xlabel(cost)
-    axes.set_ylabel("PSNR over white of validation views, dB")
-    axes.set_title("Short fits; numbers are billboards", loc="left", fontsize=11)
-    axes.legend(frameon=False, fontsize=9)
-    axes.grid(True, color="#e4e7ea", linewidth=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
+    for axes, name in zip(figure.subplots(1, len(costs), squeeze=False)[0], costs, strict=True):
+        _draw_front(axes, choice, name)
+    figure.axes[0].set_ylabel("PSNR over white of validation views, dB")
+    figure.axes[0].set_title("Short fits; numbers are billboards", loc="left", fontsize=11)
+    figure.axes[0].legend(frameon=False, fontsize=9, loc="lower right")
     buffer = io.BytesIO()
     canvas.print_png(buffer, metadata={"Software": None})
     write_bytes(path, buffer.getvalue())
+
+
+def _draw_front(axes: Any, choice: Choice, cost: Cost) -> None:
+    """One panel of :func:`pareto_plot`."""
+    from matplotlib.ticker import FixedLocator, LogLocator, NullLocator, StrMethodFormatter
+
+    trials, colour = choice.trials, "#1f5f8b"
+    points = [(float(getattr(trial, cost)), trial.psnr) for trial in trials]
+    xs, ys = zip(*(points[index] for index in pareto_front(points)), strict=True)
+    axes.plot(xs, ys, color="#a9c6da", linewidth=2, zorder=1, label="best for its cost")
+    for placement, (marker, where) in {"clusters": ("o", "where the tree is"), "even": ("s", "even")}.items():
+        for sides, many in {"one": "one side", "two": "two sides", "pair": "pairs"}.items():
+            own = [point for point, trial in zip(points, trials, strict=True) if (trial.placement, trial.sides) == (placement, sides)]
+            if own:
+                xs, ys = zip(*own, strict=True)
+                face = colour if sides == "one" else "white"
+                axes.scatter(xs, ys, s=36, marker=marker, facecolor=face, edgecolor=colour, zorder=2, label=f"{where}, {many}")
+    axes.scatter(*points[choice.chosen], s=220, facecolor="none", edgecolor="#c8501e", linewidth=2.5, zorder=3, label="chosen")
+    for point, trial in zip(points, trials, strict=True):
+        axes.annotate(str(trial.billboards), point, (0, 8), textcoords="offset points", ha="center", fontsize=8, color="#70767e")
+    axes.set_xscale("log")
+    doubling = [4 << power for power in range(12) if any(0.5 < (4 << power) / x < 2 for x, _ in points)]
+    axes.xaxis.set_major_locator(FixedLocator(doubling) if cost == "vertices" else LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel(cost)
+    axes.grid(True, color="#e4e7ea", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def running_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
