@@ -21,15 +21,15 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "billboards": 8,
         "placement": "clusters",
         "placement_rate": 0.015,
-        "texel_density": 1.5,
+        "texel_density": 1.25,
         "bounds": "silhouette",
         "loss": "backgrounds",
         "ssim_weight": 0.01,
-        "sharpness_weight": 12.0,
-        "crispness_weight": 0.004,
+        "sharpness_weight": 14.0,
+        "crispness_weight": 0.009,
         "levels": 4,
-        "steps": 750,
-        "views_per_step": 4,
+        "steps": 1200,
+        "views_per_step": 2,
         "learning_rate": 0.15,
         "schedule": "cosine",
     },
@@ -67,7 +67,7 @@ class FitConfig:
     orientation: Orientation = "any"
     """Whether clusters are upright planes, planes that may lean any way (free), or whatever does better (any)."""
     searches: int | None = None
-    """Independent searches, of which the best one counts. Left open, one for every four billboards, two at most."""
+    """Independent searches, of which the best one counts. Left open, three for eight billboards, at least one and at most three."""
     candidates: int = 12
     """Clusterings that a search compares."""
     relocations: int = 8
@@ -81,7 +81,7 @@ class FitConfig:
     """Evenly placed rectangles that cover the viewport (viewport), the silhouette in the facing view (thesis) or the silhouettes in all
     training views (silhouette); clustered ones are bounded by what they carry. Preset: silhouette; thesis: viewport."""
     texel_density: float | None = None
-    """Texels per pixel, both ways, where the tree's axis is seen face on. Preset: 1.5; thesis: 1."""
+    """Texels per pixel, both ways, where the tree's axis is seen face on. Preset: 1.25; thesis: 1."""
     loss: Loss | None = None
     """Absolute (l1) or squared (l2) difference of premultiplied RGBA, summed over channels and averaged over pixels, or the squared
     difference over random backgrounds in expectation (backgrounds). Preset: backgrounds; thesis: l2."""
@@ -90,17 +90,17 @@ class FitConfig:
     ssim_weight: float | None = None
     """Weight of 1 - SSIM beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: float | None = None
-    """Weight, at full resolution, of the squared difference in mean contrast of neighbouring pixels. Preset: 12; thesis: 0."""
+    """Weight, at full resolution, of the squared difference in mean contrast of neighbouring pixels. Preset: 14; thesis: 0."""
     crispness_weight: float | None = None
     """Weight, at full resolution, of alpha * (1 - alpha), summed over texels and divided by a view's pixels, which makes leaves opaque and
-    the air between them clear. Preset: 0.004; thesis: 0."""
+    the air between them clear. Preset: 0.009; thesis: 0."""
     levels: int | None = None
     """Resolutions of views and textures, coarse to fine, sides doubling from each to the next; the steps are shared out evenly.
     Preset: 4; thesis: 1."""
     steps: int | None = None
-    """Optimiser steps. Preset: 750; thesis: 10000."""
+    """Optimiser steps. Preset: 1200; thesis: 10000."""
     views_per_step: int | None = None
-    """Training views in every step at full resolution; twice as many at each coarser level. Preset: 4; thesis: 1."""
+    """Training views in every step at full resolution; twice as many at each coarser level. Preset: 2; thesis: 1."""
     learning_rate: float | None = None
     """Adam's initial rate. Preset: 0.15; thesis: 0.01."""
     schedule: Schedule | None = None
@@ -169,7 +169,7 @@ class FitConfig:
         resolved = replace(self, **missing)
         if resolved.searches is None:
             assert resolved.billboards is not None
-            resolved = replace(resolved, searches=min(2, max(1, resolved.billboards // 4)))
+            resolved = replace(resolved, searches=min(3, max(1, 3 * resolved.billboards // 8)))
         if resolved.sides == "pair" and resolved.placement == "clusters":
             fail("sides", "pairs stand evenly around an axis, not in clusters", "add --placement even, or choose one or two")
         return resolved
