@@ -304,7 +304,7 @@ def _progress() -> Iterator[Progress]:
             if stage not in tasks:
                 tasks[stage] = bars.add_task(stage, total=total, rate="", note="", completed=done - 1)
             speed = bars.tasks[list(tasks).index(stage)].speed
-            bars.update(tasks[stage], completed=done, note=note, rate="" if speed is None else f"{speed:.1f}/s")
+            bars.update(tasks[stage], completed=done, total=total, note=note, rate="" if speed is None else f"{speed:.1f}/s")
 
         yield tell
 

@@ -259,7 +259,11 @@ def _choose(views: ViewDataset, tree: Path | None, record: _Record, config: RunC
     asked = {**asdict(config.fit), "checkpoint_every": None}
     inputs = _hash("budget", asked, asdict(budget), asdict(export), views.train.fingerprint, mesh)
     stands = record.stands("budget", inputs)
-    earlier = read_json("budget", path) if path.is_file() else {}
+    try:
+        earlier = read_json("budget", path) if path.is_file() else {}
+    except InputError:
+        earlier = {}  # a damaged file only costs its trials
+    earlier = earlier if isinstance(earlier, dict) else {}
     known = (
         [Trial(**{f.name: trial[f.name] for f in fields(Trial)}) for trial in earlier["trials"]] if earlier.get("inputs") == inputs else []
     )

@@ -117,6 +117,129 @@ def test_a_bad_value_in_a_stage_of_a_run_is_one_line(option: str, tmp_path: Path
     assert option.rpartition(".")[2] in line and "at least" in line
 
 
+TRIALS = ["--placement", "even", "--steps", "3", "--views-per-step", "1"]
+
+
+@pytest.mark.parametrize(
+    ("options", "limits", "tried"),
+    [
+        (["--vertices", "8"], {"vertices": 8}, [(1, "one"), (2, "one"), (1, "two")]),
+        (["--vertices", "8", "--sides", "two"], {"vertices": 8}, [(1, "two")]),
+        (["--texels", "1.5k"], {"texels": "1.5k"}, None),
+        (["--bytes", "9k"], {"bytes": "9k"}, None),
+        (["--bytes", "9000", "--vertices", "4"], {"vertices": 4, "bytes": 9000}, None),
+        (["--target-psnr", "3"], {"target_psnr": 3.0}, [(1, "one")]),
+        (["--auto", "--vertices", "4"], {"vertices": 4, "auto": True}, [(1, "one")]),
+    ],
+)
+def test_fit_within_a_budget(
+    views_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    limits: dict[str, object],
+    tried: list[tuple[int, str]] | None,
+) -> None:
+    monkeypatch.setattr("bbfit.budget.choice.COUNTS", (1, 2))
+    assert main(["fit", str(views_folder), "--out", str(tmp_path), *TRIALS, *options]) == 0
+    written = json.loads((tmp_path / "pareto.json").read_text())
+    assert written["budget"] == limits and (tmp_path / "pareto.png").stat().st_size > 0
+    assert tried in (None, [(trial["billboards"], trial["sides"]) for trial in written["trials"]])
+    cloud = BillboardCloud.load(tmp_path / "cloud.safetensors")
+    assert "vertices" not in limits or cloud.vertex_count <= limits["vertices"]  # type: ignore[operator]
+    assert "texels" not in limits or len(cloud.texels) <= 1500
+    assert "bytes" not in limits or (tmp_path / "model.glb").stat().st_size <= 9000
+    assert "no short fit" not in capsys.readouterr().out
+
+
+def test_run_within_a_budget_is_fit_within_it(views_folder: Path, tmp_path: Path) -> None:
+    nested = [f"--fit.{option[2:]}" if option.startswith("--") else option for option in TRIALS]
+    assert main(["run", str(views_folder), "--out", str(tmp_path / "run"), *nested, "--budget.vertices", "4", "--budget.texels", "1k"]) == 0
+    assert main(["fit", str(views_folder), "--out", str(tmp_path / "fit"), *TRIALS, "--vertices", "4", "--texels", "1k"]) == 0
+    for name in ("cloud.safetensors", "model.glb"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "fit" / name).read_bytes()
+    assert json.loads((tmp_path / "run" / "pareto.json").read_text())["budget"] == {"vertices": 4, "texels": "1k"}
+
+
+def test_a_missed_target_is_said_and_no_failure(views_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fit", str(views_folder), "--out", str(tmp_path), *TRIALS, "--target-psnr", "90.5", "--vertices", "4"]) == 0
+    assert "no short fit within the budget reached 90.5 dB" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("command", "prefix"),
+    [(["fit", "{views}"], "--"), (["run", "{views}"], "--budget.")],
+    ids=["fit", "run"],
+)
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--vertices", "3"], "vertices: expected at least 4, got 3"),
+        (["--texels", "0"], "texels: expected at least 1, got 0"),
+        (["--texels", "2.5"], "texels: '2.5' is not a whole number"),
+        (["--bytes", "much"], "bytes: 'much' is no number; write for example 200000, 200k or 1.5M"),
+        (["--bytes", "60kb"], "bytes: '60kb' is no number"),
+        (["--target-psnr", "0"], "target_psnr: expected a value in (0, 100], got 0"),
+        (["--target-psnr", "nan"], "target_psnr: expected a value in (0, 100], got nan"),
+        (["--target-psnr", "30", "--auto"], "auto: it and a target PSNR both say when to stop"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_budget_that_cannot_be_is_one_line(
+    views_folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    command: list[str],
+    prefix: str,
+    options: list[str],
+    says: str,
+) -> None:
+    given = [prefix + option.removeprefix("--") if option.startswith("--") else option for option in options]
+    assert says in refused([*(part.format(views=views_folder) for part in command), "--out", str(tmp_path / "out"), *given], capsys)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--vertices", "8", "--billboards", "2"], "bbfit: billboards: 2 are asked for and a budget as well; leave one of them out"),
+        (["--auto", "--preset", "thesis"], "bbfit: preset: 'thesis' is a schedule of its own"),
+        (["--vertices", "4", "--sides", "two"], "bbfit: vertices: 4 are too few for one billboard"),
+        (["--bytes", "10"], "bbfit: budget: 1 billboard with "),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_budget_that_cannot_be_kept_is_exit_code_2(
+    views_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    says: str,
+) -> None:
+    """What is wrong stands in the last line, after the progress."""
+    monkeypatch.setattr("bbfit.budget.choice.COUNTS", (1,))
+    quick = [] if "--preset" in options else TRIALS
+    assert main(["fit", str(views_folder), "--out", str(tmp_path), *quick, *options]) == 2
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith(says)
+    assert not (tmp_path / "cloud.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--max-texels", "1"], "max_texels: 1 are too few for 2 textures"),
+        (["--searches", "0"], "searches: expected at least 1, got 0"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_limits_of_a_fit_that_cannot_be_are_one_line(
+    views_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], says: str
+) -> None:
+    assert says in refused(["fit", str(views_folder), "--out", str(tmp_path), *QUICK, "--placement", "even", *options], capsys)
+
+
 def test_grow_writes_what_the_function_makes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--seed", "4", "--detail", "0.3", "--leaves", "0.05"]
     for name in ("acer.glb", "acer.obj"):
@@ -178,7 +301,16 @@ def test_a_view_without_content_is_named(views_folder: Path, tmp_path: Path, cap
 
 
 @pytest.mark.parametrize(
-    "arguments", [["grow-wings"], ["fit"], ["fit", "x", "--out", "y", "--steps", "many"], ["run", "--fit.no-such", "1"]]
+    "arguments",
+    [
+        ["grow-wings"],
+        ["fit"],
+        ["fit", "x", "--out", "y", "--steps", "many"],
+        ["fit", "x", "--out", "y", "--vertices", "few"],
+        ["fit", "x", "--out", "y", "--target-psnr", "good"],
+        ["run", "--fit.no-such", "1"],
+        ["run", "--vertices", "8"],
+    ],
 )
 def test_unknown_options_are_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:

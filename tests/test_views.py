@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -102,6 +102,25 @@ def test_pictures_in_memory_stay_within_the_bound(views_folder: Path) -> None:
     cache = views.train._cache
     assert sum(picture.numel() for picture in cache._pictures.values()) == cache._held == 3 * one
     assert all(torch.equal(views.train.image(index), picture) for index, picture in enumerate(pictures))
+
+
+@pytest.mark.parametrize("indices", [[0, 5, 3], [7], [2, 2], [], range(4), [-1]])
+def test_some_of_the_views(views_folder: Path, indices: Sequence[int]) -> None:
+    """In the order asked for, each picture with its own camera, and decoded once for both."""
+    views = ViewDataset.load(views_folder).train
+    some, rows = views.take(indices), [int(index) for index in torch.arange(len(views))[list(indices)]]
+    assert len(some) == len(some.cameras) == len(rows) and some.names == [views.names[row] for row in rows]
+    assert torch.equal(some.cameras.world_to_camera, views.cameras.world_to_camera[rows])
+    assert torch.equal(some.cameras.intrinsics, views.cameras.intrinsics[rows])
+    assert (some.cameras.width, some.cameras.height) == (views.cameras.width, views.cameras.height)
+    assert all(some.image(number) is views.image(row) for number, row in enumerate(rows))
+    assert len(views) == 12
+
+
+def test_all_of_the_views_are_the_views(views_folder: Path) -> None:
+    views = ViewDataset.load(views_folder).train
+    assert views.take(range(len(views))).fingerprint == views.fingerprint != views.take(range(len(views) - 1)).fingerprint
+    assert views.take([1, 0]).take([1, 0]).fingerprint == views.take([0, 1]).fingerprint != views.take([1, 0]).fingerprint
 
 
 def test_fingerprint_follows_content_not_place(views_folder: Path, folder: Path) -> None:

@@ -193,12 +193,12 @@ class _Trials:
                 break
         best = self._best()
         if budget.target_psnr is None:  # the same vertices otherwise spent
-            count = best.billboards
+            count, done = best.billboards, len(self._trials)
             if config.sides == "one" and count > 1:
                 self._try(count // 2, "two", placement)
             if config.placement is None:
                 self._try(count, config.sides, "even")
-            best = self._best(self._vertices(count, config.sides))
+            best = max([best, *filter(self._holds, self._trials[done:])], key=lambda trial: trial.psnr)
             if budget.texels is not None or budget.bytes is not None:  # what less would do
                 for share in _LESS:
                     self._trial_of(best.billboards, best.sides, best.placement, max(2 * count, int(share * best.texels)))
@@ -225,15 +225,13 @@ class _Trials:
         limits = ((trial.vertices, self._budget.vertices), (trial.texels, self._budget.most_texels), (trial.bytes, self._budget.most_bytes))
         return all(limit is None or cost <= limit for cost, limit in limits)
 
-    def _best(self, vertices: int | None = None) -> Trial:
-        """The trial to take; once its vertices are decided on, the best of those with no more."""
+    def _best(self) -> Trial:
+        """The trial that decides over the vertices."""
         budget = self._budget
         fitting = [trial for trial in self._trials if self._holds(trial)]
         if not fitting:
             fail("budget", f"{self._trials[0].billboards} billboard with {self._trials[0].bytes:,} bytes is too much for it", "allow more")
         best = max(fitting, key=lambda trial: trial.psnr)
-        if vertices is not None:
-            return max((trial for trial in fitting if trial.vertices <= vertices), key=lambda trial: trial.psnr)
         as_good = [trial for trial in fitting if trial.psnr >= best.psnr - _LUCK]
         dear = 1 if budget.vertices is not None else -1  # what is allowed is made use of; otherwise the fewer, the cheaper to draw
         best = max(as_good, key=lambda trial: (dear * trial.vertices, trial.psnr))
@@ -250,16 +248,30 @@ class _Trials:
 
     def _try(self, count: int, sides: Sides, placement: Placement) -> Trial:
         """Add a trial, or some until the limit in bytes holds and is made use of."""
-        rate = self._trials[-1].bytes / self._trials[-1].texels if self._trials else _BYTES_A_TEXEL
+        limit, tried = self._budget.most_bytes, list[Trial]()
+        most = self._guess(count, self._trials[-1:])
         for _ in range(3):
-            most, limit = self._budget.most_texels, self._budget.most_bytes
-            if limit is not None:
-                most = max(2 * count, min(int(0.95 * limit / rate), most or 1 << 40))
-            trial = self._trial_of(count, sides, placement, most)
-            rate = trial.bytes / trial.texels
+            tried.append(self._trial_of(count, sides, placement, most))
+            trial = tried[-1]
             if limit is None or (trial.bytes <= limit and (trial.bytes > _NEAR * limit or trial.texels < _NEAR * (most or 0))):
                 break
-        return trial
+            before, most = most, self._guess(count, tried[-2:])
+            if most == before:
+                break
+        return tried[-1]
+
+    def _guess(self, count: int, known: list[Trial]) -> int | None:
+        """How many texels are within the limits, by one or two trials before: bytes are about linear in texels."""
+        limit, allowed = self._budget.most_bytes, self._budget.most_texels
+        if limit is None:
+            return allowed
+        wanted, texels = 0.95 * limit, 0.95 * limit / _BYTES_A_TEXEL
+        if len(known) == 2 and (known[1].bytes - known[0].bytes) * (known[1].texels - known[0].texels) > 0:
+            rate = (known[1].bytes - known[0].bytes) / (known[1].texels - known[0].texels)
+            texels = known[1].texels + (wanted - known[1].bytes) / rate
+        elif known:
+            texels = wanted * known[-1].texels / known[-1].bytes
+        return max(2 * count, min(int(texels), allowed or 1 << 40))
 
     def _trial_of(self, count: int, sides: Sides, placement: Placement, most: int | None) -> Trial:
         trial = self._trial(count, sides, placement, most)

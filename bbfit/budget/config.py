@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
 
 from bbfit.checks import check_count, check_range, fail
 
-_FACTORS = {"k": 1_000, "m": 1_000_000}
+_FACTORS, _MOST = {"k": 1_000, "m": 1_000_000}, 10**15
 
 
 @dataclass(frozen=True)
@@ -58,9 +59,9 @@ def amount(name: str, value: int | str) -> int:
         return value
     factor = _FACTORS.get(value[-1:].lower(), 1)
     try:
-        number = float(value if factor == 1 else value[:-1]) * factor
-    except ValueError:
+        number = Decimal(value if factor == 1 else value[:-1]) * factor
+    except InvalidOperation:
         fail(name, f"{value!r} is no number", "write for example 200000, 200k or 1.5M")
-    if number != int(number):
+    if not number.is_finite() or abs(number) > _MOST or number != int(number):
         fail(name, f"{value!r} is not a whole number", "write for example 200000, 200k or 1.5M")
     return int(number)

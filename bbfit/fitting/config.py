@@ -167,6 +167,9 @@ class FitConfig:
         preset = _PRESETS[self.preset]
         missing = {name: value for name, value in preset.items() if getattr(self, name) is None}
         resolved = replace(self, **missing)
+        textures = (resolved.billboards or 0) * (1 if resolved.sides == "one" else 2)
+        if resolved.max_texels is not None and resolved.max_texels < textures:
+            fail("max_texels", f"{resolved.max_texels} are too few for {textures} textures", "allow more")
         if resolved.searches is None:
             assert resolved.billboards is not None
             resolved = replace(resolved, searches=min(3, max(1, 3 * resolved.billboards // 8)))

@@ -185,6 +185,10 @@ def test_batches_deal_every_view_equally_often() -> None:
         {"learning_rate": float("nan")},
         {"ssim_weight": -1.0},
         {"texel_density": 0.0},
+        {"max_texels": 0},
+        {"max_texels": 10.5},
+        {"searches": 0},
+        {"searches": 1.5},
     ],
 )
 def test_bad_configurations_are_refused_by_name(fields: dict[str, object]) -> None:
@@ -200,6 +204,13 @@ def test_at_less_than_full_resolution_sharpness_and_crispness_have_no_weight(pre
     assert (coarse.sharpness_weight, coarse.crispness_weight) == (0.0, 0.0)
     assert dataclasses.replace(coarse, sharpness_weight=7.0, crispness_weight=0.5) == config
     assert config.resolve().coarse() == coarse.resolve() and FitConfig(preset=preset).coarse().resolve().sharpness_weight == 0.0
+
+
+@pytest.mark.parametrize(("billboards", "searches"), [(1, 1), (4, 1), (5, 1), (6, 2), (7, 2), (8, 3), (9, 3), (12, 3), (40, 3), (None, 3)])
+def test_eight_billboards_have_three_searches_and_no_number_has_more(billboards: int | None, searches: int) -> None:
+    """Unless their number is asked for."""
+    assert FitConfig(billboards=billboards).searches is None and FitConfig(billboards=billboards).resolve().searches == searches
+    assert FitConfig(billboards=billboards, searches=5).resolve().searches == 5
 
 
 def test_unknown_device_is_refused(views: ViewDataset) -> None:

@@ -14,7 +14,7 @@ from bbfit.fitting.initialize import tree_radius
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.losses import pixel_losses
 from bbfit.fitting.points import mesh_points
-from bbfit.fitting.search import SIDE, find_placement
+from bbfit.fitting.search import SIDE, _Search, find_placement
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.reference import render_reference
 from bbfit.views import ViewDataset
@@ -123,6 +123,56 @@ def test_moving_billboards_explain_the_views_better_than_standing_ones(
     asked = {"candidates": 1, "relocations": 0}
     standing, moving = (loss(find_placement(views.train, points, config(placement_rate=rate, **asked)), views) for rate in (0.0, 0.015))
     assert moving < 0.95 * standing
+
+
+def test_of_several_searches_the_best_one_counts(views: ViewDataset, points: torch.Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first is the one that is made where there is only one; so more are never worse, and each starts from other clusterings."""
+    for name in ("_STEPS", "_MORE_STEPS", "_MEND_STEPS"):
+        monkeypatch.setattr(f"bbfit.fitting.search.{name}", 3)
+    made: list[tuple[BillboardCloud, float]] = []
+    original = _Search._searched
+
+    def watched(self: _Search, number: int) -> tuple[BillboardCloud, float]:
+        made.append(original(self, number))
+        return made[-1]
+
+    monkeypatch.setattr(_Search, "_searched", watched)
+    better = 0
+    for seed in range(3):
+        alone = find_placement(views.train, points, config(billboards=4, searches=1, seed=seed))
+        assert len(made) == 1
+        found = find_placement(views.train, points, config(billboards=4, searches=3, seed=seed))
+        first, *more = made[1:]
+        assert same(alone, first[0]) and made[0][1] == first[1] and len(more) == 2
+        assert not any(same(first[0], cloud) for cloud, _ in more) and not same(more[0][0], more[1][0])
+        least = min(lost for _, lost in made)
+        assert [same(found, cloud) for cloud, _ in made[1:]] == [lost == least for _, lost in made[1:]]
+        better += least < first[1]
+        made.clear()
+    assert better > 0
+
+
+def test_every_search_is_told_of_and_has_its_own_clusterings(
+    views: ViewDataset, points: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("_STEPS", "_MORE_STEPS", "_MEND_STEPS"):
+        monkeypatch.setattr(f"bbfit.fitting.search.{name}", 2)
+    starts: list[int] = []
+    original = _Search._clustered
+
+    def watched(self: _Search, index: int) -> BillboardCloud:
+        starts.append(index)
+        return original(self, index)
+
+    monkeypatch.setattr(_Search, "_clustered", watched)
+    for searches in (1, 3):
+        told: list[tuple[int, int]] = []
+        starts.clear()
+        asked = config(billboards=4, candidates=3, relocations=2, searches=searches)
+        find_placement(views.train, points, asked, lambda done, total, told=told: told.append((done, total)))  # type: ignore[misc]
+        # Candidates, the one that goes on, four alternatives for the billboard that is added, and the relocations.
+        assert {total for _, total in told} == {searches * 2 * (3 + 1 + 4 + 2)} == {told[-1][0]}
+        assert sorted(starts) == list(range(3 * searches))
 
 
 @pytest.mark.parametrize("orientation", ["upright", "free"])

@@ -1,7 +1,8 @@
-"""comparison.png and loss.png: what is in them, pixel for pixel where that can be said."""
+"""comparison.png, loss.png and pareto.png: what is in them, pixel for pixel where that can be said."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import cv2
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 from billboard_scene import crossing_billboards, write_views
 
+from bbfit.budget.choice import Choice, Trial
 from bbfit.checks import InputError
 from bbfit.evaluation.scoring import held_out
+from bbfit.fitting.config import FitConfig, Placement, Sides
 from bbfit.images import over_colour, to_bytes
-from bbfit.reporting.plots import comparison_picture, loss_plot, running_mean, spread_views
+from bbfit.reporting.plots import Cost, comparison_picture, loss_plot, pareto_plot, running_mean, spread_views
 
 
 def read(path: Path) -> np.ndarray:
@@ -113,3 +116,76 @@ def test_loss_plot_needs_losses(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="losses: expected a list of at least one number"):
         loss_plot([], tmp_path / "loss.png")
     assert not list(tmp_path.iterdir())
+
+
+def trial(count: int, psnr: float, sides: Sides = "one", placement: Placement = "clusters") -> Trial:
+    textures = count * (1 if sides == "one" else 2)
+    return Trial(count, sides, placement, None, 4 * textures, 10_000 * count, 30_000 * count, psnr, 1.0)
+
+
+def chosen(trials: list[Trial], number: int) -> Choice:
+    return Choice(FitConfig(billboards=trials[number].billboards).resolve(), tuple(trials), number, True, ("0002",))
+
+
+def ring(picture: np.ndarray, panel: int, panels: int) -> tuple[float, float]:
+    """Row and column of the middle of the mark around the chosen trial, in one of the panels."""
+    marked = np.abs(picture.astype(int) - (200, 80, 30)).max(-1) < 12
+    height, width = marked.shape[0], marked.shape[1] // panels
+    marked = marked[:, panel * width : (panel + 1) * width]
+    marked[height // 2 :, width // 2 :] = False  # the legend shows the mark as well
+    rows, columns = np.nonzero(marked)
+    assert len(rows) > 50, "the mark is covered"
+    return float(rows.min() + rows.max()) / 2, float(columns.min() + columns.max()) / 2
+
+
+@pytest.mark.parametrize("cost", ["vertices", "texels", "bytes"])
+def test_the_front_is_drawn_once_and_the_same_each_time(tmp_path: Path, cost: Cost) -> None:
+    """With a second panel for what the budget limits, if that is not vertices."""
+    kinds = [trial(2, 23.0, sides, placement) for sides in ("one", "two", "pair") for placement in ("clusters", "even")]
+    choice, path = chosen([trial(1, 20.0), trial(4, 25.0), trial(6, 24.0), *kinds], 1), tmp_path / "pareto.png"
+    pareto_plot(choice, path, cost=cost)
+    first = path.read_bytes()
+    assert read(path).shape == (600, 1080 if cost == "vertices" else 1680, 3)
+    pareto_plot(choice, path, cost=cost)
+    assert path.read_bytes() == first and [file.name for file in tmp_path.iterdir()] == ["pareto.png"]
+
+
+@pytest.mark.parametrize("cost", ["vertices", "texels", "bytes"])
+def test_the_chosen_trial_is_marked_where_it_stands(tmp_path: Path, cost: Cost) -> None:
+    """In every panel: three decibels up are as far from two to four as from one to two, and so is twice the cost to the right."""
+    trials = [trial(1, 20.0), trial(2, 23.0), trial(4, 26.0), trial(8, 27.0)]
+    panels, pictures = 1 if cost == "vertices" else 2, []
+    for number in range(3):
+        pareto_plot(chosen(trials, number), tmp_path / "pareto.png", cost=cost)
+        pictures.append(read(tmp_path / "pareto.png"))
+    for panel in range(panels):
+        places = [ring(picture, panel, panels) for picture in pictures]
+        (down, across), (down_again, across_again) = np.diff(np.array(places), axis=0)
+        assert down < -50 and across > 50
+        assert abs(down - down_again) < 2 and abs(across - across_again) < 2
+
+
+@pytest.mark.parametrize("cost", ["vertices", "texels", "bytes"])
+def test_each_cost_has_an_axis_of_its_own(tmp_path: Path, cost: Cost) -> None:
+    """The last panel changes with the cost that it is of, and with no other."""
+    trials, pictures = [trial(1, 20.0), trial(2, 23.0), trial(8, 25.0)], []
+    for name in ("vertices", "texels", "bytes"):
+        other = [trials[0], dataclasses.replace(trials[1], **{name: 2 * getattr(trials[1], name)}), trials[2]]
+        pareto_plot(chosen(other, 0), tmp_path / "other.png", cost=cost)
+        pictures.append((tmp_path / "other.png").read_bytes())
+    pareto_plot(chosen(trials, 0), tmp_path / "plain.png", cost=cost)
+    changed = [picture != (tmp_path / "plain.png").read_bytes() for picture in pictures]
+    assert changed == [True, cost == "texels", cost == "bytes"]  # vertices are always shown
+
+
+def test_a_single_trial_can_be_drawn(tmp_path: Path) -> None:
+    for cost in ("vertices", "texels", "bytes"):
+        pareto_plot(chosen([trial(1, 20.0)], 0), tmp_path / "pareto.png", cost=cost)
+        assert read(tmp_path / "pareto.png").shape[0] == 600
+
+
+def test_a_front_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "pareto.png").mkdir()
+    with pytest.raises(InputError, match=r"pareto\.png cannot be written"):
+        pareto_plot(chosen([trial(1, 20.0)], 0), tmp_path / "pareto.png")
+    assert [path.name for path in tmp_path.iterdir()] == ["pareto.png"]

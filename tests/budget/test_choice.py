@@ -1,0 +1,685 @@
+"""How a budget is spent: what is tried, what is kept, and that nobody peeps at the held-out views."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import random
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from billboard_scene import crossing_billboards
+
+from bbfit.budget import choice
+from bbfit.budget.choice import COUNTS, WORTH_DB, Choice, Trial, choose, mean_psnr, model_bytes, pareto_front, within_bytes
+from bbfit.budget.config import BudgetConfig
+from bbfit.checks import InputError
+from bbfit.evaluation.scoring import evaluate
+from bbfit.exporting.config import ExportConfig
+from bbfit.fitting.config import FitConfig, Placement, Sides
+from bbfit.fitting.loop import fit
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.views import ViewDataset
+
+DATA = Path(__file__).resolve().parents[2] / "data"
+Quality = Callable[[int, Sides, Placement], float]
+
+
+@pytest.fixture(scope="module")
+def views(views_folder: Path) -> ViewDataset:
+    """Twelve training views."""
+    return ViewDataset.load(views_folder)
+
+
+# The front.
+
+
+def front_by_comparison(points: Sequence[tuple[float, float]]) -> set[int]:
+    """Those that no other point beats: none is as cheap and as good, and better in one of the two or equal and earlier."""
+    return {
+        i
+        for i, (cost, quality) in enumerate(points)
+        if not any(c <= cost and q >= quality and ((c, q) != (cost, quality) or j < i) for j, (c, q) in enumerate(points) if j != i)
+    }
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_the_front_is_what_nothing_beats(seed: int) -> None:
+    """In order of cost, quality rises from each to the next; few different numbers, so that many are equal."""
+    drawn = random.Random(seed)
+    points = [(float(drawn.randint(1, 9)), drawn.choice([drawn.random(), float(drawn.randint(0, 5))])) for _ in range(1 + seed)]
+    front = pareto_front(points)
+    assert set(front) == front_by_comparison(points) and len(set(front)) == len(front) > 0
+    assert all(points[a][0] < points[b][0] and points[a][1] < points[b][1] for a, b in pairwise(front))
+    best, cheapest = max(quality for _, quality in points), min(cost for cost, _ in points)
+    assert points[front[-1]][1] == best and points[front[0]][0] == cheapest
+
+
+def test_the_front_of_nothing_and_of_equals() -> None:
+    assert pareto_front([]) == []
+    assert pareto_front([(2, 3), (2, 3), (2, 3)]) == [0]
+    assert pareto_front([(4, 1), (2, 3), (1, 2)]) == [2, 1]
+
+
+# Bytes and decibels.
+
+
+@pytest.fixture(scope="module")
+def noise() -> BillboardCloud:
+    """Three billboards, one of them two-sided, with textures that do not pack."""
+    sizes, two_sided = torch.tensor([[40, 30], [64, 20], [9, 50]]), torch.tensor([False, True, False])
+    texels = torch.rand(40 * 30 + 2 * 64 * 20 + 9 * 50, 4, generator=torch.Generator().manual_seed(2))
+    return dataclasses.replace(crossing_billboards(3), texture_sizes=sizes, two_sided=two_sided, texels=texels)
+
+
+@pytest.mark.parametrize("share", [0.999, 0.8, 0.5, 0.35])
+@pytest.mark.parametrize("export", [ExportConfig(), ExportConfig(alpha="mask", padding=2)])
+def test_textures_shrink_until_the_model_is_small_enough(noise: BillboardCloud, share: float, export: ExportConfig) -> None:
+    """The limit is kept, and made use of; rectangles stay, and textures are as wide for their height as before."""
+    limit = int(share * model_bytes(noise, export))
+    cut = within_bytes(noise, limit, export)
+    assert 0.8 * limit < model_bytes(cut, export) <= limit  # measured 0.88
+    for name in ("centers", "rights", "ups", "half_extents", "two_sided"):
+        assert torch.equal(getattr(cut, name), getattr(noise, name))
+    factors = (cut.texture_sizes + 0.5) / noise.texture_sizes
+    assert (cut.texture_sizes < noise.texture_sizes).all() and factors.amax() - factors.amin() < 0.16
+    assert len(cut.texels) == int((cut.texture_sizes.prod(-1) * (1 + cut.two_sided.long())).sum())
+    assert cut.texels[:, 3].mean() == pytest.approx(float(noise.texels[:, 3].mean()), abs=0.03)
+
+
+def test_what_is_small_enough_is_left_alone(noise: BillboardCloud) -> None:
+    size = model_bytes(noise, ExportConfig())
+    assert within_bytes(noise, None, ExportConfig()) is noise
+    assert within_bytes(noise, size, ExportConfig()) is noise
+    assert within_bytes(noise, size - 1, ExportConfig()) is not noise
+
+
+def test_textures_shrink_to_a_texel_where_they_must(noise: BillboardCloud) -> None:
+    """Thin ones are a texel wide long before they are all that small."""
+    bare = dataclasses.replace(noise, texture_sizes=torch.ones(3, 2, dtype=torch.int64), texels=noise.texels[:4])
+    cut = within_bytes(noise, model_bytes(bare, ExportConfig()) + 60, ExportConfig())
+    assert int(cut.texture_sizes.amin()) == 1 < int(cut.texture_sizes.amax())
+
+
+def test_it_is_the_model_with_its_padding_that_counts(noise: BillboardCloud) -> None:
+    thin, thick = (within_bytes(noise, 12_000, ExportConfig(padding=padding)) for padding in (1, 64))
+    assert len(thin.texels) > len(thick.texels)
+
+
+def test_no_textures_are_small_enough_for_less_than_the_rectangles(noise: BillboardCloud) -> None:
+    with pytest.raises(
+        InputError, match=r"^bytes: 1,000 are too few: \d,\d+ are needed without textures; allow more, or fewer billboards$"
+    ):
+        within_bytes(noise, 1000, ExportConfig())
+
+
+def test_a_texel_for_each_is_the_end_and_not_an_error(noise: BillboardCloud) -> None:
+    bare = dataclasses.replace(noise, texture_sizes=torch.ones(3, 2, dtype=torch.int64), texels=torch.rand(4, 4))
+    size = model_bytes(bare, ExportConfig())
+    assert within_bytes(bare, size, ExportConfig()) is bare
+    with pytest.raises(InputError, match=f"{size:,} are needed"):
+        within_bytes(bare, size - 1, ExportConfig())
+
+
+def test_the_mean_psnr_is_that_of_the_report(views: ViewDataset, known_cloud: BillboardCloud) -> None:
+    worse = known_cloud.with_texels(known_cloud.texels**2)
+    for split in (views.test, views.train.take([3, 7])):
+        found = mean_psnr(worse, split)
+        assert found == pytest.approx(evaluate(worse, split).mean.over_white.psnr, abs=1e-9) and 10 < found < 40
+    assert mean_psnr(known_cloud, views.test) > found + 5
+
+
+# Rules, with qualities that are made up.
+
+
+class World:
+    """Where a fit gives what is made up, and is noted; every billboard side has so many texels if it may.
+
+    ``size`` is the bytes of a number of billboards and texels.
+    """
+
+    def __init__(self, quality: Quality, texels: int = 1000, size: Callable[[int, int], int] = lambda count, texels: 2 * texels) -> None:
+        self.quality, self.texels, self.size = quality, texels, size
+        self.asked: list[tuple[int, Sides, Placement, int | None]] = []
+
+    def trial(self, _: object, count: int, sides: Sides, placement: Placement, most: int | None) -> Trial:
+        """What stands in for a short fit."""
+        self.asked.append((count, sides, placement, most))
+        textures = count * (1 if sides == "one" else 2)
+        texels = min(most or 1 << 40, self.texels * textures)
+        size = self.size(count, texels)
+        return Trial(count, sides, placement, most, 4 * textures, texels, size, self.quality(count, sides, placement), 0.0)
+
+    @property
+    def line(self) -> list[int]:
+        """Numbers that were tried one after the other, in the manner of the first."""
+        return [asked[0] for asked in self.asked if asked[1:3] == self.asked[0][1:3]]
+
+    @property
+    def others(self) -> list[tuple[int, Sides, Placement]]:
+        """What was tried beside them."""
+        return [asked[:3] for asked in self.asked if asked[1:3] != self.asked[0][1:3]]
+
+
+Choosing = Callable[..., Choice]
+
+
+@pytest.fixture
+def choosing(views: ViewDataset, monkeypatch: pytest.MonkeyPatch) -> Choosing:
+    """Chooses in a made-up world, without what is tried for the curve alone."""
+    monkeypatch.setattr(choice, "_LESS", ())
+
+    def chosen(world: World, budget: BudgetConfig, config: FitConfig | None = None) -> Choice:
+        monkeypatch.setattr(choice._Trials, "_trial", lambda *arguments: world.trial(*arguments))
+        return choose(views, config or FitConfig(), budget)
+
+    return chosen
+
+
+def rising(count: int, sides: Sides, placement: Placement) -> float:
+    """More billboards are better, two sides or even placement are worse."""
+    return 20 + 4 * math.log2(count) - (sides != "one") - 2 * (placement == "even")
+
+
+def curve(**psnrs: float) -> Quality:
+    """Given PSNRs of n1, n2, ... billboards, and those of two2, even2, ...; otherwise very bad."""
+
+    def quality(count: int, sides: Sides, placement: Placement) -> float:
+        kind = "even" if placement == "even" else "n" if sides == "one" else sides
+        return psnrs.get(f"{kind}{count}", 1.0)
+
+    return quality
+
+
+def summary(found: Choice) -> tuple[int | None, Sides, Placement | None]:
+    return found.config.billboards, found.config.sides, found.config.placement
+
+
+@pytest.mark.parametrize(
+    ("vertices", "counts"),
+    [
+        (4, [1]),
+        (7, [1]),
+        (8, [1, 2]),
+        (32, [1, 2, 3, 4, 6, 8]),
+        (40, [1, 2, 3, 4, 6, 8, 10]),
+        (43, [1, 2, 3, 4, 6, 8, 10]),
+        (124, [1, 2, 3, 4, 6, 8, 12, 16, 24, 31]),
+        (128, list(COUNTS)),
+        (10**6, list(COUNTS)),
+    ],
+)
+def test_a_limit_of_vertices_is_made_use_of(choosing: Choosing, vertices: int, counts: list[int]) -> None:
+    """Numbers are tried up to what the limit allows, in the list or not."""
+    world = World(rising)
+    found = choosing(world, BudgetConfig(vertices=vertices))
+    assert world.line == counts
+    assert summary(found) == (counts[-1], "one", "clusters") and found.config.max_texels is None and found.met
+    assert all(trial.vertices <= vertices for trial in found.trials)
+    expected = [(counts[-1] // 2, "two", "clusters")] * (counts[-1] > 1) + [(counts[-1], "one", "even")]
+    assert world.others == expected
+    assert found.trials[found.chosen].billboards == counts[-1] and len(found.trials) == len(world.asked)
+
+
+def test_two_sided_billboards_have_twice_the_vertices(choosing: Choosing) -> None:
+    """They are not tried again with half as many, nor are one-sided ones."""
+    world = World(rising)
+    found = choosing(world, BudgetConfig(vertices=43), FitConfig(sides="two"))
+    assert world.line == [1, 2, 3, 4, 5] and summary(found) == (5, "two", "clusters")
+    assert world.others == [(5, "two", "even")]
+    assert choosing(World(rising), BudgetConfig(vertices=8), FitConfig(sides="two")).config.billboards == 1
+
+
+def test_even_pairs_have_eight_vertices_each(choosing: Choosing) -> None:
+    world = World(rising)
+    found = choosing(world, BudgetConfig(vertices=24), FitConfig(sides="pair", placement="even"))
+    assert world.line == [1, 2, 3] and world.others == [] and summary(found) == (3, "pair", "even")
+
+
+@pytest.mark.parametrize(
+    ("quality", "expected"),
+    [
+        (curve(n1=20, n2=22, n3=23, two1=22.9, even3=22.9), (3, "one", "clusters")),
+        (curve(n1=20, n2=22, n3=23, two1=23.1, even3=22.9), (1, "two", "clusters")),
+        (curve(n1=20, n2=22, n3=23, two1=23.1, even3=23.2), (3, "one", "even")),
+    ],
+)
+def test_the_same_vertices_may_be_spent_otherwise(choosing: Choosing, quality: Quality, expected: object) -> None:
+    """Two sides of half as many, rounded down, or even placement, are taken where they are better."""
+    world = World(quality)
+    assert summary(choosing(world, BudgetConfig(vertices=12))) == expected
+    assert world.others == [(1, "two", "clusters"), (3, "one", "even")]
+
+
+def test_a_placement_that_is_asked_for_is_kept(choosing: Choosing) -> None:
+    for placement in ("even", "clusters"):
+        world = World(rising)
+        found = choosing(world, BudgetConfig(vertices=16), FitConfig(placement=placement))  # type: ignore[arg-type]
+        assert {asked[2] for asked in world.asked} == {placement} == {found.config.placement}
+        assert world.line == [1, 2, 3, 4] and world.others == [(2, "two", placement)]
+
+
+def test_texels_stop_where_more_billboards_are_in_vain(choosing: Choosing) -> None:
+    """Two more after the best; every trial has the limit, and so has the fit."""
+    peak = curve(n1=20, n2=23, n3=24, n4=25, n6=24.5, n8=24.8, n12=30, two2=22, even4=22)
+    world = World(peak)
+    found = choosing(world, BudgetConfig(texels="2k"))
+    assert world.line == [1, 2, 3, 4, 6, 8] and summary(found) == (4, "one", "clusters")
+    assert {asked[3] for asked in world.asked} == {2000} and found.config.max_texels == 2000
+    assert all(trial.texels <= 2000 for trial in found.trials)
+    assert choosing(World(peak), BudgetConfig(vertices=48)).config.billboards == 12  # a limit of vertices has no such end
+
+
+def test_a_step_in_vain_may_be_bad_luck(choosing: Choosing) -> None:
+    world = World(curve(n1=20, n2=23, n3=22, n4=25, n6=24, n8=26, n12=25, n16=25))
+    assert choosing(world, BudgetConfig(texels=10**6)).config.billboards == 8
+    assert world.line == [1, 2, 3, 4, 6, 8, 12, 16]
+
+
+def test_limits_of_vertices_and_texels_hold_at_once(choosing: Choosing) -> None:
+    world = World(rising)
+    found = choosing(world, BudgetConfig(vertices=20, texels=3000))
+    assert world.line == [1, 2, 3, 4, 5] and found.config.max_texels == 3000
+    assert all(trial.vertices <= 20 and trial.texels <= 3000 for trial in found.trials)
+
+
+@pytest.mark.parametrize("wrong", [0.2, 0.5, 1.0, 1.04, 1.07, 1.5, 4.0])
+def test_bytes_are_kept_and_made_use_of_whatever_a_texel_takes(choosing: Choosing, wrong: float) -> None:
+    """The first guess may be wrong by far; then it is known what a texel takes, and one trial is enough."""
+    rate = wrong * choice._BYTES_A_TEXEL
+    world = World(rising, texels=10**6, size=lambda count, texels: int(rate * texels))
+    found = choosing(world, BudgetConfig(vertices=16, bytes="100k"))
+    guesses = [len([asked for asked in world.asked if asked[0] == count and asked[1:3] == ("one", "clusters")]) for count in (1, 2, 3, 4)]
+    assert guesses == [1 if choice._NEAR < 0.95 * wrong <= 1 else 2, 1, 1, 1]
+    assert summary(found) == (4, "one", "clusters") and len(set(world.asked)) == len(world.asked)
+    for trial in found.trials[guesses[0] - 1 :]:
+        assert choice._NEAR * 100_000 < trial.bytes <= 100_000
+    assert found.config.max_texels is not None
+    assert rate * found.config.max_texels == pytest.approx(choice._CRISPER * 100_000, abs=2 * rate)
+
+
+def test_bytes_that_are_not_needed_are_not_asked_for_again(choosing: Choosing) -> None:
+    """The billboards have fewer texels than they may."""
+    world = World(rising, texels=100)
+    found = choosing(world, BudgetConfig(vertices=16, bytes="100k"))
+    assert world.line == [1, 2, 3, 4] and len(world.asked) == 6
+    assert found.config.max_texels == int(choice._CRISPER * 100_000 / 800 * 400)
+
+
+def test_what_a_billboard_takes_besides_is_found_out(choosing: Choosing) -> None:
+    """Bytes that do not depend on texels: three guesses for each number are enough to stay below the limit."""
+    world = World(rising, texels=10**6, size=lambda count, texels: 400 * count + 2 * texels)
+    found = choosing(world, BudgetConfig(vertices=32, bytes=20_000))
+    assert summary(found) == (8, "one", "clusters") and found.trials[found.chosen].bytes <= 20_000
+    for count in COUNTS[:6]:
+        assert any(trial.bytes <= 20_000 for trial in found.trials if trial.billboards == count)
+
+
+def test_a_budget_of_bytes_that_can_be_kept_is_kept(choosing: Choosing) -> None:
+    """A thousand texels would do."""
+    found = choosing(World(rising, texels=10**6, size=lambda count, texels: 2000 + 4 * texels), BudgetConfig(vertices=4, bytes=6000))
+    assert found.trials[found.chosen].bytes <= 6000
+
+
+def test_bytes_and_texels_hold_at_once(choosing: Choosing) -> None:
+    world = World(rising, texels=10**6)
+    found = choosing(world, BudgetConfig(vertices=16, bytes=40_000, texels="1M"))
+    assert found.trials[found.chosen].bytes <= 40_000 and found.config.max_texels == pytest.approx(choice._CRISPER * 20_000, abs=2)
+    world = World(rising, texels=10**6)
+    found = choosing(world, BudgetConfig(vertices=16, bytes="1M", texels=3000))
+    assert {asked[3] for asked in world.asked} == {3000} and found.config.max_texels == 3000
+
+
+@pytest.mark.parametrize("budget", [BudgetConfig(texels=6000, vertices=16), BudgetConfig(bytes=12_000, vertices=16)], ids=str)
+def test_less_is_tried_for_the_curve_alone(choosing: Choosing, monkeypatch: pytest.MonkeyPatch, budget: BudgetConfig) -> None:
+    """Shares of the texels of what is best, which do not change the choice, even if they should do better."""
+    world = World(rising, texels=10**6)
+    bare = choosing(world, budget)
+    done, texels = len(world.asked), bare.trials[bare.chosen].texels
+
+    def better(count: int, sides: Sides, placement: Placement) -> float:
+        return rising(count, sides, placement) + 10 * (len(world.asked) > done)
+
+    world = World(better, texels=10**6)
+    monkeypatch.setattr(choice, "_LESS", (0.5, 0.25, 0.0001))
+    found = choosing(world, budget)
+    kind = (bare.config.billboards, bare.config.sides, bare.config.placement)
+    assert world.asked[done:] == [(*kind, int(0.5 * texels)), (*kind, int(0.25 * texels)), (*kind, 8)]  # two texels for each at the least
+    assert found.config == bare.config and found.chosen == bare.chosen and found.trials[:done] == bare.trials
+    assert found.trials[-1].psnr > found.trials[found.chosen].psnr
+
+
+def test_a_curve_of_vertices_needs_nothing_else(choosing: Choosing, monkeypatch: pytest.MonkeyPatch) -> None:
+    for budget in (BudgetConfig(vertices=16), BudgetConfig(auto=True), BudgetConfig(texels=500, target_psnr=25)):
+        asked = []
+        for less in ((), (0.5,)):
+            monkeypatch.setattr(choice, "_LESS", less)
+            world = World(rising)
+            choosing(world, budget)
+            asked.append(world.asked)
+        assert asked[0] == asked[1]
+
+
+def test_no_trial_is_done_twice(choosing: Choosing) -> None:
+    world = World(rising, texels=10**6)
+    choosing(world, BudgetConfig(vertices=16, bytes="1M", texels=3000))
+    assert len(set(world.asked)) == len(world.asked)
+
+
+def test_a_target_takes_as_few_as_will_do(choosing: Choosing) -> None:
+    """And nothing else is tried, since it would have as many vertices."""
+    world = World(curve(n1=20, n2=22, n3=24, n4=25, n6=26))
+    found = choosing(world, BudgetConfig(target_psnr=24))
+    assert world.line == [1, 2, 3] and world.others == []
+    assert summary(found) == (3, "one", "clusters") and found.met and found.trials[found.chosen].psnr == 24
+
+
+def test_a_target_that_is_not_reached_gives_the_best(choosing: Choosing) -> None:
+    world = World(curve(n1=20, n2=22, n3=24, n4=25, n6=26, n8=25))
+    found = choosing(world, BudgetConfig(target_psnr=26.1, vertices=32))
+    assert world.line == [1, 2, 3, 4, 6, 8] and world.others == []
+    assert summary(found) == (6, "one", "clusters") and not found.met
+    found = choosing(World(rising), BudgetConfig(target_psnr=90))
+    assert found.config.billboards == COUNTS[-1] and not found.met
+
+
+def test_a_target_that_only_more_than_is_allowed_reaches_is_not_reached(choosing: Choosing) -> None:
+    """From eight billboards on the model has too many bytes without a texel."""
+    world = World(rising, texels=300, size=lambda count, texels: 3000 * count + 2 * texels)
+    found = choosing(world, BudgetConfig(target_psnr=32, bytes=22_000))
+    assert any(trial.psnr >= 32 for trial in found.trials)
+    assert summary(found) == (6, "one", "clusters") and not found.met and found.trials[found.chosen].bytes <= 22_000
+    # A texel limit does not stand in the way: trials keep it.
+    found = choosing(World(rising), BudgetConfig(target_psnr=32, texels=500))
+    assert summary(found) == (8, "one", "clusters") and found.met and found.config.max_texels == 500
+
+
+def test_a_target_is_not_given_up_for_a_trial_that_is_too_much(choosing: Choosing) -> None:
+    """Three billboards reach it and do not pack at all; four do both."""
+    world = World(rising, size=lambda count, texels: 2 * texels if count != 3 else 10**6)
+    found = choosing(world, BudgetConfig(target_psnr=25, bytes=20_000))
+    assert summary(found) == (4, "one", "clusters") and found.met
+    assert {trial.billboards for trial in found.trials if trial.psnr >= 25} == {3, 4}
+
+
+def test_of_all_trials_that_reach_a_target_the_smallest_counts(choosing: Choosing) -> None:
+    """Also one that left much of the limit, after which larger ones were too large."""
+    world = World(rising, texels=10**6, size=lambda count, texels: 20_000 if texels <= 50_000 else 150_000)
+    found = choosing(world, BudgetConfig(target_psnr=20, bytes=100_000))
+    assert world.line == [1, 1, 1, 2, 2, 2] and found.config.billboards == 1 and found.chosen == 0 and found.met
+
+
+def test_auto_stops_at_the_knee(choosing: Choosing) -> None:
+    """Twice as many are to gain a certain number of decibels; two steps that do not are the end."""
+    world = World(lambda count, sides, placement: 20 + 3 * math.log2(min(count, 4)) + 0.3 * math.log2(max(count / 4, 1)) - (sides != "one"))
+    found = choosing(world, BudgetConfig(auto=True), FitConfig(placement="clusters"))
+    assert world.line == [1, 2, 3, 4, 6, 8] and summary(found) == (4, "one", "clusters") and found.met
+    assert world.others == [(2, "two", "clusters")]
+
+
+@pytest.mark.parametrize(("gain", "last"), [(WORTH_DB + 0.01, COUNTS[-1]), (WORTH_DB - 0.01, 1)])
+def test_auto_goes_as_far_as_it_pays(choosing: Choosing, gain: float, last: int) -> None:
+    """By what a doubling gains, though most steps are smaller than that."""
+    world = World(lambda count, sides, placement: 20 + gain * math.log2(count) - (sides != "one") - (placement == "even"))
+    found = choosing(world, BudgetConfig(auto=True))
+    assert summary(found) == (last, "one", "clusters") and world.line == (list(COUNTS) if last > 1 else [1, 2, 3])
+
+
+def test_auto_steps_over_one_that_was_unlucky(choosing: Choosing) -> None:
+    world = World(curve(n1=20, n2=22, n3=23, n4=24, n6=23.5, n8=26, n12=26.1, n16=26.2))
+    assert summary(choosing(world, BudgetConfig(auto=True))) == (8, "one", "clusters")
+    assert world.line == [1, 2, 3, 4, 6, 8, 12, 16]
+
+
+def test_auto_within_a_limit(choosing: Choosing) -> None:
+    world = World(rising)
+    found = choosing(world, BudgetConfig(auto=True, vertices=24, texels=5000))
+    assert world.line == [1, 2, 3, 4, 6] and summary(found) == (6, "one", "clusters") and found.config.max_texels == 5000
+
+
+def test_auto_may_spend_the_vertices_of_the_knee_otherwise(choosing: Choosing) -> None:
+    knee = {"n1": 20, "n2": 22, "n3": 23, "n4": 24, "n6": 24.1, "n8": 24.2}
+    assert summary(choosing(World(curve(**knee, two2=24.05)), BudgetConfig(auto=True))) == (2, "two", "clusters")
+    assert summary(choosing(World(curve(**knee, even4=24.05)), BudgetConfig(auto=True))) == (4, "one", "even")
+
+
+@pytest.mark.parametrize("better", [-1.1, -0.9, 0.0, 0.9, 1.1])
+def test_a_little_better_may_be_luck(choosing: Choosing, better: float) -> None:
+    """Of two that differ by little, the one of more vertices if there is a limit to them, and else that of fewer."""
+    quality = curve(n1=20, n2=22, n3=23, n4=24, n6=25, n8=26 + better * choice._LUCK, n12=26, n16=21, n24=21, n32=21)
+    expected = 12 if better < 1 else 8
+    assert choosing(World(quality), BudgetConfig(target_psnr=30, vertices=48)).config.billboards == expected
+    world = World(quality)
+    choosing(world, BudgetConfig(vertices=48))
+    assert world.others == [(expected // 2, "two", "clusters"), (expected, "one", "even")]
+    for budget in (
+        BudgetConfig(target_psnr=30),
+        BudgetConfig(texels="1M"),
+        BudgetConfig(bytes="1M"),
+        BudgetConfig(target_psnr=30, texels="1M"),
+    ):
+        world = World(quality)
+        found = choosing(world, budget)
+        assert found.config.billboards == (12 if better < -1 else 8) and 12 in world.line
+
+
+def test_luck_does_not_make_up_for_a_number(choosing: Choosing) -> None:
+    """It is counted from the best, and not from each to the next."""
+    step = 0.7 * choice._LUCK
+    quality = curve(n1=26 - 2 * step, n2=26 - step, n3=26, n4=26 - step, n6=26 - 2 * step, n8=26 - 3 * step)
+    found = choosing(World(quality), BudgetConfig(target_psnr=30, vertices=32))
+    assert found.config.billboards == 4
+    found = choosing(World(quality), BudgetConfig(texels="1M"))
+    assert found.config.billboards == 2
+
+
+def test_luck_does_not_decide_over_the_number(choosing: Choosing) -> None:
+    quality = curve(n1=20, n2=22, n3=23, n4=24, n6=25, n8=26 + 0.9 * choice._LUCK, n12=26)
+    assert choosing(World(quality), BudgetConfig(vertices=48)).config.billboards == 12
+
+
+def test_of_equals_the_first_is_chosen(choosing: Choosing) -> None:
+    """Which trial it is, not only what it is like: two-sided ones have the same number of vertices."""
+    found = choosing(World(lambda *kind: 20.0), BudgetConfig(target_psnr=20))
+    assert found.chosen == 0 and len(found.trials) == 1
+
+
+# What is fitted for a trial.
+
+
+class Fits:
+    """Stands in for :func:`bbfit.fit`: the billboards that the views show, as far as there are as many, and no others."""
+
+    def __init__(self, known: BillboardCloud) -> None:
+        self.asked: list[tuple[ViewDataset, FitConfig, Path | None]] = []
+        self._known = known
+
+    def __call__(self, views: ViewDataset, config: FitConfig, *, tree: Path | None = None) -> SimpleNamespace:
+        self.asked.append((views, config, tree))
+        return SimpleNamespace(cloud=self.cloud(config))
+
+    def cloud(self, config: FitConfig) -> BillboardCloud:
+        """What comes of a configuration."""
+        assert config.billboards is not None
+        one = self._known.take(k % 2 for k in range(config.billboards))
+        if config.sides == "one":
+            return one
+        texels = torch.cat([texture.reshape(-1, 4).repeat(2, 1) for texture in one.textures()])
+        return dataclasses.replace(one, two_sided=torch.ones(len(one), dtype=torch.bool), texels=texels)
+
+
+@pytest.fixture
+def fits(monkeypatch: pytest.MonkeyPatch, known_cloud: BillboardCloud) -> Fits:
+    stand_in = Fits(known_cloud)
+    monkeypatch.setattr(choice, "fit", stand_in)
+    return stand_in
+
+
+def test_a_trial_is_a_short_fit_measured_on_views_it_has_not_seen(views: ViewDataset, fits: Fits) -> None:
+    """Every fifth training view is for validation."""
+    export = ExportConfig(padding=2)
+    found = choose(views, FitConfig(seed=3), BudgetConfig(vertices=8), tree=Path("some.glb"), export=export)
+    held = [views.train.names[index] for index in (2, 7)]
+    assert found.validation == tuple(held)
+    asked = [(config.billboards, config.sides, config.placement) for _, config, _ in fits.asked]
+    assert asked == [(1, "one", "clusters"), (2, "one", "clusters"), (1, "two", "clusters"), (2, "one", "even")]
+    for (given, config, tree), trial in zip(fits.asked, found.trials, strict=True):
+        assert given.train.names == [name for name in views.train.names if name not in held] and given.test.names == held
+        assert tree == Path("some.glb") and config.seed == 3
+        assert all(getattr(config, name) == value for name, value in choice._SHORT.items())
+        cloud = fits.cloud(config)
+        assert (trial.billboards, trial.sides, trial.placement, trial.max_texels) == (
+            config.billboards,
+            config.sides,
+            config.placement,
+            None,
+        )
+        assert (trial.vertices, trial.texels, trial.bytes) == (cloud.vertex_count, len(cloud.texels), model_bytes(cloud, export))
+        assert trial.psnr == pytest.approx(mean_psnr(cloud, views.train.take([2, 7])), abs=6e-4) and trial.seconds >= 0
+
+
+def test_what_is_asked_for_is_kept(views: ViewDataset, fits: Fits) -> None:
+    """In the trials, steps included, and in the fit, which is not short unless it was asked to be."""
+    asked = FitConfig(steps=7, views_per_step=3, searches=2, candidates=5, loss="l1", texel_density=0.7, orientation="free")
+    found = choose(views, asked, BudgetConfig(vertices=4))
+    assert fits.asked[0][1] == dataclasses.replace(asked, billboards=1, placement="clusters")
+    trial = found.trials[found.chosen]
+    assert found.config == dataclasses.replace(asked, billboards=1, sides=trial.sides, placement=trial.placement).resolve()
+    plain = choose(views, FitConfig(), BudgetConfig(vertices=4)).config
+    assert plain == FitConfig(billboards=1, placement=plain.placement).resolve() == plain.resolve()
+
+
+@pytest.mark.parametrize(
+    ("count", "held"), [(5, [2]), (6, [2]), (7, [2]), (8, [2, 7]), (10, [2, 7]), (12, [2, 7])], ids=lambda value: str(value)
+)
+def test_one_in_five_views_is_held(views: ViewDataset, fits: Fits, count: int, held: list[int]) -> None:
+    few = dataclasses.replace(views, train=views.train.take(range(count)))
+    if count == 8:
+        few = dataclasses.replace(views, train=views.train.take(range(4, 12)))
+    found = choose(few, FitConfig(), BudgetConfig(vertices=4))
+    assert list(found.validation) == [few.train.names[index] for index in held]
+    assert len(fits.asked[0][0].train) == count - len(held)
+
+
+@pytest.mark.parametrize("kept", range(5))
+def test_trials_that_are_known_are_not_done_again(views: ViewDataset, fits: Fits, kept: int) -> None:
+    budget = BudgetConfig(vertices=8)
+    whole = choose(views, FitConfig(), budget)
+    assert len(fits.asked) == len(whole.trials) == 4
+    fits.asked.clear()
+    again = choose(views, FitConfig(), budget, known=whole.trials[:kept])
+    assert len(fits.asked) == 4 - kept and again.trials[:kept] == whole.trials[:kept]
+    assert dataclasses.replace(again, trials=()) == dataclasses.replace(whole, trials=())
+    assert [dataclasses.replace(trial, seconds=0.0) for trial in again.trials] == [
+        dataclasses.replace(trial, seconds=0.0) for trial in whole.trials
+    ]
+
+
+def test_only_the_same_trial_is_known(views: ViewDataset, fits: Fits) -> None:
+    """It has to agree in number, sides, placement and limit of texels."""
+    first = choose(views, FitConfig(), BudgetConfig(vertices=4)).trials[0]
+    for other in ({"billboards": 2}, {"sides": "two"}, {"placement": "even"}, {"max_texels": 500}):
+        fits.asked.clear()
+        choose(views, FitConfig(placement="clusters"), BudgetConfig(vertices=4), known=[dataclasses.replace(first, **other)])
+        assert len(fits.asked) == 1
+
+
+def test_each_trial_is_told(views: ViewDataset, fits: Fits) -> None:
+    """All so far, in a list of one's own, and how many there may be; also those that were known."""
+    told: list[tuple[list[Trial], int]] = []
+    found = choose(views, FitConfig(), BudgetConfig(vertices=12), on_trial=lambda trials, total: told.append((trials, total)))
+    assert [trials for trials, _ in told] == [list(found.trials[: count + 1]) for count in range(5)]
+    assert {total for _, total in told} == {5}
+    told.clear()
+    choose(views, FitConfig(), BudgetConfig(vertices=12), known=found.trials, on_trial=lambda trials, total: told.append((trials, total)))
+    assert [len(trials) for trials, _ in told] == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize(
+    ("config", "budget", "count", "says"),
+    [
+        (
+            FitConfig(billboards=3),
+            BudgetConfig(vertices=8),
+            12,
+            "^billboards: 3 are asked for and a budget as well; leave one of them out$",
+        ),
+        (FitConfig(preset="thesis"), BudgetConfig(auto=True), 12, "^preset: 'thesis' is a schedule of its own"),
+        (FitConfig(), BudgetConfig(vertices=8), 4, "^views: 4 training views leave none for validation; give at least 5$"),
+        (FitConfig(), BudgetConfig(vertices=8), 1, "^views: 1 training views leave none"),
+        (FitConfig(sides="two"), BudgetConfig(vertices=7), 12, "^vertices: 7 are too few for one billboard of sides 'two'; allow more"),
+        (FitConfig(sides="pair"), BudgetConfig(vertices=4), 12, "^vertices: 4 are too few for one billboard of sides 'pair'"),
+        (FitConfig(), BudgetConfig(bytes=100), 12, r"^budget: 1 billboard with \d,\d+ bytes is too much for it; allow more$"),
+    ],
+)
+def test_what_cannot_be_chosen(
+    views: ViewDataset, fits: Fits, monkeypatch: pytest.MonkeyPatch, config: FitConfig, budget: BudgetConfig, count: int, says: str
+) -> None:
+    monkeypatch.setattr(choice, "COUNTS", (1, 2))
+    few = dataclasses.replace(views, train=views.train.take(range(count)))
+    with pytest.raises(InputError, match=says):
+        choose(few, config, budget)
+    assert (len(fits.asked) > 0) == (budget.bytes is not None)
+
+
+def test_a_choice_survives_the_disk(choosing: Choosing) -> None:
+    """Trials read back are the trials, and can be given as known; the front is by vertices."""
+    found = choosing(World(curve(n1=20, n2=22, n3=21, n4=23, two2=23.5)), BudgetConfig(vertices=16, target_psnr=None))
+    content = json.loads(json.dumps(found.to_json()))
+    assert set(content) == {"trials", "chosen", "met", "validation"}
+    flags = [trial.pop("pareto") for trial in content["trials"]]
+    assert tuple(Trial(**trial) for trial in content["trials"]) == found.trials
+    assert flags == [True, True, False, False, True, False] and found.chosen == content["chosen"] == 4
+    assert content["met"] is True and content["validation"] == list(found.validation)
+
+
+# The real thing.
+
+
+class Sealed:
+    """Pictures that may not be looked at."""
+
+    def get(self, path: Path) -> torch.Tensor:
+        """Fails."""
+        raise AssertionError(f"{path} was looked at")
+
+
+def sealed(folder: Path) -> ViewDataset:
+    """Views whose test pictures may not be looked at."""
+    views = ViewDataset.load(folder)
+    return dataclasses.replace(views, test=dataclasses.replace(views.test, _cache=Sealed()))
+
+
+QUICK = FitConfig(candidates=2, relocations=0, steps=4, views_per_step=1)
+
+
+def test_a_choice_on_real_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Limits hold in every trial; the one that is chosen is a fit of views that leave out those for validation."""
+    monkeypatch.setattr(choice, "COUNTS", (1, 2))
+    views, told = sealed(DATA / "views"), []
+    found = choose(views, QUICK, BudgetConfig(vertices=11, texels="4k"), on_trial=lambda trials, total: told.append(len(trials)))
+    kinds = [(trial.billboards, trial.sides, trial.placement) for trial in found.trials]
+    assert kinds[:2] == [(1, "one", "clusters"), (2, "one", "clusters")] and told == list(range(1, len(kinds) + 1))
+    assert all(trial.vertices <= 8 and 0 < trial.texels <= 4000 and 5 < trial.psnr < 40 and trial.seconds > 0 for trial in found.trials)
+    best = found.trials[found.chosen]
+    whole = [trial for trial in found.trials if trial.max_texels == 4000]
+    assert best in whole and best.psnr >= max(trial.psnr for trial in whole if trial.vertices <= best.vertices) and len(whole) > 2
+    held = [index for index in range(len(views.train)) if index % 5 == 2]
+    assert found.validation == tuple(views.train.names[index] for index in held) and len(held) == 4
+    rest = dataclasses.replace(views, train=views.train.take([index for index in range(len(views.train)) if index not in held]))
+    cloud = fit(rest, dataclasses.replace(found.config, searches=1)).cloud
+    assert (best.vertices, best.texels, best.bytes) == (cloud.vertex_count, len(cloud.texels), model_bytes(cloud, ExportConfig()))
+    assert best.psnr == pytest.approx(mean_psnr(cloud, views.train.take(held)), abs=6e-4)
+
+
+def test_bytes_on_real_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choice, "COUNTS", (1, 2))
+    found = choose(sealed(DATA / "views"), dataclasses.replace(QUICK, placement="even"), BudgetConfig(bytes="20k"))
+    assert 10_000 < found.trials[found.chosen].bytes <= 20_000 and found.config.max_texels is not None
+    for count in (1, 2):
+        assert any(trial.bytes <= 20_000 for trial in found.trials if trial.billboards == count)

@@ -1,0 +1,239 @@
+"""Runs within a budget: what is written, what is not done twice, and that limits hold in the files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+
+from bbfit import pipeline
+from bbfit.budget import choice
+from bbfit.budget.choice import Trial
+from bbfit.budget.config import BudgetConfig
+from bbfit.checks import InputError
+from bbfit.exporting.config import ExportConfig
+from bbfit.fitting.config import FitConfig
+from bbfit.pipeline import RunConfig, RunResult, run
+
+VIEWS = Path(__file__).resolve().parents[1] / "data" / "views"
+FIT = FitConfig(placement="even", steps=6, views_per_step=1)
+CONFIG = RunConfig(fit=FIT, budget=BudgetConfig(vertices=8))
+STAGES = ("budget", "fit", "export", "evaluate")
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    """One, two, and a two-sided billboard were tried. Do not change its files."""
+    return run(VIEWS, tmp_path_factory.mktemp("budget") / "run", CONFIG)
+
+
+@pytest.fixture
+def trials_done(monkeypatch: pytest.MonkeyPatch) -> list[int | None]:
+    """Numbers of billboards of the short fits that are really done."""
+    fitted: list[int | None] = []
+    original = choice.fit
+
+    def watched(views: object, config: FitConfig, **options: object) -> object:
+        fitted.append(config.billboards)
+        return original(views, config, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(choice, "fit", watched)
+    return fitted
+
+
+def written(folder: Path) -> dict:
+    return json.loads((folder / "pareto.json").read_text())
+
+
+def trials_of(folder: Path) -> list[Trial]:
+    return [Trial(**{name: value for name, value in trial.items() if name != "pareto"}) for trial in written(folder)["trials"]]
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def untimed(trials: list[Trial]) -> list[Trial]:
+    return [dataclasses.replace(trial, seconds=0.0) for trial in trials]
+
+
+def test_trials_and_their_picture_are_written(done: RunResult) -> None:
+    assert done.skipped == () and done.missed is None
+    content, trials = written(done.folder), trials_of(done.folder)
+    assert set(content) == {"inputs", "budget", "trials", "chosen", "met", "validation"}
+    assert content["budget"] == {"vertices": 8} and content["met"] is True
+    assert [(trial.billboards, trial.sides, trial.placement) for trial in trials] == [
+        (1, "one", "even"),
+        (2, "one", "even"),
+        (1, "two", "even"),
+    ]
+    assert [trial.vertices for trial in trials] == [4, 8, 8] and all(trial.seconds > 0 for trial in trials)
+    train = json.loads((VIEWS / "transforms_train.json").read_text())["frames"]
+    assert content["validation"] == [Path(train[index]["file_path"]).stem for index in (2, 7, 12, 17)]
+    assert (done.folder / "pareto.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+    assert cv2.imread(str(done.folder / "pareto.png")).shape == (600, 1080, 3)
+
+
+def test_the_record_holds_the_fit_that_was_chosen(done: RunResult) -> None:
+    record, chosen = json.loads((done.folder / "run.json").read_text()), trials_of(done.folder)[written(done.folder)["chosen"]]
+    fitted = record["config"]["fit"]
+    assert {name: fitted[name] for name in ("billboards", "sides", "placement", "max_texels")} == {
+        name: getattr(chosen, name) for name in ("billboards", "sides", "placement", "max_texels")
+    }
+    assert fitted == dataclasses.asdict(FitConfig(**fitted).resolve()) and fitted["steps"] == 6 and fitted["searches"] == 1
+    assert record["config"]["budget"] == dataclasses.asdict(CONFIG.budget)
+    assert tuple(record["stages"]) == STAGES
+    assert done.cloud.vertex_count == chosen.vertices <= 8
+    metrics = json.loads((done.folder / "metrics.json").read_text())
+    assert set(metrics["seconds"]) == set(STAGES) and metrics["seconds"]["budget"] > 0
+    assert metrics["vertices"]["model"] == chosen.vertices
+
+
+def test_no_stage_is_done_twice(done: RunResult, trials_done: list[int | None]) -> None:
+    before, told = snapshot(done.folder), []
+    again = run(VIEWS, done.folder, CONFIG, on_progress=lambda *event: told.append(event))
+    assert again.skipped == STAGES and told == [] and trials_done == []
+    assert again.report == done.report and snapshot(done.folder) == before and torch.equal(again.cloud.texels, done.cloud.texels)
+
+
+def killed_after_a_trial(folder: Path) -> None:
+    def kill(stage: str, index: int, total: int, note: str = "") -> None:
+        if (stage, index) == ("budget", 1):
+            raise Killed
+
+    with pytest.raises(Killed):
+        run(VIEWS, folder, CONFIG, on_progress=kill)
+
+
+def test_a_killed_run_goes_on_with_the_trials_done(done: RunResult, tmp_path: Path, trials_done: list[int | None]) -> None:
+    killed_after_a_trial(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["pareto.json"] and trials_done == [1]
+    (first,), told = trials_of(tmp_path), []
+    result = run(VIEWS, tmp_path, CONFIG, on_progress=lambda *event: told.append(event))
+    assert trials_done == [1, 2, 1] and result.skipped == ()
+    assert trials_of(tmp_path)[0] == first and untimed(trials_of(tmp_path)) == untimed(trials_of(done.folder))
+    assert [event[:2] for event in told if event[0] == "budget"] == [("budget", index) for index in range(4)]
+    assert all(event[1] <= event[2] for event in told)
+    for name in ("cloud.safetensors", "loss.csv", "model.glb", "model.obj"):
+        assert (tmp_path / name).read_bytes() == (done.folder / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"budget": BudgetConfig(vertices=4)},
+        {"fit": dataclasses.replace(FIT, seed=1)},
+        {"export": ExportConfig(padding=4)},
+    ],
+    ids=str,
+)
+def test_what_else_is_asked_for_is_chosen_anew(tmp_path: Path, trials_done: list[int | None], change: dict[str, object]) -> None:
+    """Trials of another budget, or of other fits, do not count, though they would answer the question."""
+    killed_after_a_trial(tmp_path)
+    other = dataclasses.replace(CONFIG, **change)  # type: ignore[arg-type]
+    result = run(VIEWS, tmp_path, other)
+    assert trials_done == [1, *([1, 2, 1] if other.budget == CONFIG.budget else [1])] and result.skipped == ()
+    assert written(tmp_path)["budget"] == {"vertices": other.budget.vertices} and result.cloud.vertex_count <= (other.budget.vertices or 0)
+
+
+def test_how_often_a_state_is_kept_is_no_matter(tmp_path: Path, trials_done: list[int | None]) -> None:
+    killed_after_a_trial(tmp_path)
+    run(VIEWS, tmp_path, dataclasses.replace(CONFIG, fit=dataclasses.replace(FIT, checkpoint_every=7)))
+    assert trials_done == [1, 2, 1]
+
+
+def test_only_what_is_lost_is_made_again(tmp_path: Path, trials_done: list[int | None]) -> None:
+    run(VIEWS, tmp_path, CONFIG)
+    before = snapshot(tmp_path)
+    trials_done.clear()
+    (tmp_path / "pareto.png").unlink()
+    assert run(VIEWS, tmp_path, CONFIG).skipped == STAGES[1:] and trials_done == []
+    assert snapshot(tmp_path)["pareto.png"] == before["pareto.png"] and snapshot(tmp_path)["pareto.json"] == before["pareto.json"]
+    (tmp_path / "pareto.json").unlink()
+    assert run(VIEWS, tmp_path, CONFIG).skipped == STAGES[1:] and trials_done == [1, 2, 1]
+
+
+def test_a_run_without_a_budget_chooses_nothing(tmp_path: Path, trials_done: list[int | None]) -> None:
+    result = run(VIEWS, tmp_path, RunConfig(fit=dataclasses.replace(FIT, billboards=1)))
+    assert trials_done == [] and result.missed is None
+    assert not list(tmp_path.glob("pareto*")) and "budget" not in json.loads((tmp_path / "run.json").read_text())["stages"]
+
+
+@pytest.mark.parametrize(("target", "missed"), [(90.0, 90.0), (3.0, None)])
+def test_a_target_that_is_missed_is_told(tmp_path: Path, target: float, missed: float | None) -> None:
+    """Also by a run that finds everything done."""
+    config = RunConfig(fit=FIT, budget=BudgetConfig(vertices=4, target_psnr=target))
+    for skipped in ((), STAGES):
+        result = run(VIEWS, tmp_path, config)
+        assert result.missed == missed and result.skipped == skipped
+    assert written(tmp_path)["met"] is (missed is None) and written(tmp_path)["budget"] == {"vertices": 4, "target_psnr": target}
+
+
+@pytest.mark.parametrize("crisper", [0.9, 4.0])
+def test_the_model_has_no_more_bytes_than_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crisper: float) -> None:
+    """Even if the fit turns out much larger than the trials spoke for; a second run finds it done."""
+    monkeypatch.setattr(choice, "COUNTS", (1, 2))
+    monkeypatch.setattr(choice, "_CRISPER", crisper)
+    sizes: list[int] = []
+    original = pipeline.within_bytes
+
+    def watched(cloud: object, most: int | None, export: ExportConfig) -> object:
+        sizes.append(choice.model_bytes(cloud, export))  # type: ignore[arg-type]
+        return original(cloud, most, export)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(pipeline, "within_bytes", watched)
+    config = RunConfig(fit=FIT, budget=BudgetConfig(bytes="20k"), export=ExportConfig(padding=48))
+    result = run(VIEWS, tmp_path, config)
+    size = (tmp_path / "model.glb").stat().st_size
+    assert 10_000 < size <= 20_000 and len(sizes) == 1 and (sizes[0] > 30_000 if crisper > 1 else sizes[0] >= size)
+    assert result.report.bytes.model == size and written(tmp_path)["budget"] == {"bytes": "20k"}
+    assert all(trial.bytes <= 20_000 for trial in trials_of(tmp_path) if trial == trials_of(tmp_path)[written(tmp_path)["chosen"]])
+    assert run(VIEWS, tmp_path, config).skipped == STAGES
+
+
+def test_the_same_fit_within_fewer_bytes_is_another_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where trials speak for the same configuration the limit still counts, and so does how the model is written."""
+    trial = Trial(1, "one", "even", None, 4, 5000, 15_000, 20.0, 1.0)
+    same = choice.Choice(dataclasses.replace(FIT, billboards=1).resolve(), (trial,), 0, True, ("0002",))
+    monkeypatch.setattr(pipeline, "choose", lambda *arguments, **options: same)
+    texels = []
+    for limit, export in (("20k", ExportConfig()), ("10k", ExportConfig()), ("10k", ExportConfig(padding=48))):
+        result = run(VIEWS, tmp_path, RunConfig(fit=FIT, budget=BudgetConfig(bytes=limit), export=export))
+        assert (tmp_path / "model.glb").stat().st_size <= {"20k": 20_000, "10k": 10_000}[limit]
+        assert result.skipped == ()
+        texels.append(len(result.cloud.texels))
+    assert texels[0] > texels[1] > texels[2]
+
+
+def test_a_limit_of_texels_holds_in_the_result(tmp_path: Path) -> None:
+    result = run(VIEWS, tmp_path, RunConfig(fit=FIT, budget=BudgetConfig(vertices=8, texels="3k")))
+    assert 1500 < len(result.cloud.texels) <= 3000
+    assert json.loads((tmp_path / "run.json").read_text())["config"]["fit"]["max_texels"] == 3000
+
+
+@pytest.mark.parametrize(
+    ("config", "says"),
+    [
+        (dataclasses.replace(CONFIG, fit=dataclasses.replace(FIT, billboards=2)), "billboards: 2 are asked for and a budget"),
+        (RunConfig(fit=FitConfig(preset="thesis"), budget=BudgetConfig(vertices=8)), "preset: 'thesis'"),
+        (RunConfig(fit=FitConfig(sides="two"), budget=BudgetConfig(vertices=4)), "vertices: 4 are too few"),
+    ],
+)
+def test_what_does_not_go_together_is_found_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: RunConfig, says: str
+) -> None:
+    nothing: Callable[..., None] = lambda *arguments, **options: pytest.fail("work was begun")  # noqa: E731
+    monkeypatch.setattr(choice, "fit", nothing)
+    monkeypatch.setattr(pipeline, "fit", nothing)
+    with pytest.raises(InputError, match=says):
+        run(VIEWS, tmp_path, config)
+    assert not list(tmp_path.iterdir())
