@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from bbfit.blender.config import ViewsConfig
     from bbfit.blender.views_folder import render_views
+    from bbfit.budget.choice import choose
+    from bbfit.budget.config import BudgetConfig
     from bbfit.checks import InputError
     from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 # Names are imported when they are first used, so that `bbfit --help` need not wait for torch.
 _HOMES = {
     "BillboardCloud": "bbfit.geometry.cloud",
+    "BudgetConfig": "bbfit.budget.config",
     "Camera": "bbfit.geometry.camera",
     "ExportConfig": "bbfit.exporting.config",
     "FitConfig": "bbfit.fitting.config",
@@ -42,6 +45,7 @@ _HOMES = {
     "Species": "bbfit.trees.species",
     "ViewDataset": "bbfit.views",
     "ViewsConfig": "bbfit.blender.config",
+    "choose": "bbfit.budget.choice",
     "evaluate": "bbfit.evaluation.scoring",
     "export": "bbfit.exporting.model",
     "fit": "bbfit.fitting.loop",
@@ -56,6 +60,7 @@ _HOMES = {
 __version__ = version("bbfit")
 __all__ = [
     "BillboardCloud",
+    "BudgetConfig",
     "Camera",
     "ExportConfig",
     "FitConfig",
@@ -68,6 +73,7 @@ __all__ = [
     "Species",
     "ViewDataset",
     "ViewsConfig",
+    "choose",
     "evaluate",
     "export",
     "fit",

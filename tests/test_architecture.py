@@ -44,7 +44,7 @@ LEVEL = {name: level for level, group in enumerate(GROUPS) for name in group}
 ONLY_IN = {
     "bpy": {"blender/worker.py"},
     "cv2": {"images.py", "fitting/bounds.py"},
-    "xatlas": {"exporting/atlas.py"},
+    "xatlas": {"exporting/packing.py"},
     "warp": {
         *(f"rendering/{name}.py" for name in ("launching", "sampling", "kernels", "fused", "fused_projection")),
         *(f"fitting/{name}.py" for name in ("adam", "fused_sharpness", "fused_ssim", "ssim_kernels")),

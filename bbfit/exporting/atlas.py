@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from bbfit.exporting.packing import packed
 from bbfit.images import bleed_colour
 
 # Graphics cards compress textures in blocks of 4 x 4 texels.
@@ -50,7 +51,7 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
     sizes = np.array([texture.shape[1::-1] for texture in textures], dtype=np.int64)
     unit = max(BLOCK, 1 << (padding.bit_length() - 1))
     cells = np.maximum(-(-(sizes + 2 * padding) // unit), 2)
-    places = _place(cells)
+    places = packed(cells)
     width, height = ((places + cells).max(0) * unit).tolist()
     image = np.zeros((height, width, 4), np.uint8)
     image[..., :3] = _mean_colour(textures)  # the gaps between cells, which only the smallest mip levels see
@@ -58,34 +59,6 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
         (x, y), (w, h) = place.tolist(), cell.tolist()
         image[y : y + h, x : x + w] = fill_cell(texture, padding, w, h)
     return Atlas(image, places * unit + padding, sizes)
-
-
-def _place(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Non-overlapping places, int [R, 2], for cells of given whole widths and heights (at least 2), int [R, 2]."""
-    import xatlas
-
-    atlas = xatlas.Atlas()
-    # xatlas rounds a chart's extent up to whole texels and takes one texel more, for the half texels on either side of its outline.
-    charts = [np.array([[0, 0], [w, 0], [w, h], [0, h]], np.float32) for w, h in (cells - 1).tolist()]
-    # It takes charts at equal addresses for copies of one mesh, so all of them must stay alive until it has packed them.
-    triangles = [np.array([[0, 1, 2], [0, 2, 3]], np.uint32) for _ in charts]
-    for chart, triangle in zip(charts, triangles, strict=True):
-        atlas.add_uv_mesh(chart, triangle)
-    options = xatlas.PackOptions()
-    options.padding = 0
-    options.bilinear = False
-    options.rotate_charts = False
-    options.rotate_charts_to_axis = False
-    options.bruteForce = True
-    options.max_chart_size = 0
-    options.texels_per_unit = 1.0
-    options.resolution = 0
-    atlas.generate(pack_options=options)
-    scale = np.array([atlas.width, atlas.height])
-    places = np.stack([np.floor((atlas[n][2] * scale).min(0)) for n in range(len(charts))]).astype(np.int64)
-    ends = [np.ceil((atlas[n][2] * scale).max(0)) for n in range(len(charts))]
-    assert atlas.atlas_count == 1 and np.array_equal(places + cells, ends), "xatlas scaled or split the atlas"
-    return places - places.min(0)
 
 
 def fill_cell(texture: NDArray[np.uint8], padding: int, width: int, height: int) -> NDArray[np.uint8]:

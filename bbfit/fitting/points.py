@@ -112,17 +112,21 @@ def point_colours(pixels: list[tuple[Tensor, Tensor]], pictures: Tensor) -> Tens
     """
     total = torch.zeros(len(pixels[0][0]), 4)
     for (index, inside), picture in zip(pixels, pictures, strict=True):
-        total += picture.view(-1, 4)[torch.where(inside, index, 0)] * inside[:, None]
+        total += picture.view(-1, 4)[index] * inside[:, None]
     return total[:, :3] / total[:, 3:].clamp_min(1e-6)
 
 
 def pixels_of(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The pixel in which a single camera sees each point, counted row by row, int32 [P], and whether that is in the picture, bool [P]."""
+    """The pixel in which a single camera sees each point, counted row by row, int32 [P], and whether that is in the picture, bool [P].
+
+    Of points that are not in the picture it is pixel 0.
+    """
     x, y = camera.project(points).nan_to_num(nan=-1).round().clamp(-1, max(camera.width, camera.height)).int().unbind(-1)
-    return y * camera.width + x, (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    return torch.where(inside, y * camera.width + x, 0), inside
 
 
 def _inside(points: Tensor, camera: Camera, mask: Tensor, *, beyond: bool = False) -> Tensor:
     """Which points one camera sees on a mask [H, W]; ``beyond`` is the answer for those outside the picture."""
     index, inside = pixels_of(points, camera)
-    return torch.where(inside, mask.flatten()[torch.where(inside, index, 0)], beyond)
+    return torch.where(inside, mask.flatten()[index], beyond)

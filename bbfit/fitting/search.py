@@ -37,7 +37,6 @@ _BATCH = 8
 _NEAR, _TRIALS = 0.08, 150
 # Margin around what a billboard carries, as a share of the tree's radius.
 _MARGIN = 0.06
-joined = BillboardCloud.joined
 
 
 def find_placement(views: ViewSet, points: Tensor, config: FitConfig, on_work: Callable[[int, int], None] | None = None) -> BillboardCloud:
@@ -97,11 +96,11 @@ class _Search:
         best, lost = self._best_of([clouds[index] for index in chosen], _MORE_STEPS)
         for _ in range(self._added):
             losing = self._losses(best)
-            best, lost = self._best_of([joined([best, self._proposal(losing)]) for _ in range(_ADDITIONS)], _MEND_STEPS)
+            best, lost = self._best_of([BillboardCloud.joined([best, self._proposal(losing)]) for _ in range(_ADDITIONS)], _MEND_STEPS)
         refused, without = 0, self._without(best)
         for begin in range(0, config.relocations, _AT_ONCE):
             rest, losing = without[refused % min(3, len(without))]
-            others = [joined([rest, self._proposal(losing)]) for _ in range(min(_AT_ONCE, config.relocations - begin))]
+            others = [BillboardCloud.joined([rest, self._proposal(losing)]) for _ in range(min(_AT_ONCE, config.relocations - begin))]
             other, less = self._best_of(others, _MEND_STEPS)
             if less < lost:
                 best, lost, refused, without = other, less, 0, self._without(other)
@@ -133,7 +132,7 @@ class _Search:
 
     def _fitted(self, clouds: list[BillboardCloud], steps: int, rate: float) -> tuple[list[BillboardCloud], list[float]]:
         """Clouds of equal numbers after some steps in which the billboards move with their textures, and their losses over all views."""
-        config, together = self._config, joined(clouds)
+        config, together = self._config, BillboardCloud.joined(clouds)
         movement = Movement(together, self._radius) if config.placement_rate else None
         stepper = make_stepper(together.to(config.device), self._targets, config, movement, groups=len(clouds))
         for step in range(steps):
@@ -158,7 +157,7 @@ class _Search:
         self._proposed += 1
         weight = torch.zeros(len(self._points))
         for (index, inside), loss in zip(self._pixels, losses, strict=True):
-            weight += loss.flatten()[torch.where(inside, index, 0)] * inside
+            weight += loss.flatten()[index] * inside
         weight = (weight / len(losses)).clamp_min(1e-12).double()
         drawn = self._points[torch.multinomial(weight, 3000, replacement=True, generator=generator)]
         corners = drawn[torch.randint(len(drawn), (_TRIALS, 3), generator=generator)]

@@ -25,7 +25,6 @@ from torch import Tensor
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.geometry.orbit import Orbit
 from bbfit.rendering.fused import differentiate, draw
 from bbfit.rendering.fused_projection import Projector
 from bbfit.rendering.projection import Projection, project
@@ -122,17 +121,6 @@ def test_all_of_these_planes_side_by_side(fov: float | None) -> None:
     hidden = {name for name, (left, right, top, bottom) in boxes if left > right or top > bottom}
     assert {"edge-on", "level", "nearly edge-on", "flat", "thin", "above", "below", "left", "right"} <= hidden
     assert not {"facing", "hardly seen", "cut off", "from the back"} & hidden
-
-
-def test_each_view_reads_the_texture_on_its_side() -> None:
-    axes, n = torch.eye(3), 3
-    cloud = cloud_of(torch.zeros(n, 3), axes[:1].expand(n, 3), axes[1:2].expand(n, 3), torch.ones(n, 2), [(2, 3), (4, 5), (1, 2)])
-    cloud = replace(cloud, two_sided=torch.tensor([True, False, True]), texels=torch.zeros(2 * 6 + 20 + 2 * 2, 4))
-    from_front = [[0, 2, 3], [12, 4, 5], [32, 1, 2]]
-    from_back = [[6, 2, 3], [12, 4, 5], [34, 1, 2]]
-    for fov in (35.0, None):
-        camera = Orbit(4).frame(CORNERS, target=torch.zeros(3).double(), width=8, height=8, fov_x_degrees=fov)
-        assert Projector(cloud, camera).project(placement_of(cloud), [2, 0]).textures.tolist() == [from_back, from_front]
 
 
 @pytest.mark.parametrize(("count", "chosen"), [(0, [1, 0]), (4, []), (0, [])])
