@@ -22,7 +22,7 @@ from bbfit.images import write_png
 from bbfit.trees.species import figures_file, known_species
 
 DATA = Path(__file__).resolve().parents[1] / "data"
-QUICK = ["--billboards", "2", "--candidates", "2", "--relocations", "0", "--steps", "3"]
+QUICK = ["--billboards", "2", "--candidates", "2", "--revisions", "0", "--steps", "3"]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_help_shows_defaults_and_needs_no_torch(command: list[str]) -> None:
 
 
 def test_fit_writes_what_run_writes_for_the_same_views(views_folder: Path, fitted: Path, tmp_path: Path) -> None:
-    nested = ["--fit.billboards", "2", "--fit.candidates", "2", "--fit.relocations", "0", "--fit.steps", "3"]
+    nested = ["--fit.billboards", "2", "--fit.candidates", "2", "--fit.revisions", "0", "--fit.steps", "3"]
     assert main(["run", str(views_folder), "--out", str(tmp_path), *nested]) == 0
     for name in ("cloud.safetensors", "model.glb", "model.obj"):
         assert (tmp_path / name).read_bytes() == (fitted / name).read_bytes()
@@ -347,7 +347,7 @@ def test_a_disk_that_fills_up_leaves_the_earlier_model(fitted: Path, tmp_path: P
 def test_a_run_killed_outright_goes_on(views_folder: Path, tmp_path: Path) -> None:
     """SIGKILL in the middle of the fit; the same command ends with the result of an unbroken run."""
     script = "import sys; from bbfit.cli import main; sys.exit(main(sys.argv[1:]))"
-    options = ["--billboards", "2", "--candidates", "2", "--relocations", "0", "--steps", "120", "--checkpoint-every", "10"]
+    options = ["--billboards", "2", "--candidates", "2", "--revisions", "0", "--steps", "120", "--checkpoint-every", "10"]
     command = [sys.executable, "-c", script, "fit", str(views_folder), *options, "--out"]
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}  # as this process, so that the results are equal to the bit
     process = subprocess.Popen([*command, str(tmp_path / "broken")], stderr=subprocess.DEVNULL, env=one_thread)

@@ -20,7 +20,7 @@ from bbfit.images import read_rgba
 from bbfit.pipeline import RunConfig, RunResult, run
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
-CONFIG = RunConfig(fit=FitConfig(billboards=2, candidates=2, relocations=0, steps=20, checkpoint_every=5))
+CONFIG = RunConfig(fit=FitConfig(billboards=2, candidates=2, revisions=0, steps=20, checkpoint_every=5))
 FILES = ("cloud.safetensors", "comparison.png", "loss.csv", "loss.png", "metrics.json", "run.json")
 MODELS = ("model.glb", "model.mtl", "model.obj", "model.png")
 
@@ -54,7 +54,7 @@ def test_everything_is_written(done: RunResult) -> None:
 
 def test_record_holds_the_resolved_configuration(done: RunResult) -> None:
     record = json.loads((done.folder / "run.json").read_text())
-    assert record["config"]["fit"]["learning_rate"] == 0.15 and record["config"]["fit"]["bounds"] == "silhouette"
+    assert record["config"]["fit"]["learning_rate"] == 0.3 and record["config"]["fit"]["bounds"] == "silhouette"
     assert record["seeds"] == {"views": 0, "fit": 0}
     assert {"bbfit", "torch", "kornia", "python"} <= set(record["versions"])
     assert set(record["stages"]) == {"fit", "export", "evaluate"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,10 +14,9 @@ from bbfit.rendering.fused import occupancy
 from bbfit.rendering.launching import FLAGS, in_parallel, pieces_of
 from bbfit.rendering.sampling import BLOCK
 
-BETAS, EPSILON = (0.9, 0.999), 1e-8
-# A block without gradient for so many steps rests until it has one again. Its first moment has then shrunk by 0.9^128, so that all that
-# it would still have moved is a hundred-thousandth of a step; both moments are caught up with when it wakes.
-REST_AFTER = 128
+EPSILON = 1e-8
+# A first moment that has shrunk to this share moves a texel by no more than a hundred-thousandth of a step, all in all.
+_FORGOTTEN = 1.4e-6
 # Blocks that a CPU thread takes at a time, and at least.
 RUN, LEAST_RUNS = 64, 64
 
@@ -75,6 +75,11 @@ def _update_blocks(
             occupied[i] = wp.where(opaque > 0.0, wp.uint8(1), wp.uint8(0))
 
 
+def rest_after(beta1: float) -> int:
+    """Steps without gradient after which a block rests until it has one again, and is caught up with both moments' decay; 128 at 0.9."""
+    return 1 if beta1 <= 0 else math.ceil(math.log(_FORGOTTEN) / math.log(beta1))
+
+
 def padded(texels: Tensor) -> Tensor:
     """A copy of texels [P, 4] with transparent ones after them that fill the last block."""
     copy = texels.new_zeros(-(-len(texels) // BLOCK) * BLOCK, 4)
@@ -115,14 +120,14 @@ class AdamState:
         kept = {name: tensor.to(self.texels.device) for name, tensor in tensors.items()}
         return replace(AdamState.start(kept["texels"]), **kept)
 
-    def update(self, step: int, rate: float, crispness: float = 0.0) -> None:
-        """Take step number ``step``, from 1, at the given rate; keep the texels in [0, 1].
+    def update(self, step: int, rate: float, betas: tuple[float, float], crispness: float = 0.0) -> None:
+        """Take step number ``step``, from 1, at the given rate, the moments decaying by ``betas`` a step; keep the texels in [0, 1].
 
         ``crispness`` times the derivative of alpha (1 - alpha) is added to the gradient of every alpha that is not 0.
 
-        The same as ``torch.optim.Adam`` followed by ``clamp_`` up to rounding and :data:`REST_AFTER`.
+        The same as ``torch.optim.Adam`` followed by ``clamp_`` up to rounding and :func:`rest_after`.
         """
-        beta1, beta2 = BETAS
+        beta1, beta2 = betas
         run = 1 if self.texels.is_cuda else RUN
         arguments = [
             run,
@@ -132,7 +137,7 @@ class AdamState:
             beta2,
             (1 - beta2**step) ** -0.5,
             EPSILON,
-            REST_AFTER,
+            rest_after(beta1),
             crispness,
             *(
                 wp.from_torch(tensor.view(-1, 4 * BLOCK), dtype=texel_block)

@@ -17,7 +17,7 @@ from bbfit.views import ViewSet
 # Views that meet a billboard more obliquely than this say nothing useful about its extent.
 _OBLIQUE = math.cos(math.radians(60))
 # Alpha from which a texel counts as being something.
-_OPAQUE = 0.05
+_OPAQUE = 0.3
 # Alpha that does not round to 0 in 8 bits.
 _VISIBLE = 0.5 / 255
 # Billboards whose cosines differ by less face a view equally well.

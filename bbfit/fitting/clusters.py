@@ -7,6 +7,7 @@ clouds: every point is moved onto a plane, and what is paid for is how far that 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import itemgetter
 
 import torch
 from torch import Tensor
@@ -54,6 +55,22 @@ def cluster_planes(points: Tensor, count: int, seen: Tensor, *, upright: bool, g
         normals[:, 1] = 0
     normals = torch.nn.functional.normalize(normals, dim=-1)
     offsets = (normals * points[torch.randint(len(points), (count,), generator=generator)]).sum(-1)
+    return _refined(points, normals, offsets, seen, upright=upright)[0]
+
+
+def split_planes(points: Tensor, axes: Tensor, seen: Tensor, *, upright: bool) -> Planes:
+    """Two planes that start from halves of the points across one of some directions, [A, 3]; whichever displaces them least."""
+    tried = []
+    for axis in axes.to(points):
+        along = points @ axis
+        normals, offsets, _ = best_planes(moments(points, (along > along.median()).long(), 2), upright=upright)
+        tried.append(_refined(points, normals, offsets, seen, upright=upright))
+    return min(tried, key=itemgetter(1))[0]
+
+
+def _refined(points: Tensor, normals: Tensor, offsets: Tensor, seen: Tensor, *, upright: bool) -> tuple[Planes, float]:
+    """What planes settle down to, and the sum of squared displacements."""
+    count = len(normals)
     least = max(3, int(_STARVED * len(points) / count))
     labels = torch.full((len(points),), -1)
     for _ in range(_ITERATIONS):
@@ -66,11 +83,12 @@ def cluster_planes(points: Tensor, count: int, seen: Tensor, *, upright: bool, g
         if torch.equal(chosen, labels):
             break
         labels = chosen
-        for k in range(count):
-            own = points[labels == k]
-            if len(own) >= 3:
-                normals[k], offsets[k] = _best_plane(own, upright=upright)
-    return Planes(normals, offsets, _displacement(points, normals, offsets, seen).argmin(-1))
+        fitted = best_planes(moments(points, labels, count), upright=upright)
+        enough = torch.bincount(labels, minlength=count) >= 3
+        normals = torch.where(enough[:, None], fitted[0], normals)
+        offsets = torch.where(enough, fitted[1], offsets)
+    distance, labels = _displacement(points, normals, offsets, seen).min(-1)
+    return Planes(normals, offsets, labels), float(distance.square().sum())
 
 
 def _displacement(points: Tensor, normals: Tensor, offsets: Tensor, seen: Tensor) -> Tensor:
@@ -79,17 +97,34 @@ def _displacement(points: Tensor, normals: Tensor, offsets: Tensor, seen: Tensor
     return (points @ normals.mT - offsets).abs() * visible
 
 
-def _best_plane(points: Tensor, *, upright: bool) -> tuple[Tensor, Tensor]:
-    """Normal and offset of the plane with the least squared distances: across the direction of least variance (Pearson 1901)."""
-    mean = points.mean(0)
-    centred = points - mean
+def moments(points: Tensor, labels: Tensor, count: int) -> Tensor:
+    """The sums of p p^T over each cluster's points p = (x, y, z, 1), [K, 4, 4]; those of a union of clusters are the sums of these."""
+    extended = torch.nn.functional.pad(points, (0, 1), value=1.0)
+    return points.new_zeros(count, 4, 4).index_add_(0, labels, extended[:, :, None] * extended[:, None, :])
+
+
+def best_planes(sums: Tensor, *, upright: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """The planes with the least squared distances: across the direction of least variance (Pearson 1901).
+
+    Parameters
+    ----------
+    sums : :func:`moments`, [K, 4, 4].
+    upright : whether planes have to contain the vertical.
+
+    Returns
+    -------
+    Unit normals [K, 3], offsets [K] and the sums of squared distances [K].
+    """
+    means = sums[:, :3, 3] / sums[:, 3, 3:].clamp_min(1)
+    scatter = sums[:, :3, :3] - means[:, :, None] * sums[:, None, :3, 3]
     if upright:
-        flat = centred[:, ::2]
-        x, z = torch.linalg.eigh(flat.mT @ flat)[1][:, 0]
-        normal = torch.stack([x, torch.zeros_like(x), z])
+        values, vectors = torch.linalg.eigh(scatter[:, ::2, ::2])
+        x, z = vectors[:, :, 0].unbind(-1)
+        normals = torch.stack([x, torch.zeros_like(x), z], -1)
     else:
-        normal = torch.linalg.eigh(centred.mT @ centred)[1][:, 0]
-    return normal, normal @ mean
+        values, vectors = torch.linalg.eigh(scatter)
+        normals = vectors[:, :, 0]
+    return normals, (normals * means).sum(-1), values[:, 0].clamp_min(0)
 
 
 def rectangles(points: Tensor, planes: Planes, texels_a_metre: float, margin: float, *, two_sided: bool) -> BillboardCloud:

@@ -26,11 +26,13 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "loss": "backgrounds",
         "ssim_weight": 0.01,
         "sharpness_weight": 14.0,
-        "crispness_weight": 0.009,
+        "crispness_weight": 0.004,
         "levels": 4,
         "steps": 1200,
         "views_per_step": 2,
-        "learning_rate": 0.15,
+        "learning_rate": 0.3,
+        "beta1": 0.8,
+        "beta2": 0.95,
         "schedule": "cosine",
     },
     # Thesis, section 4.4 and 5.
@@ -48,6 +50,8 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "steps": 10_000,
         "views_per_step": 1,
         "learning_rate": 0.01,
+        "beta1": 0.9,
+        "beta2": 0.999,
         "schedule": "growth",
     },
 }
@@ -67,11 +71,12 @@ class FitConfig:
     orientation: Orientation = "any"
     """Whether clusters are upright planes, planes that may lean any way (free), or whatever does better (any)."""
     searches: int | None = None
-    """Independent searches, of which the best one counts. Left open, three for eight billboards, at least one and at most three."""
+    """Independent searches, of which the best one counts. Left open, two from eight billboards on."""
     candidates: int = 12
     """Clusterings that a search compares."""
-    relocations: int = 8
-    """How often a search tries to take the billboard that is missed least to where the picture is worst."""
+    revisions: int | None = None
+    """Rounds in which the best placement found is revised, by moving, splitting and merging billboards. Left open, five for eight
+    billboards, at least one and at most six."""
     placement_rate: float | None = None
     """How fast billboards move with their textures at first: radians a step, and shares of the tree's radius. 0: they stay.
     Preset: 0.015; thesis: 0."""
@@ -93,7 +98,7 @@ class FitConfig:
     """Weight, at full resolution, of the squared difference in mean contrast of neighbouring pixels. Preset: 14; thesis: 0."""
     crispness_weight: float | None = None
     """Weight, at full resolution, of alpha * (1 - alpha), summed over texels and divided by a view's pixels, which makes leaves opaque and
-    the air between them clear. Preset: 0.009; thesis: 0."""
+    the air between them clear. Preset: 0.004; thesis: 0."""
     levels: int | None = None
     """Resolutions of views and textures, coarse to fine, sides doubling from each to the next; the steps are shared out evenly.
     Preset: 4; thesis: 1."""
@@ -102,7 +107,11 @@ class FitConfig:
     views_per_step: int | None = None
     """Training views in every step at full resolution; twice as many at each coarser level. Preset: 2; thesis: 1."""
     learning_rate: float | None = None
-    """Adam's initial rate. Preset: 0.15; thesis: 0.01."""
+    """Adam's initial rate. Preset: 0.3; thesis: 0.01."""
+    beta1: float | None = None
+    """What is left of Adam's first moment, the mean gradient, after a step. Preset: 0.8; thesis: 0.9."""
+    beta2: float | None = None
+    """What is left of Adam's second moment, the mean squared gradient, after a step. Preset: 0.95; thesis: 0.999."""
     schedule: Schedule | None = None
     """cosine decay to zero, or the thesis's growth by (1 + 0.1 / steps) a step. Preset: cosine; thesis: growth."""
     seed: int = 0
@@ -123,7 +132,8 @@ class FitConfig:
         if self.searches is not None:
             check_count("searches", self.searches)
         check_count("candidates", self.candidates)
-        check_count("relocations", self.relocations, 0)
+        if self.revisions is not None:
+            check_count("revisions", self.revisions, 0)
         if self.placement_rate is not None:
             check_range("placement_rate", self.placement_rate, 0, 1)
         check_choice("sides", self.sides, ("one", "two", "pair"))
@@ -151,6 +161,9 @@ class FitConfig:
             check_count("views_per_step", self.views_per_step)
         if self.learning_rate is not None:
             check_range("learning_rate", self.learning_rate, 0, 10, open_low=True)
+        for name in ("beta1", "beta2"):
+            if getattr(self, name) is not None:
+                check_range(name, getattr(self, name), 0, 0.9999)
 
     def coarse(self) -> FitConfig:
         """The same for less than full resolution: without the weights that count only there."""
@@ -172,7 +185,10 @@ class FitConfig:
             fail("max_texels", f"{resolved.max_texels} are too few for {textures} textures", "allow more")
         if resolved.searches is None:
             assert resolved.billboards is not None
-            resolved = replace(resolved, searches=min(3, max(1, 3 * resolved.billboards // 8)))
+            resolved = replace(resolved, searches=min(2, max(1, resolved.billboards // 4)))
+        if resolved.revisions is None:
+            assert resolved.billboards is not None
+            resolved = replace(resolved, revisions=min(6, max(1, resolved.billboards - 3)))
         if resolved.sides == "pair" and resolved.placement == "clusters":
             fail("sides", "pairs stand evenly around an axis, not in clusters", "add --placement even, or choose one or two")
         return resolved

@@ -1,4 +1,4 @@
-"""The search for a placement: many clusterings are fitted at a low resolution, the best ones longer, and the best one is mended."""
+"""The search for a placement: many clusterings are fitted at a low resolution, the best ones longer, and the best one is revised."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from operator import itemgetter
 import torch
 from torch import Tensor
 
-from bbfit.fitting.clusters import Planes, cluster_planes, rectangles, seen_across, splatted
+from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, seen_across, splatted, split_planes
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_a_metre, tree_radius
 from bbfit.fitting.levels import Targets
@@ -25,12 +25,12 @@ from bbfit.views import ViewSet
 
 SIDE = 64
 """About the width of the pictures that the search is done on, in pixels."""
-# Steps of every candidate, of those that survive, and of every relocation; their rates; how many survive.
+# Steps of every candidate, of those that survive, and of every alternative later on; their rates; how many survive.
 _STEPS, _MORE_STEPS, _MEND_STEPS = 30, 50, 40
-_RATE, _LATER_RATE = 0.15, 0.1
+_RATE, _LATER_RATE = 0.15, 0.06
 _SURVIVORS = 0.3
-# One in so many billboards does not come from a clustering but is added to it; alternatives for each, and for every relocation.
-_ADDED, _ADDITIONS, _AT_ONCE = 4, 4, 2
+# One in so many billboards does not come from a clustering but is added to it; alternatives for each, and in every revision.
+_ADDED, _ADDITIONS, _REVISIONS = 4, 4, 5
 # Views in every step.
 _BATCH = 8
 # Points nearer to a new plane than this share of the tree's radius are what it carries; planes tried for each.
@@ -43,16 +43,16 @@ def find_placement(views: ViewSet, points: Tensor, config: FitConfig, on_work: C
     """Billboards placed where the tree is, with textures fitted at a low resolution.
 
     Clusterings of the points from different random starts, upright and free, are fitted for a few steps each in which billboards move with
-    their textures; the best third goes on for longer. To the best of them the last quarter of the billboards is added, each where the loss
-    is largest; then the billboard that is missed least, since others carry the same or there is little to carry, is taken away and put
-    where the loss is largest, again and again, and stays there if that lowers the loss on the training views. Several such searches are
-    made, and the one with the least loss counts.
+    their textures; the best third goes on for longer. To the best of these the last quarter of the billboards is added, by splitting one or
+    where the loss is largest. That is done a few times over, and the cloud with the least loss on the training views is revised: a
+    billboard that is missed least, since others carry the same or there is little to carry, is put where the loss is largest, or given up
+    to split another; or two whose points lie almost on one plane are merged to have one free. Whatever lowers the loss stays.
 
     Parameters
     ----------
     views : training views.
     points : on the tree, [P, 3] float64.
-    config : resolved; ``billboards``, ``searches``, ``candidates``, ``relocations``, ``orientation`` and ``seed`` matter.
+    config : resolved; ``billboards``, ``searches``, ``candidates``, ``revisions``, ``orientation`` and ``seed`` matter.
     on_work : told how much of the work is done and how much there is, in steps of one candidate.
 
     Returns
@@ -69,22 +69,30 @@ class _Search:
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))
         cameras = self._targets.cameras
-        assert config.texel_density is not None and config.billboards is not None and config.searches is not None
+        assert config.texel_density is not None and config.billboards is not None
+        assert config.searches is not None and config.revisions is not None
         self._density = float(pixels_a_metre(cameras)) * config.texel_density
         self._seen = seen_across(cameras)
         self._pixels = [pixels_of(points, cameras[index]) for index in range(len(cameras))]
+        self._all_upright = config.orientation == "upright"
         self._colours = point_colours(self._pixels, self._pictures)
         self._radius = tree_radius(views)
         self._added = config.billboards // _ADDED
         self._clusters, self._survivors = config.billboards - self._added, max(1, round(_SURVIVORS * config.candidates))
         self._generator, self._proposed, self._done = torch.Generator().manual_seed(config.seed), 0, 0
-        mended = _ADDITIONS * self._added + config.relocations
-        self._total = config.searches * (_STEPS * config.candidates + _MORE_STEPS * self._survivors + _MEND_STEPS * mended)
+        # So many of them are completed, half as many after every addition; fewer where that would take long beside the fit.
+        self._chains = min(self._survivors, max(1, config.billboards // 2))
+        completed = sum(max(1, self._chains >> addition) for addition in range(self._added))
+        each = _STEPS * config.candidates + _MORE_STEPS * self._survivors + _MEND_STEPS * _ADDITIONS * completed
+        self._total = config.searches * each + _MEND_STEPS * _REVISIONS * config.revisions
 
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
-        assert self._config.searches is not None
-        return min((self._searched(number) for number in range(self._config.searches)), key=itemgetter(1))[0]
+        assert self._config.searches is not None and self._config.revisions is not None
+        best = min((self._searched(number) for number in range(self._config.searches)), key=itemgetter(1))
+        for turn in range(self._config.revisions):
+            best = min(best, self._best_of([best[0], *self._revised(best[0], turn)]), key=itemgetter(1))
+        return best[0]
 
     def _searched(self, number: int) -> tuple[BillboardCloud, float]:
         """What search ``number`` finds, and its loss."""
@@ -93,24 +101,16 @@ class _Search:
             clouds = list(pool.map(self._clustered, range(number * config.candidates, (number + 1) * config.candidates)))
         clouds, losses = self._fitted(clouds, _STEPS, _RATE)
         chosen = sorted(range(len(clouds)), key=losses.__getitem__)[: self._survivors]
-        best, lost = self._best_of([clouds[index] for index in chosen], _MORE_STEPS)
+        clouds, losses = self._fitted([clouds[index] for index in chosen], _MORE_STEPS, _LATER_RATE)
+        grown = sorted(zip(clouds, losses, strict=True), key=itemgetter(1))[: self._chains]
         for _ in range(self._added):
-            losing = self._losses(best)
-            best, lost = self._best_of([BillboardCloud.joined([best, self._proposal(losing)]) for _ in range(_ADDITIONS)], _MEND_STEPS)
-        refused, without = 0, self._without(best)
-        for begin in range(0, config.relocations, _AT_ONCE):
-            rest, losing = without[refused % min(3, len(without))]
-            others = [BillboardCloud.joined([rest, self._proposal(losing)]) for _ in range(min(_AT_ONCE, config.relocations - begin))]
-            other, less = self._best_of(others, _MEND_STEPS)
-            if less < lost:
-                best, lost, refused, without = other, less, 0, self._without(other)
-            else:
-                refused += 1
-        return best, lost
+            grown = sorted((self._best_of(self._extended(cloud)) for cloud, _ in grown), key=itemgetter(1))
+            grown = grown[: max(1, len(grown) // 2)]
+        return grown[0]
 
-    def _best_of(self, clouds: list[BillboardCloud], steps: int) -> tuple[BillboardCloud, float]:
+    def _best_of(self, clouds: list[BillboardCloud]) -> tuple[BillboardCloud, float]:
         """The best of some clouds after some steps, and its loss."""
-        return min(zip(*self._fitted(clouds, steps, _LATER_RATE), strict=True), key=itemgetter(1))
+        return min(zip(*self._fitted(clouds, _MEND_STEPS, _LATER_RATE), strict=True), key=itemgetter(1))
 
     def _without(self, cloud: BillboardCloud) -> list[tuple[BillboardCloud, Tensor]]:
         """A cloud without one of its billboards, and its losses of every pixel, for each of them; what is missed least first."""
@@ -118,15 +118,76 @@ class _Search:
         return sorted(((rest, self._losses(rest)) for rest in rests), key=lambda pair: float(pair[1].mean()))
 
     def _upright(self, index: int) -> bool:
-        return self._config.orientation == "upright" or (self._config.orientation == "any" and index % 2 == 0)
+        return self._all_upright or (self._config.orientation == "any" and index % 2 == 0)
 
     def _clustered(self, index: int) -> BillboardCloud:
         """Clusters from random start number ``index``."""
         generator = torch.Generator().manual_seed((self._config.seed << 16) + index)
         planes = cluster_planes(self._points, self._clusters, self._seen, upright=self._upright(index), generator=generator)
-        return self._textured(self._points, self._colours, planes)
+        return self._textured(torch.arange(len(self._points)), planes)
 
-    def _textured(self, points: Tensor, colours: Tensor, planes: Planes) -> BillboardCloud:
+    def _extended(self, cloud: BillboardCloud) -> list[BillboardCloud]:
+        """A cloud with one billboard more, in several ways: by splitting one, and through points where the loss is large."""
+        weight = self._weights(self._losses(cloud))
+        return [self._split(cloud, weight), *(self._with_another(cloud, weight) for _ in range(_ADDITIONS - 1))]
+
+    def _revised(self, cloud: BillboardCloud, turn: int) -> list[BillboardCloud]:
+        """A cloud with one billboard moved, in two ways; with one given up to split another; and with two merged to have one free."""
+        if len(cloud) == 1:
+            weight = self._weights(self._losses(cloud))
+            return [self._proposal(weight) for _ in range(_REVISIONS - 1)]
+        without = self._without(cloud)
+        (rest, losing), (other, also_losing) = (without[(2 * turn + k) % min(4, len(without))] for k in range(2))
+        weight = self._weights(losing)
+        merged = self._merged(cloud, turn)
+        return [
+            self._with_another(rest, weight),
+            self._with_another(other, self._weights(also_losing)),
+            self._split(rest, weight),
+            self._with_another(merged, self._weights(self._losses(merged))),
+        ]
+
+    def _with_another(self, cloud: BillboardCloud, weight: Tensor) -> BillboardCloud:
+        return BillboardCloud.joined([cloud, self._proposal(weight)])
+
+    def _carried(self, cloud: BillboardCloud) -> Tensor:
+        """Which billboard each point is nearest to, by how far views see it moved onto the plane and, from there, into the rectangle."""
+        cloud = cloud.to(torch.float64)
+        offset = self._points[:, None] - cloud.centers
+        x, y = ((offset * axis).sum(-1).abs() for axis in (cloud.rights, cloud.ups))
+        beyond = (torch.stack([x, y], -1) - cloud.half_extents).clamp_min(0)
+        visible = ((cloud.normals @ self._seen) * cloud.normals).sum(-1)
+        return ((offset * cloud.normals).sum(-1).square() * visible + beyond.square().sum(-1)).argmin(-1)
+
+    def _split(self, cloud: BillboardCloud, weight: Tensor) -> BillboardCloud:
+        """A cloud with two billboards for the points of one, which is drawn by the losses on its points."""
+        carried = self._carried(cloud)
+        shares = torch.zeros(len(cloud), dtype=weight.dtype).index_add_(0, carried, weight)
+        chosen = int(torch.multinomial(shares, 1, generator=self._generator))
+        held = torch.nonzero(carried == chosen)[:, 0]
+        axes = torch.stack([cloud.normals[chosen], cloud.rights[chosen], cloud.ups[chosen]])
+        planes = split_planes(self._points[held], axes, self._seen, upright=self._all_upright)
+        return BillboardCloud.joined([cloud.take(k for k in range(len(cloud)) if k != chosen), self._textured(held, planes)])
+
+    def _merged(self, cloud: BillboardCloud, turn: int) -> BillboardCloud:
+        """A cloud with one billboard for the points of two: of one of the three pairs whose points that moves least farther."""
+        carried, upright = self._carried(cloud), self._all_upright
+        sums = moments(self._points, carried, len(cloud))
+        pairs = torch.combinations(torch.arange(len(cloud)))
+        normals, offsets, squares = best_planes(sums[pairs].sum(1), upright=upright)
+        farther = squares - best_planes(sums, upright=upright)[2][pairs].sum(1)
+        chosen = int(farther.argsort()[turn % min(3, len(pairs))])
+        merged = torch.isin(torch.arange(len(cloud)), pairs[chosen])
+        held = torch.nonzero(merged[carried])[:, 0]
+        rest = cloud.take(torch.nonzero(~merged)[:, 0].tolist())
+        return BillboardCloud.joined([rest, self._on_plane(held, normals[chosen], offsets[chosen])])
+
+    def _on_plane(self, held: Tensor, normal: Tensor, offset: Tensor) -> BillboardCloud:
+        """One billboard for some of the points, given by their indices."""
+        return self._textured(held, Planes(normal[None], offset[None], torch.zeros(len(held), dtype=torch.int64)))
+
+    def _textured(self, held: Tensor, planes: Planes) -> BillboardCloud:
+        points, colours = self._points[held], self._colours[held]
         bare = rectangles(points, planes, self._density, _MARGIN * self._radius, two_sided=self._config.sides == "two")
         return splatted(bare, points, colours, planes.labels).to(torch.float32)
 
@@ -151,14 +212,17 @@ class _Search:
         image = render(cloud.to(device), self._targets.cameras.to(device), backend=self._config.backend)
         return pixel_losses(image.cpu(), self._pictures, self._config.loss)
 
-    def _proposal(self, losses: Tensor) -> BillboardCloud:
-        """A billboard through points where the loss is large: of random planes (Fischler and Bolles 1981) that with most of it near."""
-        upright, generator = self._upright(self._proposed), self._generator
-        self._proposed += 1
+    def _weights(self, losses: Tensor) -> Tensor:
+        """The mean loss where views see each point, float64 [P]."""
         weight = torch.zeros(len(self._points))
         for (index, inside), loss in zip(self._pixels, losses, strict=True):
             weight += loss.flatten()[index] * inside
-        weight = (weight / len(losses)).clamp_min(1e-12).double()
+        return (weight / len(losses)).clamp_min(1e-12).double()
+
+    def _proposal(self, weight: Tensor) -> BillboardCloud:
+        """A billboard through points where the loss is large: of random planes (Fischler and Bolles 1981) that with most of it near."""
+        upright, generator = self._upright(self._proposed), self._generator
+        self._proposed += 1
         drawn = self._points[torch.multinomial(weight, 3000, replacement=True, generator=generator)]
         corners = drawn[torch.randint(len(drawn), (_TRIALS, 3), generator=generator)]
         along, across = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -173,6 +237,4 @@ class _Search:
         normal, offset = normals[chosen], normals[chosen] @ corners[chosen, 0]
         held = torch.nonzero((self._points @ normal - offset).abs() * visible[chosen] < near)[:, 0]
         held = held[torch.multinomial(weight[held], min(2000, len(held)), replacement=True, generator=generator)]
-        points, colours = self._points[held], self._colours[held]
-        planes = Planes(normal[None], offset[None], torch.zeros(len(held), dtype=torch.int64))
-        return self._textured(points, colours, planes)
+        return self._on_plane(held, normal, offset)

@@ -71,7 +71,8 @@ class ReferenceStepper:
 
     def _start(self, texels: Tensor, first_moment: Tensor, second_moment: Tensor, steps: int) -> None:
         self.texels = texels.to(self._cloud.texels.device).requires_grad_()
-        self._adam = torch.optim.Adam([self.texels], fused=True)
+        assert self._config.beta1 is not None and self._config.beta2 is not None
+        self._adam = torch.optim.Adam([self.texels], betas=(self._config.beta1, self._config.beta2), fused=True)
         self._adam.state[self.texels] = {
             "step": torch.tensor(float(steps), device=self.texels.device),
             "exp_avg": first_moment.to(self.texels.device),
@@ -209,7 +210,10 @@ class FusedStepper:
             of_matrices = of_matrices.unflatten(0, (groups, -1)).transpose(0, 1).flatten(1, 2)
             movement.update(movement.pull_back(placement, self._projector.pull_back(of_matrices).cpu()), placement_rate)
         self.steps += 1
-        state.update(self.steps, rate, (config.crispness_weight or 0.0) / (projection.width * projection.height))
+        assert config.beta1 is not None and config.beta2 is not None
+        state.update(
+            self.steps, rate, (config.beta1, config.beta2), (config.crispness_weight or 0.0) / (projection.width * projection.height)
+        )
         return sums.sum() / pixels + lost
 
     def _perceived(self, projection: Projection, loss: PixelLoss) -> tuple[Tensor | float, Tensor | None]:

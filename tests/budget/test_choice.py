@@ -655,7 +655,7 @@ def sealed(folder: Path) -> ViewDataset:
     return dataclasses.replace(views, test=dataclasses.replace(views.test, _cache=Sealed()))
 
 
-QUICK = FitConfig(candidates=2, relocations=0, steps=4, views_per_step=1)
+QUICK = FitConfig(candidates=2, revisions=0, steps=4, views_per_step=1)
 
 
 def test_a_choice_on_real_views(monkeypatch: pytest.MonkeyPatch) -> None:

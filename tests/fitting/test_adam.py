@@ -9,11 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from bbfit.fitting.adam import BETAS, EPSILON, REST_AFTER, AdamState, padded
+from bbfit.fitting.adam import EPSILON, AdamState, padded, rest_after
 from bbfit.rendering.fused import occupancy
 from bbfit.rendering.sampling import BLOCK
 
 STEPS = 420
+BETAS = (0.9, 0.999)
+REST_AFTER = rest_after(BETAS[0])
 
 
 @pytest.fixture
@@ -51,24 +53,25 @@ def rate_of(step: int) -> float:
 def advance(state: AdamState, count: int, steps: range) -> None:
     for step in steps:
         state.gradient[:count] += gradient_of(step, count)
-        state.update(step, rate_of(step))
+        state.update(step, rate_of(step), BETAS)
 
 
-def test_hundreds_of_steps_are_torchs_adam_and_a_clamp() -> None:
+@pytest.mark.parametrize("betas", [BETAS, (0.8, 0.95), (0.0, 0.0)])
+def test_hundreds_of_steps_are_torchs_adam_and_a_clamp(betas: tuple[float, float]) -> None:
     """Measured against float64: at most 7e-6 apart in any step; a step is up to 0.1. What rests misses 1e-5 of a step."""
-    count = 1003
+    count, rest = 1003, rest_after(betas[0])
     texels = start(count)
     state, leaf = AdamState.start(padded(texels)), texels.double().requires_grad_()
-    reference = torch.optim.Adam([leaf], betas=BETAS, eps=EPSILON)
+    reference = torch.optim.Adam([leaf], betas=betas, eps=EPSILON)
     largest, rested, woken = 0.0, 0, 0
     for step in range(1, STEPS + 1):
         gradient = gradient_of(step, count)
         idle = step - state.last
         moved = torch.nn.functional.pad(gradient, (0, 0, 0, -count % BLOCK)).view(-1, 4 * BLOCK).any(-1)
-        rested += int(((idle > REST_AFTER) & (idle < 1 << 20) & ~moved).sum())
-        woken += int(((idle > REST_AFTER) & (idle < 1 << 20) & moved).sum())
+        rested += int(((idle > rest) & (idle < 1 << 20) & ~moved).sum())
+        woken += int(((idle > rest) & (idle < 1 << 20) & moved).sum())
         state.gradient[:count] += gradient
-        state.update(step, rate_of(step))
+        state.update(step, rate_of(step), betas)
         reference.param_groups[0]["lr"] = rate_of(step)
         leaf.grad = gradient.double()
         reference.step()
@@ -90,7 +93,7 @@ def test_sizes_that_are_not_whole_blocks(count: int) -> None:
     state = AdamState.start(padded(texels))
     assert len(state.texels) == -(-count // BLOCK) * BLOCK and torch.equal(state.texels[:count], texels)
     state.gradient[:count] += 1
-    state.update(1, 0.1)
+    state.update(1, 0.1, BETAS)
     assert torch.allclose(state.texels[:count], (texels - 0.1).clamp_min(0), atol=1e-6)
     assert not state.texels[count:].any() and not state.gradient.any()
     assert texels.max() == start(count).max() and torch.equal(texels, start(count))  # what it started from is untouched
@@ -98,14 +101,14 @@ def test_sizes_that_are_not_whole_blocks(count: int) -> None:
 
 def test_no_texels_at_all() -> None:
     state = AdamState.start(padded(torch.zeros(0, 4)))
-    state.update(1, 0.1)
+    state.update(1, 0.1, BETAS)
     assert state.texels.shape == (0, 4)
 
 
 def test_an_update_without_gradients_moves_nothing_at_first() -> None:
     state = AdamState.start(padded(start(100)))
     for step in range(1, 5):
-        state.update(step, 0.1)
+        state.update(step, 0.1, BETAS)
     assert torch.equal(state.texels, AdamState.start(padded(start(100))).texels)
 
 
@@ -148,11 +151,16 @@ def test_crispness_is_a_gradient_of_alphas_that_are_not_zero() -> None:
         plain.gradient[:40] = gradient
         woken = (gradient.view(-1, BLOCK, 4) != 0).flatten(1).any(-1) | (step - plain.last <= REST_AFTER)
         plain.gradient[:40, 3] += torch.where((alpha > 0) & woken.repeat_interleave(BLOCK), 0.3 * (1 - 2 * alpha), 0)
-        plain.update(step, 0.05)
-        crisp.update(step, 0.05, crispness=0.3)
+        plain.update(step, 0.05, BETAS)
+        crisp.update(step, 0.05, BETAS, crispness=0.3)
     torch.testing.assert_close(crisp.texels, plain.texels, atol=1e-6, rtol=0)
     untouched = AdamState.start(padded(texels))
     for step in range(1, 4):
         untouched.gradient[:40] = gradient_of(step, 40)
-        untouched.update(step, 0.05)
+        untouched.update(step, 0.05, BETAS)
     assert (untouched.texels[:, 3] - crisp.texels[:, 3]).abs().max() > 0.01
+
+
+def test_how_soon_blocks_rest() -> None:
+    assert [rest_after(beta1) for beta1 in (0.0, 0.8, 0.9)] == [1, 61, 128]
+    assert 0.99 ** rest_after(0.99) < 1.5e-6

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bbfit.fitting.clusters import Planes, cluster_planes, rectangles, seen_across, splatted
+from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, seen_across, splatted, split_planes
 from bbfit.fitting.initialize import sized
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.cloud import BillboardCloud
@@ -386,3 +386,56 @@ def test_a_billboard_without_points_is_grey_and_transparent(two_sided: bool) -> 
     made = splatted(cloud, points, torch.tensor([[0.2, 0.4, 0.6]]), torch.tensor([0]))
     assert (made.textures()[1] == torch.tensor([0.5, 0.5, 0.5, 0.0])).all()
     assert replace(made, texels=cloud.texels).texels is cloud.texels and torch.equal(made.centers, cloud.centers)
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_best_planes_of_moments_are_those_of_the_points(upright: bool) -> None:
+    """Against the singular vectors of the points themselves; far from the origin as well."""
+    points = random_points(500) * torch.tensor([3.0, 1.0, 0.4]) + torch.tensor([40.0, 5.0, -60.0])
+    labels = torch.arange(500) % 3
+    normals, offsets, squares = best_planes(moments(points, labels, 4), upright=upright)
+    for k in range(3):
+        own = points[labels == k]
+        flat = own * torch.tensor([1.0, 0.0, 1.0]) if upright else own
+        _, values, axes = torch.linalg.svd(flat - flat.mean(0), full_matrices=False)
+        last = 1 if upright else 2
+        assert (normals[k] @ axes[last]).abs() == pytest.approx(1, abs=1e-9)
+        assert float(squares[k]) == pytest.approx(float(values[last] ** 2), rel=1e-6)
+        assert float((own @ normals[k] - offsets[k]).square().sum()) == pytest.approx(float(squares[k]), rel=1e-6)
+    assert normals.norm(dim=-1)[3] == pytest.approx(1) and float(squares[3]) == 0  # a cluster without points
+
+
+def test_moments_of_a_union_are_the_sums() -> None:
+    points, labels = random_points(60), torch.arange(60) % 4
+    apart = moments(points, labels, 4)
+    assert torch.allclose(moments(points, labels % 2, 2), apart[:2] + apart[2:], rtol=1e-12)
+    assert apart[:, 3, 3].tolist() == [15] * 4
+
+
+@pytest.mark.parametrize("upright", [False, True])
+@pytest.mark.parametrize("across", [0, 2])
+def test_split_planes_find_two_sheets(ring: Camera, upright: bool, across: int) -> None:
+    """Parallel ones, a pace apart, seen through noise; and a bent sheet."""
+    points = random_points(400)
+    points[:, across] = 0.02 * points[:, across] + torch.where(torch.arange(400) % 2 == 0, 0.5, -0.5)
+    planes = split_planes(points, torch.eye(3), seen_across(ring), upright=upright)
+    assert planes.normals[:, across].abs().min() > 0.99 and planes.offsets.abs().sub(0.5).abs().max() < 0.05
+    assert planes.labels.bincount().tolist() == [200, 200] and len(planes.labels[::2].unique()) == len(planes.labels[1::2].unique()) == 1
+
+
+def test_split_planes_are_upright_where_they_have_to_be(ring: Camera) -> None:
+    points, seen = random_points(300), seen_across(ring)
+    upright, free = (split_planes(points, torch.eye(3), seen, upright=must) for must in (True, False))
+    assert (upright.normals[:, 1] == 0).all()
+
+    def moved(planes: Planes) -> float:
+        return float(((points @ planes.normals.mT - planes.offsets).abs().amin(-1)).square().mean())
+
+    one = best_planes(moments(points, torch.zeros(300, dtype=torch.int64), 1), upright=True)[2]
+    assert moved(upright) < 0.8 * float(one) / 300 and moved(free) < 1.2 * moved(upright)
+
+
+def test_few_points_split_as_well(ring: Camera) -> None:
+    for count in (1, 2, 3, 5):
+        planes = split_planes(random_points(count), torch.eye(3), seen_across(ring), upright=False)
+        assert planes.normals.isfinite().all() and planes.offsets.isfinite().all() and len(planes.labels) == count

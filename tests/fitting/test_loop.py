@@ -27,7 +27,7 @@ def views(views_folder: Path) -> ViewDataset:
 
 def quick(**fields: object) -> FitConfig:
     """A configuration whose search for a placement is short."""
-    return FitConfig(**{"candidates": 2, "relocations": 2} | fields)  # type: ignore[arg-type]
+    return FitConfig(**{"candidates": 2, "revisions": 2} | fields)  # type: ignore[arg-type]
 
 
 class Killed(Exception):
@@ -206,11 +206,17 @@ def test_at_less_than_full_resolution_sharpness_and_crispness_have_no_weight(pre
     assert config.resolve().coarse() == coarse.resolve() and FitConfig(preset=preset).coarse().resolve().sharpness_weight == 0.0
 
 
-@pytest.mark.parametrize(("billboards", "searches"), [(1, 1), (4, 1), (5, 1), (6, 2), (7, 2), (8, 3), (9, 3), (12, 3), (40, 3), (None, 3)])
-def test_eight_billboards_have_three_searches_and_no_number_has_more(billboards: int | None, searches: int) -> None:
+@pytest.mark.parametrize(("billboards", "searches"), [(1, 1), (3, 1), (4, 1), (7, 1), (8, 2), (9, 2), (40, 2), (None, 2)])
+def test_eight_billboards_have_two_searches_and_no_number_has_more(billboards: int | None, searches: int) -> None:
     """Unless their number is asked for."""
     assert FitConfig(billboards=billboards).searches is None and FitConfig(billboards=billboards).resolve().searches == searches
     assert FitConfig(billboards=billboards, searches=5).resolve().searches == 5
+
+
+@pytest.mark.parametrize(("billboards", "revisions"), [(1, 1), (4, 1), (5, 2), (8, 5), (9, 6), (40, 6), (None, 5)])
+def test_more_billboards_are_revised_more_often(billboards: int | None, revisions: int) -> None:
+    assert FitConfig(billboards=billboards).revisions is None and FitConfig(billboards=billboards).resolve().revisions == revisions
+    assert FitConfig(billboards=billboards, revisions=0).resolve().revisions == 0
 
 
 def test_unknown_device_is_refused(views: ViewDataset) -> None:

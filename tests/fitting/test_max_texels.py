@@ -31,7 +31,7 @@ def views(views_folder: Path) -> ViewDataset:
 
 
 def config(**fields: object) -> FitConfig:
-    return FitConfig(**{"billboards": 2, "texel_density": 1.5, "candidates": 2, "relocations": 0, "steps": 8} | fields)  # type: ignore[arg-type]
+    return FitConfig(**{"billboards": 2, "texel_density": 1.5, "candidates": 2, "revisions": 0, "steps": 8} | fields)  # type: ignore[arg-type]
 
 
 def rectangles(seed: int) -> BillboardCloud:
