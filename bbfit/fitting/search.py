@@ -44,7 +44,7 @@ def find_placement(views: ViewSet, points: Tensor, config: FitConfig, on_work: C
 
     Clusterings of the points from different random starts, upright and free, are fitted for a few steps each in which billboards move with
     their textures; the best third goes on for longer. To the best of these the last quarter of the billboards is added, by splitting one or
-    where the loss is largest. That is done a few times over, and the cloud with the least loss on the training views is revised: a
+    where the loss is largest. That is done ``searches`` times, and the cloud with the least loss on the training views is revised: a
     billboard that is missed least, since others carry the same or there is little to carry, is put where the loss is largest, or given up
     to split another; or two whose points lie almost on one plane are merged to have one free. Whatever lowers the loss stays.
 
