@@ -44,7 +44,7 @@ import torch
 from torch.nn.functional import interpolate
 
 import bbfit
-from bbfit.fitting.adam import REST_AFTER
+from bbfit.fitting.adam import rest_after
 from bbfit.fitting.initialize import random_textures, start_cloud
 from bbfit.fitting.levels import Targets, resize_textures, shrunk_sizes
 from bbfit.fitting.loop import Step
@@ -178,7 +178,7 @@ def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torc
             chosen = [((4 * turn + index) * batch + view) % len(views) for view in range(batch)]
             times["fused"].append(seconds_of(lambda chosen=chosen: fused.step(chosen, 0.01), device))  # type: ignore[misc]
     slow, fast = (statistics.median(times[which]) for which in ("reference", "fused"))
-    moved = bytes_of_a_step(fused, views, batch)
+    moved = bytes_of_a_step(fused, views, batch, rest_after(config.beta1 or 0.0))
     return {
         "name": name,
         "device": device.type,
@@ -195,11 +195,11 @@ def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torc
     }
 
 
-def bytes_of_a_step(stepper: FusedStepper, views: ViewSet, batch: int) -> int:
+def bytes_of_a_step(stepper: FusedStepper, views: ViewSet, batch: int, rest: int) -> int:
     """Bytes that a step must move: targets once, touched texels read and their gradients added for each view, awake blocks updated."""
     state, steps = stepper.state, stepper.steps
     touched = int((state.last == steps).sum()) * 4
-    awake = int((steps - state.last <= REST_AFTER).sum()) * 4
+    awake = int((steps - state.last <= rest).sum()) * 4
     pixels = views.cameras.width * views.cameras.height
     # RGBA in float32 is 16 bytes. Touched texels are read, their gradient is read, written, and cleared; of awake ones three arrays are
     # read and written; every gradient is looked at.
