@@ -110,7 +110,7 @@ def test_imports_go_downwards_only() -> None:
         ("geometry/camera.py", "from bbfit.layout import Frame", False),
         ("fitting/loop.py", "from bbfit.fitting.config import FitConfig", True),
         ("fitting/loop.py", "def f():\n    import bbfit.evaluation.metrics", False),
-        ("evaluation/scoring.py", "from bbfit.exporting import quads", False),
+        ("evaluation/scoring.py", "from bbfit.exporting import cards", False),
         ("views.py", "from bbfit.blender.views_folder import render_views", False),
         ("views.py", "from bbfit.images import read_rgba", True),
         ("pipeline.py", "from bbfit import cli", False),

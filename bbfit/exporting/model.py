@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.obj import mtl_bytes, obj_bytes
-from bbfit.exporting.quads import cloud_quads
 from bbfit.files import write_bytes
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png
@@ -31,15 +31,15 @@ def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None 
         if the folder does not exist or cannot be written to; files that were there stay as they were.
     """
     path, config = check_model_path("model file", path), config or ExportConfig()
-    quads = cloud_quads(cloud, config.padding)
+    cards = cloud_cards(cloud, config.padding)
     if path.suffix.lower() == ".glb":
-        contents = {path: glb_bytes(quads, config)}
+        contents = {path: glb_bytes(cards, config)}
     else:
         material, texture = path.with_suffix(".mtl"), path.with_suffix(".png")
         contents = {
-            path: obj_bytes(quads, config, material_file=material.name),
+            path: obj_bytes(cards, config, material_file=material.name),
             material: mtl_bytes(texture_file=texture.name),
-            texture: encode_png(quads.atlas.image),
+            texture: encode_png(cards.atlas.image),
         }
     for file, data in reversed(contents.items()):  # what is referred to before what refers to it
         write_bytes(file, data)

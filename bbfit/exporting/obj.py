@@ -1,6 +1,6 @@
 """Wavefront OBJ with its material library.
 
-Written here rather than by trimesh, which splits quads into triangles, rounds to a fixed number of decimals and has no alpha map.
+Written here rather than by trimesh, which splits polygons into triangles, rounds to a fixed number of decimals and has no alpha map.
 """
 
 from __future__ import annotations
@@ -8,31 +8,33 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bbfit.exporting.cards import Cards
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.quads import Quads
 
 _MATERIAL = "billboards"
 
 
-def obj_bytes(quads: Quads, config: ExportConfig, *, material_file: str) -> bytes:
-    """An OBJ file: four vertices for each quad, in metres, ``config.up`` up; nine digits, which give every float32 back.
+def obj_bytes(cards: Cards, config: ExportConfig, *, material_file: str) -> bytes:
+    """An OBJ file: a polygon for each card, in metres, ``config.up`` up; nine digits, which give every float32 back.
 
-    OBJ cannot say whether a face is culled from behind. A two-sided billboard is written as two quads of opposite winding, and the
+    OBJ cannot say whether a face is culled from behind. A two-sided billboard is written as two faces of opposite winding, and the
     file's header asks for culling where there are any.
     """
-    corners, normals = quads.corners.reshape(-1, 3), quads.normals
+    corners = np.concatenate([card.corners for card in cards.cards])
+    normals = np.stack([card.normal for card in cards.cards])
     if config.up == "z":
         corners, normals = _z_up(corners), _z_up(normals)
-    uvs = quads.uvs.reshape(-1, 2) * [1, -1] + [0, 1]  # OBJ counts v from the bottom
+    uvs = np.concatenate([card.uvs for card in cards.cards]) * [1.0, -1.0] + [0.0, 1.0]  # OBJ counts v from the bottom
     lines = [f"# bbfit billboard cloud, metres, {'Z' if config.up == 'z' else 'Y'} up"]
-    if quads.culled.any():
+    if any(card.culled for card in cards.cards):
         lines.append("# has separate front and back faces: turn on back-face culling")
     lines += [f"mtllib {material_file}", "o billboards"]
     lines += _rows("v", corners) + _rows("vt", uvs) + _rows("vn", normals)
     lines += [f"usemtl {_MATERIAL}", "s off"]
-    for quad in range(len(normals)):
-        first = 4 * quad + 1
-        lines.append("f " + " ".join(f"{vertex}/{vertex}/{quad + 1}" for vertex in range(first, first + 4)))
+    first = 1
+    for face, card in enumerate(cards.cards, 1):
+        lines.append("f " + " ".join(f"{vertex}/{vertex}/{face}" for vertex in range(first, first + len(card.corners))))
+        first += len(card.corners)
     return ("\n".join(lines) + "\n").encode()
 
 

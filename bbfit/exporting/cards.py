@@ -1,8 +1,8 @@
-"""The rectangles of a cloud as textured quads."""
+"""The rectangles of a cloud as flat textured polygons, which is what model files hold."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,36 +12,56 @@ from bbfit.exporting.atlas import Atlas, pack_atlas
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import to_bytes
 
-# Two triangles that wind like their quad.
-TRIANGLES = ((0, 1, 2), (0, 2, 3))
+
+@dataclass(frozen=True)
+class Card:
+    """A flat convex polygon that shows a part of one texture of the atlas, or all of it."""
+
+    corners: NDArray[np.float64]
+    """K >= 3 points in metres, counter-clockwise as seen from where the normal points, [K, 3]."""
+    uvs: NDArray[np.float64]
+    """Texture coordinates with (0, 0) at the atlas's top-left corner and (1, 1) at its bottom-right corner, [K, 2]."""
+    normal: NDArray[np.float64]
+    """Unit normal, [3]."""
+    culled: bool
+    """Whether only the side that the normal points to is shown; otherwise both sides show the same."""
+    rectangle: int
+    """Which texture of the atlas it shows."""
+    origin: NDArray[np.float64] | None = None
+    """Point in metres by which programs that sort what is transparent are to sort it, [3]; it then gets a node of its own."""
+
+    @property
+    def triangles(self) -> NDArray[np.int64]:
+        """A fan of triangles that wind like the polygon, [K - 2, 3]."""
+        middle = np.arange(1, len(self.corners) - 1)
+        return np.stack([np.zeros_like(middle), middle, middle + 1], -1)
 
 
 @dataclass(frozen=True)
-class Quads:
-    """Q textured quads in the cloud's world, one for each rectangle of the atlas."""
+class Cards:
+    """A cloud's cards and their textures."""
 
-    corners: NDArray[np.float64]
-    """Corner points in metres, counter-clockwise as seen from where the normal points, [Q, 4, 3]."""
-    normals: NDArray[np.float64]
-    """Unit normals, [Q, 3]."""
-    uvs: NDArray[np.float64]
-    """Texture coordinates with (0, 0) at the atlas's top-left corner and (1, 1) at its bottom-right corner, [Q, 4, 2]."""
-    culled: NDArray[np.bool_]
-    """Whether only the side that the normal points to is shown, [Q]; the other quads show the same from both sides."""
+    cards: tuple[Card, ...]
+    """Q >= 1 of them."""
     atlas: Atlas
     """The textures: per billboard the front, then the back if there is one."""
 
-    def triangles(self, chosen: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Vertex indices of the chosen quads' triangles, [2 * len(chosen), 3], counting their corners only."""
-        return (np.array(TRIANGLES) + 4 * np.arange(len(chosen))[:, None, None]).reshape(-1, 3)
+    @property
+    def vertex_count(self) -> int:
+        """Vertices of all cards."""
+        return sum(len(card.corners) for card in self.cards)
+
+    def with_cards(self, cards: list[Card]) -> Cards:
+        """Other cards of the same textures."""
+        return replace(self, cards=tuple(cards))
 
 
-def cloud_quads(cloud: BillboardCloud, padding: int) -> Quads:
-    """Quads and atlas that any renderer with bilinear filtering shows as :func:`~bbfit.rendering.reference.render_reference` does.
+def cloud_cards(cloud: BillboardCloud, padding: int) -> Cards:
+    """Rectangles and atlas that any renderer with bilinear filtering shows as :func:`~bbfit.rendering.reference.render_reference` does.
 
     A billboard's picture fades to transparent over one texel beyond its outermost texel centres, so half a texel beyond its
-    rectangle. Each quad is half a texel larger than its rectangle on every side and reaches to the centres of the padding texels
-    around its texture. A two-sided billboard gives two quads at the same place, front and back, of opposite winding.
+    rectangle. Each card is half a texel larger than its rectangle on every side and reaches to the centres of the padding texels
+    around its texture. A two-sided billboard gives two cards at the same place, front and back, of opposite winding.
 
     Textures are rounded to 8 bits, which moves a premultiplied colour by at most 1/255 a layer. Transparent texels change their
     colour (:func:`~bbfit.exporting.atlas.fill_cell`); that shows within a texel of the silhouette, by at most 1/4 a layer, where they
@@ -74,10 +94,12 @@ def cloud_quads(cloud: BillboardCloud, padding: int) -> Quads:
     extent = np.array(atlas.image.shape[1::-1])
     uvs = np.stack([low, high], -1)[:, [[0, 1], [0, 1], [0, 1], [0, 1]], [[0, 1], [1, 1], [1, 0], [0, 0]]] / extent
     order = np.where(back[:, None], [1, 0, 3, 2], [0, 1, 2, 3])
-    return Quads(
+    made = zip(
         np.take_along_axis(corners[owner], order[..., None], 1),
-        np.where(back[:, None], -1.0, 1.0) * normals[owner],
         np.take_along_axis(uvs, order[..., None], 1),
-        two_sided.astype(np.bool_)[owner],
-        atlas,
+        np.where(back[:, None], -1.0, 1.0) * normals[owner],
+        two_sided.astype(np.bool_)[owner].tolist(),
+        range(len(owner)),
+        strict=True,
     )
+    return Cards(tuple(Card(*parts) for parts in made), atlas)
