@@ -154,6 +154,7 @@ def _evaluate(
     views: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIEWS")],
     /,
     out: Path | None = None,
+    export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
     """Score a billboard cloud on the held-out views of a folder.
 
@@ -161,12 +162,14 @@ def _evaluate(
         cloud: A .safetensors file written by bbfit fit.
         views: Folder of views.
         out: File for the measures as JSON; left out, metrics.json beside the cloud, which replaces the one of its run.
+        export: How the model was written, if not as the cloud was fitted: the score is of what the model shows.
     """
     from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
+    from bbfit.exporting.model import as_shipped, shipped_cards
     from bbfit.files import output_folder
     from bbfit.geometry.cloud import BillboardCloud
-    from bbfit.pipeline import original_tree
+    from bbfit.pipeline import original_tree, with_model
     from bbfit.reporting.tables import report_table
     from bbfit.views import ViewDataset
 
@@ -175,13 +178,14 @@ def _evaluate(
     output_folder("out", out.parent)
     with _progress() as tell:
         report = evaluate(
-            billboards,
+            as_shipped(billboards, export),
             dataset.test,
             original=original_tree(dataset),
             model_bytes=model.stat().st_size if (model := cloud.with_name("model.glb")).is_file() else None,
             seconds=Report.load(earlier).seconds if earlier.is_file() else None,
             on_view=lambda done, total: tell("evaluate", done, total),
         )
+    report = with_model(report, shipped_cards(billboards, export))
     report.save(out)
     _out.print(report_table(report))
     _out.print(f"measures in {out}", soft_wrap=True)

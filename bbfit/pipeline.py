@@ -7,7 +7,9 @@ import io
 import json
 import platform
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cache
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -19,8 +21,10 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, check_file, fail
 from bbfit.evaluation.report import Report
 from bbfit.evaluation.scoring import OriginalTree, evaluate
+from bbfit.exporting.cards import Cards
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import export
+from bbfit.exporting.hulls import overdraw
+from bbfit.exporting.model import as_shipped, shipped_cards, shows_from, write_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
@@ -35,7 +39,7 @@ from bbfit.views import ViewDataset
 
 RECORD_FILE = "run.json"
 # Raise a stage's number when its results change for the same inputs, so that old results are made anew.
-_STAGE_VERSIONS = {"grow": 1, "budget": 2, "fit": 5, "export": 1, "evaluate": 3}
+_STAGE_VERSIONS = {"grow": 1, "budget": 3, "fit": 6, "export": 2, "evaluate": 4}
 _PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headless", "bpy", "trimesh", "xatlas", "scikit-image", "warp-lang")
 
 
@@ -137,9 +141,16 @@ def run(
         asked, missed = choice.config, None if choice.met else config.budget.target_psnr
         record.decided(asked)
     cloud = _fit(views, tree, record, asked, tell, (config.budget.most_bytes, exported))
-    _export(cloud, record, exported, tell)
-    report = _evaluate(cloud, views, record, tell)
+    cards = cache(lambda: shipped_cards(cloud, exported))
+    _export(cards, record, exported, tell)
+    report = _evaluate(as_shipped(cloud, exported), cards, views, record, tell)
     return RunResult(record.folder, cloud, report, tuple(record.skipped), missed)
+
+
+def with_model(report: Report, cards: Cards) -> Report:
+    """The report with what a model file of these cards has."""
+    vertices = replace(report.vertices, model=cards.vertex_count)
+    return replace(report, vertices=vertices, overdraw=overdraw(cards, shows_from(cards)))
 
 
 def original_tree(views: ViewDataset) -> OriginalTree:
@@ -312,21 +323,22 @@ def _fit(
     return cloud
 
 
-def _export(cloud: BillboardCloud, record: _Record, config: ExportConfig, tell: Progress) -> None:
-    inputs = _hash("export", asdict(config), _hash_file(record.folder / "cloud.safetensors"))
+def _export(cards: Callable[[], Cards], record: _Record, config: ExportConfig, tell: Progress) -> None:
+    inputs = _hash("export", asdict(config.resolve()), _hash_file(record.folder / "cloud.safetensors"))
     if record.stands("export", inputs):
         return
     begun, written = time.perf_counter(), list[Path]()
     for step, suffix in enumerate((".glb", ".obj"), 1):
-        written += export(cloud, record.folder / f"model{suffix}", config)
+        written += write_model(cards(), record.folder / f"model{suffix}", config)
         tell("export", step, 2)
     record.done("export", inputs, [path.name for path in written], time.perf_counter() - begun)
 
 
-def _evaluate(cloud: BillboardCloud, views: ViewDataset, record: _Record, tell: Progress) -> Report:
+def _evaluate(cloud: BillboardCloud, cards: Callable[[], Cards], views: ViewDataset, record: _Record, tell: Progress) -> Report:
+    """The score of the cloud in the alpha mode that its model has."""
     path = record.folder / "metrics.json"
     results = [_hash_file(record.folder / name) for name in ("cloud.safetensors", "model.glb")]
-    inputs = _hash("evaluate", results, views.fingerprint)
+    inputs = _hash("evaluate", results, asdict(cloud.alpha), views.fingerprint)
     if record.stands("evaluate", inputs):
         return Report.load(path)
     begun = time.perf_counter()
@@ -338,6 +350,7 @@ def _evaluate(cloud: BillboardCloud, views: ViewDataset, record: _Record, tell: 
         seconds={name: seconds for name, seconds in record.seconds.items() if name != "evaluate"},
         on_view=lambda done, total: tell("evaluate", done, total),
     )
+    report = with_model(report, cards())
     report.save(path)
     comparison_picture(cloud, views.test, record.folder / "comparison.png")
     record.done("evaluate", inputs, [path.name, "comparison.png"], time.perf_counter() - begun)

@@ -15,9 +15,9 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.checks import fail
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import held_out
-from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
+from bbfit.exporting.model import shipped_cards
 from bbfit.fitting.config import FitConfig, Placement, Sides
 from bbfit.fitting.levels import resize_textures
 from bbfit.fitting.loop import fit
@@ -149,7 +149,7 @@ def within_bytes(cloud: BillboardCloud, most: int | None, export: ExportConfig) 
 
 def model_bytes(cloud: BillboardCloud, export: ExportConfig) -> int:
     """Size of the cloud as GLB."""
-    return len(glb_bytes(cloud_cards(cloud, export.padding), export))
+    return len(glb_bytes(shipped_cards(cloud, export), export))
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:

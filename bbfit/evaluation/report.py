@@ -9,6 +9,7 @@ from typing import Any
 
 from bbfit.checks import check_file, fail
 from bbfit.files import read_json, write_json
+from bbfit.geometry.alpha import AlphaMode
 
 RING_GAP = 1.0
 """Degrees between the elevations of two rings of views, at least."""
@@ -131,6 +132,10 @@ class Report:
     """Sizes of the exported file and of the original tree's file."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall-clock seconds of each stage."""
+    alpha: AlphaMode = field(default_factory=AlphaMode)
+    """The alpha mode that was measured."""
+    overdraw: float | None = None
+    """Share of the model's area that is drawn and shows nothing, in [0, 1]."""
 
     @property
     def mean(self) -> Measures:
@@ -163,13 +168,16 @@ class Report:
         Returns
         -------
         ``{"over_white": {"psnr", "ssim", "flip"}, "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
-        "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "seconds": {stage: ..},
+        "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw",
+        "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
         "rings": [{"elevation_degrees", "views", and the measures as above}],
         "views": [{"name", "azimuth_degrees", "elevation_degrees", and the measures as above}]}``
         """
         return asdict(self.mean) | {
             "vertices": self.vertices.to_json(),
             "bytes": self.bytes.to_json(),
+            "overdraw": self.overdraw,
+            "alpha": {"mode": self.alpha.kind, "cutoff": self.alpha.cutoff},
             "seconds": dict(self.seconds),
             "rings": [ring.to_json() for ring in self.rings],
             "views": [view.to_json() for view in self.views],
@@ -192,7 +200,9 @@ class Report:
         content = read_json("metrics", path)
         try:
             vertices, sizes = (Cost(content[name]["model"], content[name]["original"]) for name in ("vertices", "bytes"))
-            return Report(tuple(_view(entry) for entry in content["views"]), vertices, sizes, dict(content["seconds"]))
+            alpha = AlphaMode(content["alpha"]["mode"], content["alpha"]["cutoff"])
+            scores = tuple(_view(entry) for entry in content["views"])
+            return Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"])
         except (KeyError, TypeError, ValueError):
             fail("metrics", f"{path} is not a report", "expected a metrics.json that bbfit evaluate wrote")
 

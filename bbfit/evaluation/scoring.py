@@ -83,6 +83,7 @@ def evaluate(
         Cost(cloud.vertex_count, original.vertices),
         Cost(model_bytes, original.bytes),
         {**(seconds or {}), "evaluate": time.perf_counter() - began},
+        cloud.alpha,
     )
 
 

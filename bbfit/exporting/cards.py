@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.checks import fail
 from bbfit.exporting.atlas import Atlas, pack_atlas
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import to_bytes
 
@@ -45,11 +46,13 @@ class Cards:
     """Q >= 1 of them."""
     atlas: Atlas
     """The textures: per billboard the front, then the back if there is one."""
+    alpha: AlphaMode = field(default_factory=AlphaMode)
+    """What their alpha means."""
 
     @property
     def vertex_count(self) -> int:
-        """Vertices of all cards."""
-        return sum(len(card.corners) for card in self.cards)
+        """Vertices of all cards, with the two that centre the bounds of each that has an origin."""
+        return sum(len(card.corners) + 2 * (card.origin is not None) for card in self.cards)
 
     def with_cards(self, cards: list[Card]) -> Cards:
         """Other cards of the same textures."""
@@ -102,4 +105,4 @@ def cloud_cards(cloud: BillboardCloud, padding: int) -> Cards:
         range(len(owner)),
         strict=True,
     )
-    return Cards(tuple(Card(*parts) for parts in made), atlas)
+    return Cards(tuple(Card(*parts) for parts in made), atlas, cloud.alpha)

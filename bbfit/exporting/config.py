@@ -1,24 +1,58 @@
-"""What an export may choose."""
+"""What an export may choose, and what it takes for each program."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
-from bbfit.checks import check_choice, check_count, check_range
+from bbfit.checks import check_choice, check_count, fail
+from bbfit.geometry.alpha import AlphaKind, check_cutoff
 
-Alpha = Literal["blend", "mask"]
 Up = Literal["auto", "y", "z"]
+Profile = Literal["three", "babylon", "godot", "unity", "unreal", "blender"]
+Textures = Literal["png", "webp", "ktx2"]
+Material = Literal["unlit", "pbr"]
+
+# What is taken where it is left open. Programs that rasterize sort what is blended node by node, so they need split cards; Blender's Cycles
+# finds the order by itself.
+_OPEN: dict[str, Any] = {"split": False, "material": "unlit", "textures": "png"}
+_PROFILES: dict[str, dict[str, Any]] = {
+    "three": {"split": True},
+    "babylon": {"split": True},
+    "godot": {"split": True},
+    "unity": {"split": True},
+    "unreal": {"split": True},
+    "blender": {},
+}
 
 
 @dataclass(frozen=True)
 class ExportConfig:
     """How a billboard cloud is written to a model file."""
 
-    alpha: Alpha = "blend"
-    """Blend by alpha (smooth edges, drawn back to front), or mask: draw where alpha reaches the cutoff (needs no sorting)."""
-    alpha_cutoff: float = 0.5
-    """Least alpha that is drawn with mask, in (0, 1]."""
+    profile: Profile | None = None
+    """The program that the file is for, which decides over what is left open below; any program when left out."""
+    alpha: AlphaKind | None = None
+    """What alpha means: mask, drawn where alpha reaches the cutoff, needs no sorting; blend has smooth edges and is drawn back to front;
+    hash is drawn by chance. Left open, what the textures were fitted for, which they are best at."""
+    alpha_cutoff: float | None = None
+    """Least alpha that is drawn with mask, in (0, 1). Left open, what the textures were fitted for."""
+    split: bool | None = None
+    """Cut billboards that cross, and give each piece a node, so that programs that sort nodes blend them in the right order from every
+    side. Costs vertices. Of no use with mask and hash, where it is ignored. Left open, only for a profile whose program sorts nodes."""
+    hull: int | None = None
+    """Corners at most, 4 to 8, of a convex outline around what each billboard shows, in place of its rectangle: fewer empty pixels are
+    drawn. The rectangle when left out."""
+    textures: Textures | None = None
+    """Format of a GLB's texture beside PNG, which every program reads: webp is smaller; ktx2 stays compressed on the graphics card and
+    brings mip levels that keep their coverage (needs the extra ktx2). Left open, PNG alone."""
+    fallback: bool = True
+    """Keep the PNG beside a texture in another format, for programs that cannot read it."""
+    mip_files: bool = False
+    """Write the mip levels as PNG files beside the model too, for programs that take them."""
+    material: Material | None = None
+    """unlit: colours as they are, with the light that the tree was rendered in. pbr: a rough dielectric that the program lights once more.
+    Left open, unlit."""
     padding: int = 8
     """Texels kept free around each texture in the atlas, at least 1; with 8 the mip levels 1 to 3 never mix two textures."""
     up: Up = "auto"
@@ -26,7 +60,21 @@ class ExportConfig:
     else y. A GLB is Y up, as glTF demands."""
 
     def __post_init__(self) -> None:
-        check_choice("alpha", self.alpha, get_args(Alpha))
-        check_range("alpha_cutoff", self.alpha_cutoff, 0, 1, open_low=True)
+        check_choice("profile", self.profile, (None, *get_args(Profile)))
+        check_choice("alpha", self.alpha, (None, *get_args(AlphaKind)))
+        if self.alpha_cutoff is not None:
+            check_cutoff("alpha_cutoff", self.alpha_cutoff)
+        check_choice("split", self.split, (None, False, True))
+        if self.hull is not None:
+            check_count("hull", self.hull, 4)
+            if self.hull > 8:
+                fail("hull", f"expected 4 to 8 corners, got {self.hull}")
+        check_choice("textures", self.textures, (None, *get_args(Textures)))
+        check_choice("material", self.material, (None, *get_args(Material)))
         check_count("padding", self.padding, 1)
         check_choice("up", self.up, get_args(Up))
+
+    def resolve(self) -> ExportConfig:
+        """The same with what the profile decides over; ``alpha`` and ``alpha_cutoff``, which the cloud decides over, stay as they are."""
+        taken = _OPEN | (_PROFILES[self.profile] if self.profile else {})
+        return replace(self, **{name: value for name, value in taken.items() if getattr(self, name) is None})

@@ -5,53 +5,70 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bbfit.exporting.cards import Card, Cards
 from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.encoders import encode_ktx2, encode_webp
+from bbfit.exporting.mips import mip_chain
+from bbfit.exporting.splitting import centred
 from bbfit.images import encode_png
 from bbfit.model_files import glb_of_scene, joined_glb, split_glb
 
 # Numbers that glTF 2.0 borrows from OpenGL (specification, section 5.26).
-_SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}  # linear, trilinear, clamped to the edge
+_SAMPLER = {"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}  # linear, clamped to the edge
+_WITH_MIPS = _SAMPLER | {"minFilter": 9987}  # trilinear
+_EXTENSIONS = {"webp": ("EXT_texture_webp", "image/webp"), "ktx2": ("KHR_texture_basisu", "image/ktx2")}
 
 
 def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
     """A GLB file: one mesh for the cards shown from both sides, one for those culled from behind, and one for each that has an origin.
 
-    The materials are unlit (``KHR_materials_unlit``), as the textures hold colours with the light in them. Viewers without that
-    extension see a rough dielectric.
+    A mesh with an origin stands there, and its bounds are centred on it, by two vertices that no triangle uses: programs sort what is
+    blended by the one or the other. Mip levels are asked for only where the file brings its own (``ktx2``): those that programs make
+    for themselves lose coverage.
     """
     import trimesh
     from PIL import Image
 
+    config = config.resolve()
     standin = Image.new("RGBA", (1, 1))  # trimesh writes texture coordinates for textured materials only
     scene = trimesh.Scene(base_frame="billboard_cloud")
     for name, chosen in _meshes(cards).items():
         material = trimesh.visual.material.PBRMaterial(
             name="billboards_two_sided" if chosen[0].culled else "billboards",
             baseColorTexture=standin,
-            alphaMode=config.alpha.upper(),
-            alphaCutoff=float(config.alpha_cutoff) if config.alpha == "mask" else None,
+            alphaMode="MASK" if cards.alpha.kind == "mask" else "BLEND",
+            alphaCutoff=float(cards.alpha.cutoff) if cards.alpha.kind == "mask" else None,
             doubleSided=not chosen[0].culled,
             metallicFactor=0.0,
             roughnessFactor=1.0,
         )
-        origin = chosen[0].origin
-        uvs, points = np.concatenate([card.uvs for card in chosen]), np.concatenate([card.corners for card in chosen])
+        points, uvs, normals = (np.concatenate(parts) for parts in zip(*map(_vertices, chosen), strict=True))
         first = np.cumsum([0, *(len(card.corners) for card in chosen)])
         mesh = trimesh.Trimesh(
-            points if origin is None else points - origin,
+            points,
             np.concatenate([card.triangles + start for card, start in zip(chosen, first, strict=False)]),
-            vertex_normals=np.concatenate([np.tile(card.normal, (len(card.corners), 1)) for card in chosen]),
+            vertex_normals=normals,
             # trimesh counts v from the bottom and turns it over on writing.
             visual=trimesh.visual.TextureVisuals(uv=np.stack([uvs[:, 0], 1 - uvs[:, 1]], -1), material=material),
             process=False,
         )
+        origin = chosen[0].origin
         place = None if origin is None else trimesh.transformations.translation_matrix(origin)
         scene.add_geometry(mesh, node_name=name, geom_name=name, transform=place)
-    tree, views = split_glb(glb_of_scene(scene, _complete))
-    views[tree["images"][0]["bufferView"]] = encode_png(cards.atlas.image)
-    return joined_glb(tree, views)
+    tree, views = split_glb(glb_of_scene(scene, lambda tree: _complete(tree, cards, config)))
+    return joined_glb(tree, _with_pictures(tree, views, cards, config))
+
+
+def _vertices(card: Card) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Points about the card's origin, texture coordinates and normals."""
+    if card.origin is None:
+        points, uvs = card.corners, card.uvs
+    else:
+        points = centred(card) - card.origin
+        uvs = np.concatenate([card.uvs, card.uvs[:1].repeat(len(points) - len(card.uvs), 0)])
+    return points, uvs, np.tile(card.normal, (len(points), 1))
 
 
 def _meshes(cards: Cards) -> dict[str, list[Card]]:
@@ -65,15 +82,46 @@ def _meshes(cards: Cards) -> dict[str, list[Card]]:
     return meshes
 
 
-def _complete(tree: dict[str, Any]) -> None:
-    """Add to trimesh's glTF what it has no means to say."""
-    tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), "KHR_materials_unlit"})
-    for material in tree["materials"]:
-        material["extensions"] = {"KHR_materials_unlit": {}}
-    tree["samplers"] = [_SAMPLER]
+def _complete(tree: dict[str, Any], cards: Cards, config: ExportConfig) -> None:
+    """Add to trimesh's glTF what it has no means to say, but for the pictures."""
     # trimesh lists the picture once for each material.
     assert len({image["bufferView"] for image in tree["images"]}) == 1
-    tree["images"] = [tree["images"][0] | {"name": "atlas"}]
-    tree["textures"] = [{"source": 0, "sampler": 0, "name": "atlas"}]
+    tree["images"] = [{"bufferView": tree["images"][0]["bufferView"]}]
+    tree["textures"] = [{"sampler": 0, "name": "atlas"}]
+    tree["samplers"] = [_WITH_MIPS if config.textures == "ktx2" else _SAMPLER]
+    used = set(tree.get("extensionsUsed", ()))
     for material in tree["materials"]:
         material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+        if config.material == "unlit":
+            used.add("KHR_materials_unlit")
+            material["extensions"] = {"KHR_materials_unlit": {}}
+        if cards.alpha.kind == "hash":
+            material["extras"] = {"alphaMode": "HASH"}
+    if used:
+        tree["extensionsUsed"] = sorted(used)
+
+
+def _with_pictures(tree: dict[str, Any], views: list[bytes], cards: Cards, config: ExportConfig) -> list[bytes]:
+    """The contents of the buffer views with those of the pictures, which the JSON is made to name."""
+    pictures = {"image/png": encode_png(cards.atlas.image)}
+    if config.textures in _EXTENSIONS:
+        extension, kind = _EXTENSIONS[config.textures]
+        pictures = pictures if config.fallback else {}
+        if config.textures == "webp":
+            pictures[kind] = encode_webp(cards.atlas.image)
+        else:
+            pictures[kind] = encode_ktx2(mip_chain(cards.atlas, cards.alpha.cutoff if cards.alpha.kind == "mask" else None))
+        tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), extension})
+        tree["textures"][0]["extensions"] = {extension: {"source": len(pictures) - 1}}
+        if not config.fallback:
+            tree["extensionsRequired"] = [extension]
+    if "image/png" in pictures:
+        tree["textures"][0]["source"] = 0
+    at, views = tree["images"][0]["bufferView"], list(views)
+    places = [at, *range(len(views), len(views) + len(pictures) - 1)]
+    tree["bufferViews"] += [{} for _ in places[1:]]
+    views += [b""] * (len(places) - 1)
+    for place, content in zip(places, pictures.values(), strict=True):
+        views[place] = content
+    tree["images"] = [{"bufferView": place, "mimeType": kind, "name": "atlas"} for place, kind in zip(places, pictures, strict=True)]
+    return views

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-from bbfit.exporting.cards import cloud_cards
+from bbfit.exporting.cards import Cards, cloud_cards
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
+from bbfit.exporting.hulls import with_hulls
+from bbfit.exporting.mips import mip_chain
 from bbfit.exporting.obj import mtl_bytes, obj_bytes
+from bbfit.exporting.splitting import split
 from bbfit.files import write_bytes
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png
 from bbfit.model_files import check_model_path
@@ -26,12 +31,16 @@ def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None 
     Raises
     ------
     InputError
-        for another ending, an empty cloud or one with values that are not finite.
+        for another ending, an empty cloud or one with values that are not finite, or if an encoder is missing that was asked for.
     MissingFileError, OSError
         if the folder does not exist or cannot be written to; files that were there stay as they were.
     """
     path, config = check_model_path("model file", path), config or ExportConfig()
-    cards = cloud_cards(cloud, config.padding)
+    return write_model(shipped_cards(cloud, config), path, config)
+
+
+def write_model(cards: Cards, path: Path, config: ExportConfig) -> list[Path]:
+    """Write the cards that :func:`shipped_cards` gives, as :func:`export` does."""
     if path.suffix.lower() == ".glb":
         contents = {path: glb_bytes(cards, config)}
     else:
@@ -41,6 +50,35 @@ def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None 
             material: mtl_bytes(texture_file=texture.name),
             texture: encode_png(cards.atlas.image),
         }
+    if config.mip_files:
+        chain = mip_chain(cards.atlas, cards.alpha.cutoff if cards.alpha.kind == "mask" else None)
+        contents |= {path.with_name(f"{path.stem}_mip{level}.png"): encode_png(image) for level, image in enumerate(chain)}
     for file, data in reversed(contents.items()):  # what is referred to before what refers to it
         write_bytes(file, data)
     return list(contents)
+
+
+def as_shipped(cloud: BillboardCloud, config: ExportConfig) -> BillboardCloud:
+    """The cloud with the alpha mode that its model file has: what a render or a score of the file is to be taken of."""
+    kind, cutoff = config.alpha or cloud.alpha.kind, config.alpha_cutoff or cloud.alpha.cutoff
+    return replace(cloud, alpha=AlphaMode(kind, cutoff))
+
+
+def shipped_cards(cloud: BillboardCloud, config: ExportConfig) -> Cards:
+    """The polygons that a model file of the cloud has, cut up and trimmed as asked for.
+
+    Raises
+    ------
+    InputError
+        if the cloud is empty or has values that are not finite.
+    """
+    config = config.resolve()
+    cards = cloud_cards(as_shipped(cloud, config), config.padding)
+    if config.split and cards.alpha.kind == "blend":
+        cards = split(cards)
+    return cards if config.hull is None else with_hulls(cards, config.hull, shows_from(cards))
+
+
+def shows_from(cards: Cards) -> float:
+    """The alpha from which on something shows; 0 where it is anything above."""
+    return cards.alpha.cutoff if cards.alpha.kind == "mask" else 0.0

@@ -37,6 +37,7 @@ def _update_blocks(
     epsilon: float,
     rest_after: int,
     crispness: float,
+    alpha_rate: float,
     texels: wp.array(dtype=texel_block),  # type: ignore[valid-type]
     gradient: wp.array(dtype=texel_block),  # type: ignore[valid-type]
     first_moment: wp.array(dtype=texel_block),  # type: ignore[valid-type]
@@ -69,7 +70,8 @@ def _update_blocks(
             first_moment[i] = m
             second_moment[i] = v
             for c in range(wp.static(4 * BLOCK)):
-                p[c] = wp.clamp(p[c] - rate * m[c] / (wp.sqrt(v[c]) * correction + epsilon), 0.0, 1.0)
+                of_channel = wp.where((c & 3) == 3, rate * alpha_rate, rate)
+                p[c] = wp.clamp(p[c] - of_channel * m[c] / (wp.sqrt(v[c]) * correction + epsilon), 0.0, 1.0)
             texels[i] = p
             opaque = p[3] + p[7] + p[11] + p[15]
             occupied[i] = wp.where(opaque > 0.0, wp.uint8(1), wp.uint8(0))
@@ -120,10 +122,11 @@ class AdamState:
         kept = {name: tensor.to(self.texels.device) for name, tensor in tensors.items()}
         return replace(AdamState.start(kept["texels"]), **kept)
 
-    def update(self, step: int, rate: float, betas: tuple[float, float], crispness: float = 0.0) -> None:
+    def update(self, step: int, rate: float, betas: tuple[float, float], crispness: float = 0.0, alpha_rate: float = 1.0) -> None:
         """Take step number ``step``, from 1, at the given rate, the moments decaying by ``betas`` a step; keep the texels in [0, 1].
 
-        ``crispness`` times the derivative of alpha (1 - alpha) is added to the gradient of every alpha that is not 0.
+        ``crispness`` times the derivative of alpha (1 - alpha) is added to the gradient of every alpha that is not 0. Alpha moves by
+        ``alpha_rate`` times the step.
 
         The same as ``torch.optim.Adam`` followed by ``clamp_`` up to rounding and :func:`rest_after`.
         """
@@ -139,6 +142,7 @@ class AdamState:
             EPSILON,
             rest_after(beta1),
             crispness,
+            alpha_rate,
             *(
                 wp.from_torch(tensor.view(-1, 4 * BLOCK), dtype=texel_block)
                 for tensor in (self.texels, self.gradient, self.first_moment, self.second_moment)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from bbfit.checks import check_choice, check_count, check_range, fail
+from bbfit.geometry.alpha import AlphaKind, check_cutoff
 from bbfit.rendering.config import Backend
 
 Preset = Literal["default", "thesis"]
@@ -18,15 +19,13 @@ Schedule = Literal["cosine", "growth"]
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "default": {
+        "alpha": "mask",
         "billboards": 8,
         "placement": "clusters",
         "placement_rate": 0.015,
-        "texel_density": 1.25,
         "bounds": "silhouette",
         "loss": "backgrounds",
         "ssim_weight": 0.01,
-        "sharpness_weight": 14.0,
-        "crispness_weight": 0.004,
         "levels": 4,
         "steps": 1200,
         "views_per_step": 2,
@@ -37,6 +36,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
     },
     # Thesis, section 4.4 and 5.
     "thesis": {
+        "alpha": "blend",
         "billboards": 4,
         "placement": "even",
         "placement_rate": 0.0,
@@ -56,6 +56,14 @@ _PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
+# What the default preset takes by the alpha mode: what is cut off has no half-transparent texels to smooth it, and drawing by chance is
+# the noisier the more there are.
+_BY_ALPHA: dict[str, dict[str, Any]] = {
+    "mask": {"texel_density": 0.85, "sharpness_weight": 24.0, "crispness_weight": 0.015},
+    "blend": {"texel_density": 1.25, "sharpness_weight": 14.0, "crispness_weight": 0.004},
+    "hash": {"texel_density": 1.25, "sharpness_weight": 14.0, "crispness_weight": 0.03},
+}
+
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -63,6 +71,11 @@ class FitConfig:
 
     preset: Preset = "default"
     """thesis repeats the thesis's schedule: 10,000 steps of one random view, Adam at 0.01 growing by a tenth, no bounds, L2."""
+    alpha: AlphaKind | None = None
+    """What the textures are fitted for: to be cut off where alpha is less than the cutoff (mask), blended (blend), or drawn by chance with
+    alpha as the probability (hash). Preset: mask; thesis: blend."""
+    alpha_cutoff: float = 0.5
+    """Least alpha that shows with mask, in (0, 1)."""
     billboards: int | None = None
     """Number N of billboards. Preset: 8; thesis: 4."""
     placement: Placement | None = None
@@ -86,7 +99,8 @@ class FitConfig:
     """Evenly placed rectangles that cover the viewport (viewport), the silhouette in the facing view (thesis) or the silhouettes in all
     training views (silhouette); clustered ones are bounded by what they carry. Preset: silhouette; thesis: viewport."""
     texel_density: float | None = None
-    """Texels per pixel, both ways, where the tree's axis is seen face on. Preset: 1.25; thesis: 1."""
+    """Texels per pixel, both ways, where the tree's axis is seen face on. Preset: 0.85 (mask) or 1.25;
+    thesis: 1."""
     loss: Loss | None = None
     """Absolute (l1) or squared (l2) difference of premultiplied RGBA, summed over channels and averaged over pixels, or the squared
     difference over random backgrounds in expectation (backgrounds). Preset: backgrounds; thesis: l2."""
@@ -95,10 +109,11 @@ class FitConfig:
     ssim_weight: float | None = None
     """Weight of 1 - SSIM beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: float | None = None
-    """Weight, at full resolution, of the squared difference in mean contrast of neighbouring pixels. Preset: 14; thesis: 0."""
+    """Weight, at full resolution, of the squared difference in mean contrast of neighbouring pixels. Preset: 24 (mask)
+    or 14; thesis: 0."""
     crispness_weight: float | None = None
     """Weight, at full resolution, of alpha * (1 - alpha), summed over texels and divided by a view's pixels, which makes leaves opaque and
-    the air between them clear. Preset: 0.004; thesis: 0."""
+    the air between them clear. Preset: 0.015 (mask), 0.004 (blend) or 0.03 (hash); thesis: 0."""
     levels: int | None = None
     """Resolutions of views and textures, coarse to fine, sides doubling from each to the next; the steps are shared out evenly.
     Preset: 4; thesis: 1."""
@@ -125,6 +140,8 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         check_choice("preset", self.preset, ("default", "thesis"))
+        check_choice("alpha", self.alpha, (None, *get_args(AlphaKind)))
+        check_cutoff("alpha_cutoff", self.alpha_cutoff)
         if self.billboards is not None:
             check_count("billboards", self.billboards)
         check_choice("placement", self.placement, (None, "even", "clusters"))
@@ -178,6 +195,7 @@ class FitConfig:
             if the values do not go together.
         """
         preset = _PRESETS[self.preset]
+        preset = _BY_ALPHA[self.alpha or preset["alpha"]] | preset
         missing = {name: value for name, value in preset.items() if getattr(self, name) is None}
         resolved = replace(self, **missing)
         textures = (resolved.billboards or 0) * (1 if resolved.sides == "one" else 2)

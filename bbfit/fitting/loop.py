@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -19,18 +19,22 @@ from bbfit.checks import InputTypeError, check_file, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
 from bbfit.fitting.config import FitConfig
+from bbfit.fitting.coverage import matched_coverage
 from bbfit.fitting.initialize import bounded, pixels_a_metre, random_textures, sized, start_cloud, tree_radius
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.points import hull_points, mesh_points
 from bbfit.fitting.search import find_placement
-from bbfit.fitting.steps import Stepper, make_stepper
+from bbfit.fitting.steps import BLEND, HARDEST, Stepper, make_stepper
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
-from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.images import bleed_colour
 from bbfit.views import ViewDataset
 
 _START, _FOUND = "start.", "found."
+# Share of the steps at full resolution in which a mask hardens.
+_HARDENING = 0.3
 
 
 @dataclass(frozen=True)
@@ -120,7 +124,7 @@ def fit(
     if config.placement == "even":
         tree = None  # it has no say
     mesh = None if tree is None else sha256(check_file("tree", tree).read_bytes()).hexdigest()
-    mark = sha256(json.dumps([5, asdict(config), views.train.fingerprint, mesh], sort_keys=True).encode()).hexdigest()
+    mark = sha256(json.dumps([6, asdict(config), views.train.fingerprint, mesh], sort_keys=True).encode()).hexdigest()
     checkpoint = Path(checkpoint) if checkpoint is not None else None
     done = _load(checkpoint, mark) if checkpoint is not None else None
     if done is None:
@@ -148,7 +152,7 @@ def fit(
             rate = learning_rate(config, index)
             placement_rate = (config.placement_rate or 0.0) * rate / config.learning_rate
             chosen = draw_views(config, len(views.train), index, level.halvings)
-            losses.append(float(stepper.step(chosen, rate, placement_rate)))
+            losses.append(float(stepper.step(chosen, rate, placement_rate, drawn_as(config, level, index))))
             if on_step is not None:
                 on_step(Step(index + 1, config.steps, losses[-1], rate, partial(_cloud_of, stepper)))
             if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
@@ -157,7 +161,10 @@ def fit(
         del stepper
         if movement is not None:
             start = bounded(fitted, opaque_bounds(fitted), density, config.max_texels).to(torch.float32)
-    assert fitted is not None
+    assert fitted is not None and config.alpha is not None
+    fitted = replace(fitted, alpha=AlphaMode(config.alpha, config.alpha_cutoff))
+    if config.alpha == "mask":
+        fitted = matched_coverage(fitted, views.train, config.backend)
     # No view determines the colour of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
     bled = [bleed_colour(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
@@ -204,6 +211,20 @@ def levels_of(config: FitConfig, cameras: Camera) -> list[Level]:
     return [Level(*level) for level in zip(halvings, edges, edges[1:], strict=False)]
 
 
+def drawn_as(config: FitConfig, level: Level, index: int) -> AlphaMode:
+    """How step ``index`` (from 0) of a resolved configuration draws: as blend, but for a mask at full resolution.
+
+    There the ramp about the cutoff hardens over the first third of the level's steps, and then is a step. At lower resolutions what is cut
+    off at full resolution looks like a blend. A hash looks like one on average.
+    """
+    if config.alpha != "mask" or level.halvings:
+        return BLEND
+    share = (index - level.begin) / (_HARDENING * (level.end - level.begin))
+    first = max(2.0, 0.5 / min(config.alpha_cutoff, 1 - config.alpha_cutoff))
+    hardness = first * (max(first, HARDEST) / first) ** share if share < 1 else math.inf
+    return AlphaMode("mask", config.alpha_cutoff, hardness)
+
+
 def learning_rate(config: FitConfig, index: int) -> float:
     """Adam's rate in step ``index`` (from 0) of a resolved configuration.
 
@@ -243,9 +264,9 @@ def _save(path: Path, mark: str, progress: _Progress) -> None:
     tensors = {name: tensor.detach().cpu() for name, tensor in progress.tensors.items()}
     tensors["losses"] = torch.tensor(progress.losses, dtype=torch.float64)
     for prefix, cloud in {_START: progress.start, _FOUND: progress.found}.items():
-        for field in fields(cloud) if cloud is not None else ():
-            if prefix == _FOUND or field.name != "texels":
-                tensors[prefix + field.name] = getattr(cloud, field.name).clone()  # no two may share memory
+        for name in TENSORS if cloud is not None else ():
+            if prefix == _FOUND or name != "texels":
+                tensors[prefix + name] = getattr(cloud, name).clone()  # no two may share memory
     write_tensors(path, tensors, {"fit": mark, "seconds": repr(progress.seconds)})
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
@@ -13,13 +14,25 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.losses import blending, image_loss
 from bbfit.fitting.movement import Movement
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.reference import render_reference
+
+HARDEST = 16.0
+"""Slope of a mask's ramp from which on it may as well be a step."""
 
 if TYPE_CHECKING:
     from bbfit.fitting.adam import AdamState
     from bbfit.rendering.fused import PixelLoss
     from bbfit.rendering.projection import Projection
+
+
+BLEND = AlphaMode()
+
+
+def alpha_rate(alpha: AlphaMode) -> float:
+    """By how much alpha moves less than colour in a step: the harder the ramp, the more a change of alpha shows."""
+    return 1.0 if alpha.kind == "blend" else min(alpha.hardness, HARDEST) ** -0.5
 
 
 class Stepper(Protocol):
@@ -36,8 +49,8 @@ class Stepper(Protocol):
     def finish(self) -> BillboardCloud:
         """The same as :attr:`cloud` without a copy; no step may follow."""
 
-    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0) -> Tensor:
-        """Take the next step on the chosen views; return the loss before the update, a scalar."""
+    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
+        """Take the next step on the chosen views, drawn in an alpha mode; return the loss before the update, a scalar."""
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that changes from step to step."""
@@ -101,14 +114,14 @@ class ReferenceStepper:
         texels = self.texels.detach().cpu()
         return self._movement.now(texels) if self._movement else self._cloud.to("cpu").with_texels(texels)
 
-    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0) -> Tensor:
+    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
         """See :class:`Stepper`."""
         device = self.texels.device
         self._adam.param_groups[0]["lr"] = rate
-        cloud, moved = self._cloud.with_texels(self.texels), None
+        cloud, moved = replace(self._cloud, texels=self.texels, alpha=alpha), None
         if self._movement:
             moved = self._movement.parameters.clone().requires_grad_(bool(placement_rate))
-            cloud = self._movement.placed(moved, self.texels).to(torch.float32).to(device)
+            cloud = replace(self._movement.placed(moved, self.texels).to(torch.float32).to(device), alpha=alpha)
         config, cameras = self._config, self._targets.cameras[list(chosen)].to(device)
         assert config.loss is not None
         target, loss = self._targets.pictures(chosen).to(device), torch.zeros((), device=device)
@@ -117,8 +130,10 @@ class ReferenceStepper:
             loss = loss + image_loss(image, target, config.loss, config.ssim_weight or 0.0, config.sharpness_weight or 0.0)
         self._adam.zero_grad()
         (loss + (config.crispness_weight or 0.0) * blending(self.texels) / (target.shape[1] * target.shape[2])).backward()
+        before = self.texels.detach()[:, 3].clone()
         self._adam.step()
         with torch.no_grad():
+            self.texels[:, 3].sub_(before).mul_(alpha_rate(alpha)).add_(before)
             self.texels.clamp_(0, 1)
         if moved is not None and moved.grad is not None:
             assert self._movement is not None
@@ -174,7 +189,7 @@ class FusedStepper:
         if self._movement:
             self._movement.restore(tensors)
 
-    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0) -> Tensor:
+    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
         """See :class:`Stepper`."""
         from bbfit.rendering.fused import PixelLoss, differentiate
 
@@ -186,7 +201,7 @@ class FusedStepper:
         else:
             assert self._standing is not None
             projection = self._standing.take(torch.tensor(chosen, device=device))
-        projection, groups = projection.grouped(self._groups), self._groups
+        projection, groups = replace(projection, alpha=alpha).grouped(self._groups), self._groups
         pixels = len(chosen) * projection.width * projection.height
         assert config.loss is not None
         target = self._targets.packed(chosen).to(device)
@@ -211,9 +226,8 @@ class FusedStepper:
             movement.update(movement.pull_back(placement, self._projector.pull_back(of_matrices).cpu()), placement_rate)
         self.steps += 1
         assert config.beta1 is not None and config.beta2 is not None
-        state.update(
-            self.steps, rate, (config.beta1, config.beta2), (config.crispness_weight or 0.0) / (projection.width * projection.height)
-        )
+        crispness = (config.crispness_weight or 0.0) / (projection.width * projection.height)
+        state.update(self.steps, rate, (config.beta1, config.beta2), crispness, alpha_rate(alpha))
         return sums.sum() / pixels + lost
 
     def _perceived(self, projection: Projection, loss: PixelLoss) -> tuple[Tensor | float, Tensor | None]:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from bbfit.checks import InputError, check_choice, check_count, check_file, check_shape, fail
+from bbfit.geometry.alpha import AlphaMode
 
 FORMAT = "bbfit billboard cloud 1"
-_TENSORS = ("centers", "rights", "ups", "half_extents", "texture_sizes", "two_sided", "texels")
+TENSORS = ("centers", "rights", "ups", "half_extents", "texture_sizes", "two_sided", "texels")
+"""Names of a cloud's tensors."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ class BillboardCloud:
     """Whether there is a separate back texture, bool [N]."""
     texels: Tensor
     """Straight-alpha display-referred RGBA in [0, 1], [P, 4]: per billboard its front texture row by row, then its back texture if any."""
+    alpha: AlphaMode = field(default_factory=AlphaMode)
+    """How alpha is to be understood, in renders, scores and exports alike."""
 
     def __post_init__(self) -> None:
         check_shape("centers", tuple(self.centers.shape), (None, 3))
@@ -82,11 +87,11 @@ class BillboardCloud:
 
     def to(self, target: torch.device | torch.dtype | str) -> BillboardCloud:
         """Move to a device, or convert the floating-point tensors to a dtype."""
-        moved = {name: getattr(self, name) for name in _TENSORS}
+        moved = {name: getattr(self, name) for name in TENSORS}
         for name, tensor in moved.items():
             if not isinstance(target, torch.dtype) or tensor.is_floating_point():
                 moved[name] = tensor.to(target)
-        return BillboardCloud(**moved)
+        return replace(self, **moved)
 
     def with_texels(self, texels: Tensor) -> BillboardCloud:
         """The same rectangles with other texels, [P, 4]."""
@@ -100,8 +105,8 @@ class BillboardCloud:
         """Some of the billboards, in the given order."""
         kept, textures = list(kept), self.textures()
         texels = [textures[n].reshape(-1, 4) for n in kept]
-        others = {name: getattr(self, name)[kept] for name in _TENSORS if name != "texels"}
-        return BillboardCloud(**others, texels=torch.cat(texels) if texels else self.texels[:0])
+        others = {name: getattr(self, name)[kept] for name in TENSORS if name != "texels"}
+        return replace(self, **others, texels=torch.cat(texels) if texels else self.texels[:0])
 
     def parts(self, count: int) -> list[BillboardCloud]:
         """The billboards in ``count`` clouds of equal numbers."""
@@ -110,15 +115,16 @@ class BillboardCloud:
 
     @staticmethod
     def joined(clouds: Sequence[BillboardCloud]) -> BillboardCloud:
-        """The billboards of several clouds in one."""
-        return BillboardCloud(**{name: torch.cat([getattr(cloud, name) for cloud in clouds]) for name in _TENSORS})
+        """The billboards of several clouds in one, with the alpha mode of the first."""
+        tensors = {name: torch.cat([getattr(cloud, name) for cloud in clouds]) for name in TENSORS}
+        return BillboardCloud(**tensors, alpha=clouds[0].alpha)
 
     def save(self, path: str | Path) -> None:
         """Write one ``.safetensors`` file, completely or not at all."""
         from bbfit.files import write_tensors
 
-        tensors = {name: getattr(self, name).detach().cpu().clone(memory_format=torch.contiguous_format) for name in _TENSORS}
-        write_tensors(path, tensors, {"format": FORMAT})
+        tensors = {name: getattr(self, name).detach().cpu().clone(memory_format=torch.contiguous_format) for name in TENSORS}
+        write_tensors(path, tensors, {"format": FORMAT, "alpha": json.dumps({"kind": self.alpha.kind, "cutoff": self.alpha.cutoff})})
 
     @staticmethod
     def load(path: str | Path) -> BillboardCloud:
@@ -134,14 +140,15 @@ class BillboardCloud:
         path = check_file("cloud", path)
         try:
             with safe_open(path, framework="pt") as file:
-                known = (file.metadata() or {}).get("format") == FORMAT
-                tensors = {name: file.get_tensor(name) for name in _TENSORS} if known else {}
+                metadata = file.metadata() or {}
+                known = metadata.get("format") == FORMAT
+                tensors = {name: file.get_tensor(name) for name in TENSORS} if known else {}
             if tensors:
                 for name, tensor in tensors.items():
                     if not tensor.isfinite().all():
                         fail(name, "expected finite values")
-                return BillboardCloud(**tensors)
-        except (SafetensorError, InputError) as error:
+                return BillboardCloud(**tensors, alpha=AlphaMode(**json.loads(metadata.get("alpha", "{}"))))
+        except (SafetensorError, InputError, TypeError, json.JSONDecodeError) as error:
             fail("cloud", f"{path} is damaged ({error})", "expected a file written by bbfit fit")
         fail("cloud", f"{path} is not a billboard cloud", "expected a file written by bbfit fit")
 

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
+from bbfit.geometry.alpha import AlphaMode
+
+STEEPEST = 4.0
+"""Slope that a mask's gradient has at most, within 1 / (2 * slope) of the cutoff, and nowhere else: a test has no gradient of its own."""
+HASH = (0x8DA6B343, 0xD8163841, 0xCB1AB31F, 0x7FEB352D, 0x846CA68B)
+"""Factors of :func:`thresholds`: of a pixel's column and row and of a texture, and of the two rounds of mixing."""
 TIE = 1e-5
 """Relative difference of depths below which two layers count as equally deep. It is far above rounding and far below what shows: which
 of two planes is in front where they cross exactly at a pixel's centre must not depend on rounding."""
@@ -37,3 +45,32 @@ def composite(colours: list[Tensor], alphas: list[Tensor], depths: list[Tensor])
     for n in range(1, len(colours)):
         colour = torch.addcmul(colour, colours[n], weights[n])
     return torch.cat([colour, sum(weights[1:], weights[0])], 1)
+
+
+def opacity(alpha: Tensor, mode: AlphaMode) -> Tensor:
+    """How opaque samples are whose filtered alpha is given, in the modes blend and mask; same shape.
+
+    A mask is a ramp about its cutoff, in the limit a step. Where the ramp is steeper than :data:`STEEPEST`, the derivative is taken to be
+    that of a ramp of this slope (a straight-through estimator; Bengio et al. 2013, section 4).
+    """
+    if mode.kind == "blend":
+        return alpha
+    steepness = min(mode.hardness, STEEPEST)
+    ramp = (0.5 + (alpha - mode.cutoff) * steepness).clamp(0, 1)
+    if mode.hardness == steepness:
+        return ramp
+    hard = (alpha >= mode.cutoff).to(alpha) if math.isinf(mode.hardness) else (0.5 + (alpha - mode.cutoff) * mode.hardness).clamp(0, 1)
+    return ramp + (hard - ramp).detach()
+
+
+def thresholds(x: Tensor, y: Tensor, texture: int) -> Tensor:
+    """What alpha is compared with in the mode hash: numbers in (0, 1) that look random, one for each pixel and first texel of a texture.
+
+    An integer hash of 32 bits (lowbias32, C. Wellons, "Prospecting for Hash Functions", 2018). ``x`` and ``y`` are int64 and broadcast.
+    """
+    bits, (of_x, of_y, of_texture, first_round, second_round) = 0xFFFFFFFF, HASH
+    mixed = (x * of_x & bits) ^ (y * of_y & bits) ^ (texture * of_texture & bits)
+    mixed = ((mixed ^ mixed >> 16) * first_round) & bits
+    mixed = ((mixed ^ mixed >> 15) * second_round) & bits
+    mixed = mixed ^ mixed >> 16
+    return ((mixed >> 9).to(torch.float32) + 0.5) / (1 << 23)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,8 +11,10 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.rendering.compositing import STEEPEST
 from bbfit.rendering.kernels import NORMS, Plane, kernels, unpack
 from bbfit.rendering.launching import in_parallel, pieces_of
 from bbfit.rendering.projection import Projection, project
@@ -28,15 +31,18 @@ LANES = 16
 def render_fused(cloud: BillboardCloud, camera: Camera) -> Tensor:
     """Draw a billboard cloud as :func:`bbfit.rendering.reference.render_reference` does, in float32.
 
-    Differentiable in the texels and in the placement. On a CPU equal inputs give equal bytes, whatever the number of threads; on CUDA
-    the gradients are summed in no fixed order.
+    Differentiable in the texels and in the placement, save in the mode hash. On a CPU equal inputs give equal bytes, whatever the number
+    of threads; on CUDA the gradients are summed in no fixed order.
 
     Returns
     -------
     Premultiplied RGBA, float32 [V, H, W, 4] ([H, W, 4] for a single camera).
     """
-    projection = project(cloud, camera)
-    image = _Drawing.apply(cloud.texels.to(torch.float32), projection.to_texel, projection)
+    projection, texels = project(cloud, camera), cloud.texels.to(torch.float32)
+    if cloud.alpha.kind == "hash":
+        image = draw(texels.detach().contiguous(), projection)
+    else:
+        image = _Drawing.apply(texels, projection.to_texel, projection)
     return image if camera.batched else image[0]
 
 
@@ -96,7 +102,7 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None,
     run, device = _run(projection, texels.device), wp.device_from_torch(texels.device)
     kernel, packed = kernels(_capacity(projection.count), _lanes(texels.device)).draw, _packed_planes(projection)
     kernel.module.load(device)  # or every thread would compile it
-    arguments = [run, width, int(projection.orthographic), projection.count, _planes(packed)]
+    arguments = [run, width, int(projection.orthographic), projection.count, _test(projection.alpha), _planes(packed)]
     arguments += [_array(texels, wp.vec4), _array(occupied, wp.uint8)]
     outputs = [_array(image, wp.vec4)]
 
@@ -160,6 +166,7 @@ def differentiate(
             width,
             int(projection.orthographic),
             count,
+            _test(projection.alpha),
             _planes(packed),
             _array(texels, wp.vec4),
             _array(occupied, wp.uint8),
@@ -205,6 +212,13 @@ def _schedule(projection: Projection, device: torch.device) -> list[list[tuple[i
         else:
             phases.append([(view, 1, 0, height)])
     return phases
+
+
+def _test(mode: AlphaMode) -> Any:
+    """An alpha mode for a kernel: the cutoff (0: blend, -1: hash), the hardness (0: a step) and the slope of its gradient."""
+    if mode.kind != "mask":
+        return wp.vec3(0.0 if mode.kind == "blend" else -1.0, 0.0, 0.0)
+    return wp.vec3(mode.cutoff, 0.0 if math.isinf(mode.hardness) else mode.hardness, min(mode.hardness, STEEPEST))
 
 
 def _capacity(count: int) -> int:

@@ -19,7 +19,20 @@ import warp as wp
 
 from bbfit.rendering.compositing import TIE as TIE_VALUE
 from bbfit.rendering.launching import FLAGS
-from bbfit.rendering.sampling import empty, fetch, next_row, prefetch, premultiplied, reaches, scatter, sign, slope
+from bbfit.rendering.sampling import (
+    empty,
+    fetch,
+    next_row,
+    opacity,
+    opacity_slope,
+    prefetch,
+    premultiplied,
+    reaches,
+    scatter,
+    sign,
+    slope,
+    threshold,
+)
 
 TIE = wp.constant(TIE_VALUE)
 MISS = wp.constant(-2)
@@ -114,6 +127,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
         width: int,
         orthographic: int,
         count: int,
+        test: wp.vec3,
         planes: wp.array(dtype=Plane),
         texels: wp.array(dtype=wp.vec4),
         occupied: wp.array(dtype=wp.uint8),
@@ -177,7 +191,10 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                         layer = order[i]
                         texture = wp.vec3i(firsts[layer], heights[layer], widths[layer])
                         s = fetch(texels, texture, left[layer, c], top[layer, c], fx[layer, c], fy[layer, c])
-                        weight = through * s[3]
+                        alpha = opacity(s[3], test)
+                        if test[0] < 0.0:
+                            alpha = wp.where(s[3] >= threshold(column + c, row, firsts[layer]), 1.0, 0.0)
+                        weight = through * alpha
                         through -= weight
                         colour += wp.vec4(s[0] * weight, s[1] * weight, s[2] * weight, weight)
                     i += 1
@@ -192,6 +209,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
         width: int,
         orthographic: int,
         count: int,
+        test: wp.vec3,
         planes: wp.array(dtype=Plane),
         texels: wp.array(dtype=wp.vec4),
         occupied: wp.array(dtype=wp.uint8),
@@ -227,6 +245,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
         greens = floats()
         blues = floats()
         alphas = floats()
+        slopes = floats()
         values = floats()
         total = float(0.0)
         given_target = target.shape[0] != 0
@@ -290,13 +309,15 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                         layer = order[i]
                         texture = wp.vec3i(firsts[layer], heights[layer], widths[layer])
                         s = fetch(texels, texture, left[layer, c], top[layer, c], fx[layer, c], fy[layer, c])
-                        opacity = through * s[3]
-                        through -= opacity
-                        colour += wp.vec4(s[0] * opacity, s[1] * opacity, s[2] * opacity, opacity)
+                        alpha = opacity(s[3], test)
+                        slopes[i] = opacity_slope(s[3], test)
+                        share = through * alpha
+                        through -= share
+                        colour += wp.vec4(s[0] * share, s[1] * share, s[2] * share, share)
                         reds[i] = s[0]
                         greens[i] = s[1]
                         blues[i] = s[2]
-                        alphas[i] = s[3]
+                        alphas[i] = alpha
                         i += 1
                     if given_target:
                         d = colour - premultiplied(packed, straight)
@@ -323,8 +344,8 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                         while f < hit:
                             if reaching > 0.0:
                                 own = order[f]
-                                share = reaching * alphas[f]
-                                of_sample = wp.vec4(g[0] * share, g[1] * share, g[2] * share, reaching * values[f])
+                                part = reaching * alphas[f]
+                                of_sample = wp.vec4(g[0] * part, g[1] * part, g[2] * part, reaching * values[f] * slopes[f])
                                 whose = wp.vec3i(firsts[own], heights[own], widths[own])
                                 scatter(texel_gradient, whose, left[own, c], top[own, c], fx[own, c], fy[own, c], of_sample)
                                 if wanted_placement:
@@ -340,7 +361,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                                     wp.atomic_add(matrix_gradient, view, row, ids[own], 0, pixel * wp.float64(of_u))
                                     wp.atomic_add(matrix_gradient, view, row, ids[own], 1, pixel * wp.float64(of_v))
                                     wp.atomic_add(matrix_gradient, view, row, ids[own], 2, pixel * wp.float64(of_w))
-                                reaching -= share
+                                reaching -= part
                             f += 1
                 c += 1
         if target.shape[0] != 0:

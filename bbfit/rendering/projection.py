@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.homography import pixel_depth, signed_distance, texel_to_pixel
@@ -38,6 +39,8 @@ class Projection:
     """Height of the picture in pixels."""
     orthographic: bool
     """Whether the views are parallel projections."""
+    alpha: AlphaMode = field(default_factory=AlphaMode)
+    """What alpha means."""
     groups: int = 1
     """So many equal parts of the views, one after the other, see different texels each."""
 
@@ -89,6 +92,7 @@ def project(cloud: BillboardCloud, camera: Camera) -> Projection:
         width,
         height,
         cameras.orthographic,
+        cloud.alpha,
     )
 
 

@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.homography import pixel_depth, signed_distance, texel_to_pixel
-from bbfit.rendering.compositing import composite
+from bbfit.rendering.compositing import composite, opacity, thresholds
 
 # A plane is edge-on, and so not drawn, when the camera is nearer to it than this share of its distance to the billboard's centre.
 EDGE_ON = 1e-5
@@ -25,7 +25,8 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
     """Draw a billboard cloud.
 
     Each texture is filtered bilinearly with straight alpha, as engines do, then premultiplied; a margin of one transparent texel in the
-    colour of its neighbour surrounds it. Pixels whose ray meets the plane behind the camera, or a plane seen edge-on, show nothing.
+    colour of its neighbour surrounds it. Filtered alpha becomes opacity as ``cloud.alpha`` says (without a gradient in the mode hash).
+    Pixels whose ray meets the plane behind the camera, or a plane seen edge-on, show nothing.
 
     Returns
     -------
@@ -52,7 +53,11 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
     else:
         warped = [_warp(source, matrix, height, width) for source, matrix in zip(sources, matrices, strict=True)]
     colours, alphas = zip(*(layer.split((3, 1), 1) for layer in warped), strict=True)
-    shown = [alpha * mask for alpha, mask in zip(alphas, drawn, strict=True)]
+    if cloud.alpha.kind == "hash":
+        opaque = _hashed(cloud, list(alphas), signed_distance(cloud, cameras) >= 0)
+    else:
+        opaque = [opacity(alpha, cloud.alpha) for alpha in alphas]
+    shown = [alpha * mask for alpha, mask in zip(opaque, drawn, strict=True)]
     image = composite(list(colours), shown, list(depth)).permute(0, 2, 3, 1)
     return image if camera.batched else image[0]
 
@@ -97,6 +102,19 @@ def _facing_textures(cloud: BillboardCloud, front: Tensor) -> list[Tensor]:
         padded = padded * margin
         sources.append(padded.expand(len(front), -1, -1, -1) if len(texture) == 1 else padded[(~front[:, n]).long()])
     return sources
+
+
+def _hashed(cloud: BillboardCloud, alphas: list[Tensor], front: Tensor) -> list[Tensor]:
+    """Layers [V, 1, H, W] that are opaque or not by chance; ``front`` [V, N] tells the side that a view sees."""
+    height, width = alphas[0].shape[2:]
+    y, x = torch.meshgrid(*(torch.arange(side, device=front.device) for side in (height, width)), indexing="ij")
+    first, opaque = 0, []
+    for n, ((h, w), two) in enumerate(zip(cloud.texture_sizes.tolist(), cloud.two_sided.tolist(), strict=True)):
+        sides = torch.stack([thresholds(x, y, first), thresholds(x, y, first + two * h * w)])
+        chosen = sides[(~front[:, n]).long()][:, None]  # [V, 1, H, W]
+        opaque.append((alphas[n].detach() >= chosen).to(alphas[n]))
+        first += h * w * (1 + two)
+    return opaque
 
 
 def _plane_depth(cloud: BillboardCloud, cameras: Camera, visible: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,12 +4,14 @@
 
 import warp as wp
 
+from bbfit.rendering.compositing import HASH
 from bbfit.rendering.launching import FLAGS
 
 BLOCK = 4
 """Consecutive texels whose being empty is known by one byte, and that Adam takes together."""
 BLOCK_BITS = wp.constant(2)
 ROUNDING = wp.constant(5e-7)
+OF_X, OF_Y, OF_TEXTURE, FIRST_ROUND, SECOND_ROUND = (wp.constant(wp.uint32(factor)) for factor in HASH)
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
@@ -116,6 +118,34 @@ def fetch(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: in
         t = texel(texels, at[i])
         mixed += wp.vec4(t[0], t[1], t[2], t[3] * there[i]) * weight[i]
     return mixed
+
+
+@wp.func
+def opacity(alpha: float, test: wp.vec3) -> float:
+    """How opaque a sample is (:func:`bbfit.rendering.compositing.opacity`); ``test`` is of :mod:`bbfit.rendering.fused`."""
+    if test[0] == 0.0:
+        return alpha
+    if test[1] == 0.0:
+        return wp.where(alpha >= test[0], 1.0, 0.0)
+    return wp.clamp(0.5 + (alpha - test[0]) * test[1], 0.0, 1.0)
+
+
+@wp.func
+def opacity_slope(alpha: float, test: wp.vec3) -> float:
+    """What is taken for the derivative of :func:`opacity`."""
+    if test[0] == 0.0:
+        return 1.0
+    return wp.where(wp.abs(alpha - test[0]) * test[2] <= 0.5, test[2], 0.0)
+
+
+@wp.func
+def threshold(x: int, y: int, texture: int) -> float:
+    """The same as :func:`bbfit.rendering.compositing.thresholds`."""
+    mixed = (wp.uint32(x) * OF_X) ^ (wp.uint32(y) * OF_Y) ^ (wp.uint32(texture) * OF_TEXTURE)
+    mixed = (mixed ^ (mixed >> wp.uint32(16))) * FIRST_ROUND
+    mixed = (mixed ^ (mixed >> wp.uint32(15))) * SECOND_ROUND
+    mixed = mixed ^ (mixed >> wp.uint32(16))
+    return (float(mixed >> wp.uint32(9)) + 0.5) / 8388608.0
 
 
 @wp.func

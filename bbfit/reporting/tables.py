@@ -69,6 +69,8 @@ def report_table(report: Report, title: str = "Held-out views") -> Table:
     table.add_row("[bold]cost[/]", "", "[bold]model[/]", "[bold]original[/]", "[bold not dim]ratio[/]")
     for name, cost in (("vertices", report.vertices), ("file, bytes", report.bytes)):
         table.add_row(name, _DOWN, _count(cost.model), _count(cost.original), _percent(cost))
+    if report.overdraw is not None:
+        table.add_row("drawn in vain", _DOWN, f"{100 * report.overdraw:.3g} %", "", "")
     if report.seconds:
         table.caption = "seconds: " + "  ·  ".join(f"{stage} {seconds:,.1f}" for stage, seconds in report.seconds.items())
         table.caption_justify = "left"

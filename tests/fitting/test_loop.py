@@ -14,8 +14,10 @@ from bbfit.checks import InputError
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
 from bbfit.fitting.levels import LEAST_SIDE
-from bbfit.fitting.loop import FitResult, Step, draw_views, fit, learning_rate, levels_of
+from bbfit.fitting.loop import FitResult, Level, Step, draw_views, drawn_as, fit, learning_rate, levels_of
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import over_colour
 from bbfit.rendering.reference import render_reference
 from bbfit.views import ViewDataset, ViewSet
 
@@ -23,6 +25,12 @@ from bbfit.views import ViewDataset, ViewSet
 @pytest.fixture(scope="module")
 def views(views_folder: Path) -> ViewDataset:
     return ViewDataset.load(views_folder)
+
+
+@pytest.fixture(scope="module")
+def data_views() -> ViewDataset:
+    """Views of a small tree."""
+    return ViewDataset.load(Path(__file__).resolve().parents[2] / "data" / "views")
 
 
 def quick(**fields: object) -> FitConfig:
@@ -39,13 +47,20 @@ def psnr(cloud: BillboardCloud, views: ViewSet) -> float:
     return -10 * math.log10((render_reference(cloud, views.cameras) - targets).square().mean())
 
 
+def over_white(cloud: BillboardCloud, views: ViewSet) -> float:
+    pictures = (over_colour(render_reference(cloud, views.cameras)), over_colour(views.targets(range(len(views)))))
+    return -10 * math.log10((pictures[0] - pictures[1]).square().mean())
+
+
 def same(a: FitResult, b: FitResult) -> bool:
     return torch.equal(a.cloud.texels, b.cloud.texels) and a.losses == b.losses
 
 
 @pytest.mark.parametrize("loss", ["l1", "l2", "backgrounds"])
 def test_fit_explains_held_out_views_of_a_cloud_it_can_represent(views: ViewDataset, loss: str) -> None:
-    config = FitConfig(billboards=2, placement="even", placement_rate=0, loss=loss, sharpness_weight=0, crispness_weight=0, steps=150)
+    config = FitConfig(
+        alpha="blend", billboards=2, placement="even", placement_rate=0, loss=loss, sharpness_weight=0, crispness_weight=0, steps=150
+    )
     result = fit(views, config)
     # Measured 37.1 dB (l1) and 34.6 dB (l2) on one thread; an even grey scores 9 dB. The two grids of texels differ, so it is not exact.
     assert psnr(result.cloud, views.test) > 32
@@ -83,7 +98,7 @@ def test_one_thesis_step_is_one_adam_step(views: ViewDataset, backend: str) -> N
 
 
 @pytest.mark.parametrize(
-    "config", [FitConfig(billboards=2, placement="even", steps=24), FitConfig(preset="thesis", billboards=2, steps=24)]
+    "config", [FitConfig(alpha="blend", billboards=2, placement="even", steps=24), FitConfig(preset="thesis", billboards=2, steps=24)]
 )
 def test_the_fused_fit_is_the_reference_fit(views: ViewDataset, config: FitConfig) -> None:
     """After a few steps of either the pictures agree; Adam turns roundings of vanishing gradients into steps, so texels need not."""
@@ -222,3 +237,31 @@ def test_more_billboards_are_revised_more_often(billboards: int | None, revision
 def test_unknown_device_is_refused(views: ViewDataset) -> None:
     with pytest.raises(InputError, match="device"):
         fit(views, FitConfig(device="abacus"))
+
+
+@pytest.mark.parametrize("cutoff", [0.3, 0.5])
+def test_a_fit_for_mask_is_better_cut_off_than_one_for_blend(data_views: ViewDataset, cutoff: float) -> None:
+    """And covers as much of views that it was not fitted to as the tree does; it is drawn with the texels that 8 bits hold."""
+    config = FitConfig(billboards=4, placement="even", placement_rate=0, alpha_cutoff=cutoff)
+    masked, blended = (fit(data_views, dataclasses.replace(config, alpha=alpha)).cloud for alpha in ("mask", "blend"))
+    assert masked.alpha == AlphaMode("mask", cutoff) and blended.alpha == AlphaMode("blend", cutoff)
+    cut = dataclasses.replace(blended, alpha=masked.alpha)
+    test = data_views.test
+    gain = over_white(masked, test) - over_white(cut, test)
+    assert gain > 0.5  # measured: 0.86 and 0.82 dB
+    covered = render_reference(masked, test.cameras)[..., 3].mean() / test.targets(range(len(test)))[..., 3].mean()
+    assert abs(float(covered) - 1) < 0.04  # measured: 0.01 to 0.02
+    assert torch.equal((masked.texels * 255).round() / 255, masked.texels)
+
+
+def test_a_mask_hardens_at_full_resolution_only() -> None:
+    config = FitConfig(steps=80).resolve()
+    coarse, fine = Level(1, 40, 60), Level(0, 60, 80)
+    assert all(drawn_as(config, coarse, index) == AlphaMode() for index in range(40, 60))
+    modes = [drawn_as(config, fine, index) for index in range(60, 80)]
+    hardness = [mode.hardness for mode in modes]
+    assert hardness[0] == 2 and hardness == sorted(hardness) and math.isinf(hardness[6]) and math.isinf(hardness[-1])
+    assert all(mode.kind == "mask" and mode.cutoff == 0.5 for mode in modes)
+    assert drawn_as(FitConfig(alpha_cutoff=0.1).resolve(), Level(0, 0, 8), 0).hardness == 5
+    for alpha in ("blend", "hash"):
+        assert drawn_as(FitConfig(alpha=alpha).resolve(), fine, 79) == AlphaMode()

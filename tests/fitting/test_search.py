@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from itertools import accumulate
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from bbfit.fitting.levels import Targets
 from bbfit.fitting.losses import pixel_losses
 from bbfit.fitting.points import mesh_points
 from bbfit.fitting.search import SIDE, _Search, find_placement
-from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.rendering.reference import render_reference
 from bbfit.views import ViewDataset
 
@@ -44,7 +43,7 @@ def loss(cloud: BillboardCloud, views: ViewDataset) -> float:
 
 
 def same(a: BillboardCloud, b: BillboardCloud) -> bool:
-    return all(torch.equal(getattr(a, field.name), getattr(b, field.name)) for field in fields(BillboardCloud))
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in TENSORS)
 
 
 def test_it_finds_as_many_billboards_as_asked_near_the_tree(views: ViewDataset, points: torch.Tensor) -> None:

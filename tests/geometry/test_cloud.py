@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import save_file
 
 from bbfit.checks import InputError, MissingFileError
-from bbfit.geometry.cloud import FORMAT, BillboardCloud, even_upright
+from bbfit.geometry.cloud import FORMAT, TENSORS, BillboardCloud, even_upright
 
 
 def small_cloud(dtype: torch.dtype = torch.float32) -> BillboardCloud:
@@ -42,7 +42,7 @@ def test_counts() -> None:
 
 def test_dtype_conversion_leaves_whole_numbers_alone() -> None:
     cloud = small_cloud().to(torch.float64)
-    kinds = {field.name: getattr(cloud, field.name).dtype for field in fields(cloud)}
+    kinds = {name: getattr(cloud, name).dtype for name in TENSORS}
     assert kinds.pop("texture_sizes") == torch.int64 and kinds.pop("two_sided") == torch.bool
     assert set(kinds.values()) == {torch.float64}
 
@@ -58,9 +58,9 @@ def mixed_cloud(count: int, seed: int = 0, dtype: torch.dtype = torch.float32) -
 
 
 def assert_same(a: BillboardCloud, b: BillboardCloud) -> None:
-    for field in fields(BillboardCloud):
-        ours, theirs = getattr(a, field.name), getattr(b, field.name)
-        assert ours.dtype == theirs.dtype and torch.equal(ours, theirs), field.name
+    for name in TENSORS:
+        ours, theirs = getattr(a, name), getattr(b, name)
+        assert ours.dtype == theirs.dtype and torch.equal(ours, theirs), name
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -82,9 +82,9 @@ def test_taken_billboards_keep_all_that_is_theirs_in_the_given_order(kept: list[
     some = cloud.take(number for number in kept)
     assert len(some) == len(kept) and len(some.textures()) == len(kept)
     for ours, number in zip(range(len(kept)), kept, strict=True):
-        for field in fields(cloud):
-            if field.name != "texels":
-                assert torch.equal(getattr(some, field.name)[ours], getattr(cloud, field.name)[number]), field.name
+        for name in TENSORS:
+            if name != "texels":
+                assert torch.equal(getattr(some, name)[ours], getattr(cloud, name)[number]), name
         assert torch.equal(some.textures()[ours], cloud.textures()[number])
     assert_same(cloud, mixed_cloud(6))
 
@@ -182,8 +182,8 @@ def test_a_file_gives_back_the_same_bits(tmp_path: Path, dtype: torch.dtype) -> 
     cloud, path = small_cloud(dtype), tmp_path / "cloud.safetensors"
     replace(cloud, texels=cloud.texels.requires_grad_()).save(path)
     loaded = BillboardCloud.load(path)
-    for field in fields(cloud):
-        before, after = getattr(cloud, field.name).detach(), getattr(loaded, field.name)
+    for name in TENSORS:
+        before, after = getattr(cloud, name).detach(), getattr(loaded, name)
         assert before.dtype == after.dtype and torch.equal(before, after)
     assert [p.name for p in tmp_path.iterdir()] == ["cloud.safetensors"]
 
@@ -222,7 +222,7 @@ def test_a_failed_save_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.M
 
 
 def tensors_of(cloud: BillboardCloud) -> dict[str, torch.Tensor]:
-    return {field.name: getattr(cloud, field.name) for field in fields(cloud)}
+    return {name: getattr(cloud, name) for name in TENSORS}
 
 
 def test_unusable_files_are_refused_by_name(tmp_path: Path) -> None:

@@ -1,0 +1,263 @@
+"""Cards cut down to convex polygons around what they show, so that fewer transparent fragments are shaded."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bbfit.checks import check_count, check_range
+from bbfit.exporting.cards import Card, Cards
+
+# Texels that a polygon reaches beyond what shows: far more than float32 coordinates and graphics cards' snapping of vertices move it.
+_MARGIN = 1 / 64
+# What counts as more than no alpha. Bilinear filtering takes alpha from 1/255 to nothing and passes this within a texel's millionth of it.
+_ANY = 1e-9
+# Directions that sides are tried in: this many around the circle, and those of the hull's longest edges.
+_AROUND, _EDGES = 72, 56
+# Samples of a card that overdraw is measured by.
+_SAMPLES = 500_000
+
+
+def texel_corners(cards: Cards, card: Card) -> NDArray[np.float64]:
+    """A card's corners in texels of its texture, x to the right and y down, (0, 0) at the top-left texel's centre, [K, 2]."""
+    return card.uvs * np.array(cards.atlas.image.shape[1::-1]) - 0.5 - cards.atlas.corners[card.rectangle]
+
+
+def rimmed_alpha(cards: Cards, rectangle: int) -> NDArray[np.float64]:
+    """Alpha of a texture in [0, 1] with one transparent texel around it, [h + 2, w + 2]; its texel (0, 0) is at row 1, column 1."""
+    (x, y), (width, height) = cards.atlas.corners[rectangle].tolist(), cards.atlas.sizes[rectangle].tolist()
+    return np.pad(cards.atlas.image[y : y + height, x : x + width, 3] / 255.0, 1)
+
+
+def bilinear(rimmed: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Alpha at points in texels, [..., 2] -> [...], filtered bilinearly; 0 outside the rim's texel centres."""
+    height, width = rimmed.shape
+    x, y = points[..., 0] + 1, points[..., 1] + 1
+    outside = ~((x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1))  # also what is not a number
+    x, y = np.where(outside, 0, x), np.where(outside, 0, y)
+    left, top = np.minimum(x.astype(np.int64), width - 2), np.minimum(y.astype(np.int64), height - 2)
+    x, y = x - left, y - top
+    flat, start = rimmed.ravel(), top * width + left
+    upper = flat[start] * (1 - x) + flat[start + 1] * x
+    lower = flat[start + width] * (1 - x) + flat[start + width + 1] * x
+    return np.where(outside, 0.0, upper * (1 - y) + lower * y)
+
+
+def sides(polygon: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Unit normals n, [K, 2], and offsets d, [K], of a convex polygon's sides: inside is n . p <= d. Either winding will do."""
+    along = np.roll(polygon, -1, 0) - polygon
+    length = np.linalg.norm(along, axis=-1)
+    kept = length > 1e-12 * length.max()  # a doubled corner has no side
+    normals = np.stack([along[:, 1], -along[:, 0]], -1)[kept] / length[kept, None]
+    normals = normals if area(polygon) > 0 else -normals
+    return normals, (normals * polygon[kept]).sum(-1)
+
+
+def area(polygon: NDArray[np.float64]) -> float:
+    """Signed area, positive where x turns to y, [K, 2] ->."""
+    x, y = (polygon - polygon[0]).T
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+
+
+def shown_cells(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], least: float) -> NDArray[np.int64]:
+    """Squares between four texel centres that overlap a convex polygon and in which alpha reaches a value, row and column of each, [C, 2].
+
+    The square of row r and column c has its top-left corner at (c - 1, r - 1). Exact: by the separating axes of the square and the polygon.
+    """
+    reached = rimmed >= least
+    cells = np.argwhere(reached[:-1, :-1] | reached[1:, :-1] | reached[:-1, 1:] | reached[1:, 1:])
+    centres = cells[:, ::-1] - 0.5
+    normals, offsets = sides(polygon)
+    low, high = polygon.min(0) - 0.5 + 1e-9, polygon.max(0) + 0.5 - 1e-9
+    overlaps = ((centres > low) & (centres < high)).all(-1)
+    cells, centres = cells[overlaps], centres[overlaps]
+    nearest = centres @ normals.T - 0.5 * abs(normals).sum(-1)  # of the square's corners, the farthest inside
+    return cells[(nearest < offsets - 1e-9).all(-1)]
+
+
+def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
+    """Replace every card by a small convex polygon around what it shows.
+
+    The polygon holds every point of the card where the bilinearly filtered alpha reaches ``least``, lies inside the card and is never
+    larger. Its sides touch the convex hull of what shows. Of all such polygons whose sides have one of some 130 directions and whose
+    corners lie in the card, the smallest is found, not by leaving out edges one by one, but as a shortest cycle, as areas add up corner by
+    corner (after Aggarwal, Chang and Yap 1985, "Minimum area circumscribing polygons"). More vertices never give a larger polygon.
+
+    Mip levels reach farther than the texture itself: from afar up to half of one of their texels may be cut away.
+
+    Parameters
+    ----------
+    vertices : most corners of a polygon, at least 4. A card that came with no more is kept where nothing smaller is found.
+    least : in [0, 1], the cutoff of MASK, or 0 for whatever is not wholly transparent, as BLEND shows it.
+
+    Returns
+    -------
+    As many cards in the same order, with the same normals, winding, textures and origins. One that shows nothing shrinks to about
+    one texel around its middle.
+
+    Raises
+    ------
+    InputError
+        if ``vertices`` or ``least`` is out of range.
+    """
+    check_count("hull vertices", vertices, 4)
+    check_range("least alpha", least, 0, 1)
+    made = []
+    for card in cards.cards:
+        polygon = texel_corners(cards, card)
+        points = _shown_points(rimmed_alpha(cards, card.rectangle), polygon, max(least, _ANY))
+        hull = _hull_within(points, polygon) if len(points) else points
+        if len(hull) >= 3 and area(hull) > 0:
+            smaller = _enclosing(hull, polygon, vertices)
+        else:
+            shrunk = min(1.0, abs(area(polygon)) ** -0.5)
+            smaller = polygon.mean(0) + (polygon[:vertices] - polygon.mean(0)) * shrunk
+        if smaller is None or abs(area(smaller)) > (1 - 1e-9) * abs(area(polygon)):
+            made.append(card)
+        else:
+            made.append(with_texel_corners(cards, card, smaller if area(smaller) * area(polygon) > 0 else smaller[::-1]))
+    return cards.with_cards(made)
+
+
+def with_texel_corners(cards: Cards, card: Card, polygon: NDArray[np.float64]) -> Card:
+    """The same card with other corners, in texels, [K, 2], that wind like the old ones."""
+    at = texel_corners(cards, card)
+    middle, flat = card.corners.mean(0), at.mean(0)
+    to_world = np.linalg.lstsq(at - flat, card.corners - middle, rcond=None)[0]
+    uvs = (polygon + 0.5 + cards.atlas.corners[card.rectangle]) / np.array(cards.atlas.image.shape[1::-1])
+    return replace(card, corners=(polygon - flat) @ to_world + middle, uvs=uvs)
+
+
+def overdraw(cards: Cards, least: float) -> float:
+    """Share of the cards' area, counted in texels, in which nothing shows although it is shaded, in [0, 1].
+
+    Parameters
+    ----------
+    least : as in :func:`with_hulls`.
+
+    Raises
+    ------
+    InputError
+        if ``least`` is out of range.
+    """
+    check_range("least alpha", least, 0, 1)
+    shaded = shown = 0.0
+    for card in cards.cards:
+        polygon = texel_corners(cards, card)
+        low, size = polygon.min(0), np.ptp(polygon, axis=0)
+        counts = np.maximum(np.ceil(size * np.sqrt(_SAMPLES / len(cards.cards) / size.prod())).astype(int), 8)
+        x, y = (start + (np.arange(count) + 0.5) * extent / count for start, count, extent in zip(low, counts, size, strict=True))
+        points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+        normals, offsets = sides(polygon)
+        points = points[(points @ normals.T <= offsets).all(-1)]
+        reached = bilinear(rimmed_alpha(cards, card.rectangle), points) >= max(least, _ANY)
+        shaded += abs(area(polygon))
+        shown += abs(area(polygon)) * float(reached.mean()) if len(points) else 0.0
+    return 1 - shown / shaded
+
+
+def _shown_points(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], least: float) -> NDArray[np.float64]:
+    """Points in texels whose convex hull holds all of the polygon where alpha reaches ``least``, [N, 2]; none where it never does."""
+    cells = shown_cells(rimmed, polygon, least)
+    row, column = cells.T
+    # Around the square: corner, value there; where the value passes the limit on the way to the next corner, and its gradient there.
+    steps = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    values = np.stack([rimmed[row + y, column + x] for x, y in steps], -1)  # [C, 4]
+    top_left = cells[:, ::-1] - 1.0
+    corners = (top_left[:, None] + steps)[values >= least]
+    following = np.roll(values, -1, -1)
+    passes = (values >= least) != (following >= least)
+    share = np.where(passes, (values - least) / np.where(passes, values - following, 1.0), 0.0)
+    local = steps + share[..., None] * (np.roll(steps, -1, 0) - steps)  # [C, 4, 2]
+    found = [corners, (top_left[:, None] + local)[passes]]
+    # The border of what shows is a hyperbola, and may bulge outwards between two such points. The tangents there meet outside of it.
+    a, b, c, d = values.T[..., None]  # clockwise from the top left
+    x, y = local[..., 0], local[..., 1]
+    gradient = np.stack([(b - a) * (1 - y) + (c - d) * y, (d - a) * (1 - x) + (c - b) * x], -1)
+    for i in range(4):
+        for j in range(i + 1, 4):
+            both = passes[:, i] & passes[:, j]
+            first, second, at = gradient[both, i], gradient[both, j], local[both, i]
+            across = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+            offset = ((local[both, j] - at) * second).sum(-1)
+            safe = abs(across) > 1e-12
+            meet = at + np.stack([-first[:, 1], first[:, 0]], -1) * (offset / np.where(safe, across, 1.0))[:, None]
+            meet = np.where(safe[:, None], meet, at)
+            within = ((meet >= -1e-9) & (meet <= 1 + 1e-9)).all(-1)
+            found.append((top_left[both] + meet)[within])
+    return np.concatenate(found)
+
+
+def _hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The convex hull of the points, enlarged by the margin, as far as it lies in the convex polygon, counter-clockwise, [N, 2]."""
+    from scipy.spatial import ConvexHull
+
+    if np.linalg.eigvalsh(np.cov(points.T, bias=True))[0] > 1e-3:  # points on one line have no hull of their own
+        points = points[ConvexHull(points).vertices]
+    hull = (points[:, None] + _MARGIN * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])).reshape(-1, 2)
+    hull = hull[ConvexHull(hull).vertices]
+    for normal, offset in zip(*sides(polygon), strict=True):
+        hull = kept_half(hull, hull @ normal - offset)
+    return hull
+
+
+def kept_half(polygon: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The part of a convex polygon, [K, D], where a height, given at the corners, is not positive, [L, D].
+
+    One side of a clip after Sutherland and Hodgman (1974, "Reentrant polygon clipping").
+    """
+    made = []
+    for here, there, low, high in zip(polygon, np.roll(polygon, -1, 0), heights, np.roll(heights, -1), strict=True):
+        if low <= 0:
+            made.append(here)
+        if (low < 0 < high) or (high < 0 < low):
+            made.append(here + (there - here) * (low / (low - high)))
+    return np.array(made).reshape(-1, polygon.shape[1])
+
+
+def _enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices: int) -> NDArray[np.float64] | None:
+    """The smallest polygon around the hull inside the convex polygon with that many corners at most, or None if none was found."""
+    middle = hull.mean(0)
+    hull, (normals, offsets) = hull - middle, sides(polygon - middle)
+    along = np.roll(hull, -1, 0) - hull
+    longest = np.argsort(-(along**2).sum(-1), kind="stable")[:_EDGES]
+    outwards = np.stack([along[:, 1], -along[:, 0]], -1)[longest]
+    angles = np.concatenate([np.arctan2(*outwards.T[::-1]), np.arctan2(*normals.T[::-1]), np.arange(_AROUND) * (2 * np.pi / _AROUND)])
+    angles = np.sort(angles % (2 * np.pi))
+    angles = angles[np.diff(angles, prepend=angles[-1] - 2 * np.pi) > 1e-7]
+
+    normal = np.stack([np.cos(angles), np.sin(angles)], -1)
+    height = (hull @ normal.T).max(0)
+    turn = (angles[None] - angles[:, None]) % (2 * np.pi)  # from a side to the next
+    sine, cosine = np.sin(turn), np.cos(turn)
+    possible = (turn > 1e-7) & (turn < np.pi - 1e-3)
+    reach = (height[None] - height[:, None] * cosine) / np.where(possible, sine, 1.0)  # along a side to its corner with the next
+    corner = height[:, None, None] * normal[:, None] + reach[..., None] * np.stack([-normal[:, 1], normal[:, 0]], -1)[:, None]
+    possible &= (corner @ normals.T <= offsets + 1e-9).all(-1)
+    # The quadrangle between the middle, the feet on both sides and their corner; all of them make up the polygon.
+    share = (2 * height[:, None] * height[None] - (height[:, None] ** 2 + height[None] ** 2) * cosine) / np.where(possible, 2 * sine, 1.0)
+    chosen = _shortest_cycle(np.where(possible, share, np.inf), vertices)
+    return None if chosen is None else corner[chosen, np.roll(chosen, -1)] + middle
+
+
+def _shortest_cycle(cost: NDArray[np.float64], length: int) -> NDArray[np.int64] | None:
+    """The cheapest once-around cycle through 3 to ``length`` of n nodes that lie on a circle, by the steps' costs [n, n]; in order."""
+    upwards = np.where(np.arange(len(cost))[:, None] < np.arange(len(cost)), cost, np.inf)
+    paths, through = [upwards], []
+    best, chosen = sys.float_info.max, None
+    for count in range(3, length + 1):
+        joined = paths[-1][:, :, None] + upwards[None]
+        through.append(joined.argmin(1))
+        paths.append(np.take_along_axis(joined, through[-1][:, None], 1)[:, 0])
+        closed = paths[-1] + cost.T
+        if closed.min() < best * (1 - 1e-9):
+            first, last = np.unravel_index(closed.argmin(), closed.shape)
+            best, chosen = float(closed.min()), [int(last)]
+            for step in through[::-1]:
+                chosen.insert(0, int(step[first, chosen[0]]))
+            chosen.insert(0, int(first))
+            assert len(chosen) == count
+    return None if chosen is None else np.array(chosen)

@@ -1,0 +1,38 @@
+"""What alpha means to the program that draws a model: the three alpha modes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from bbfit.checks import InputTypeError, check_choice, check_range, fail
+
+AlphaKind = Literal["mask", "blend", "hash"]
+
+
+def check_cutoff(name: str, cutoff: float) -> None:
+    """Require a cutoff in (0, 1)."""
+    if isinstance(cutoff, bool) or not isinstance(cutoff, int | float):
+        raise InputTypeError(f"{name}: expected a number, got {cutoff!r}")
+    if not 0 < cutoff < 1:
+        fail(name, f"expected a value in (0, 1), got {cutoff!r}", "0.5 is what most programs assume")
+
+
+@dataclass(frozen=True)
+class AlphaMode:
+    """How opaque a sample of a texture is, given its filtered alpha."""
+
+    kind: AlphaKind = "blend"
+    """blend: as opaque as alpha says. mask: opaque where alpha is at least the cutoff, and nothing elsewhere (glTF 2.0, section 3.9.4).
+    hash: opaque with alpha as the probability, drawn anew for every pixel and texture (Wyman and McGuire 2017, "Hashed Alpha Testing")."""
+    cutoff: float = 0.5
+    """Least alpha that shows with mask, in (0, 1)."""
+    hardness: float = math.inf
+    """Slope, with mask, of the ramp from nothing to opaque, whose middle is the cutoff. Finite only while textures are fitted; at least
+    the slope at which alpha 0 is nothing and alpha 1 opaque."""
+
+    def __post_init__(self) -> None:
+        check_choice("alpha", self.kind, get_args(AlphaKind))
+        check_cutoff("alpha_cutoff", self.cutoff)
+        check_range("hardness", min(self.hardness, 1e30), 0.5 / min(self.cutoff, 1 - self.cutoff), 1e30)

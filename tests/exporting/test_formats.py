@@ -1,0 +1,183 @@
+"""What a GLB may hold beside the plain export: other alpha modes, other textures, split nodes, outlines; and bad wishes."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bbfit.checks import InputError
+from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.model import as_shipped, export, shipped_cards
+from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.model_files import joined_glb, split_glb
+
+NODE = Path(__file__).parents[1] / "node"
+
+
+def tree_of(path: Path) -> tuple[dict[str, Any], list[bytes]]:
+    return split_glb(path.read_bytes())
+
+
+def validated(*files: Path) -> list[dict[str, Any]]:
+    """What the Khronos validator finds: the messages of each file, but for those on sizes of textures."""
+    if shutil.which("node") is None or not (NODE / "node_modules" / "gltf-validator").is_dir():
+        pytest.fail(f"the glTF validator is not installed: install Node.js and run `npm ci` in {NODE}")
+    done = subprocess.run(["node", str(NODE / "validate.mjs"), *map(str, files)], check=True, capture_output=True, timeout=60)
+    return [
+        message
+        for report in json.loads(done.stdout)
+        for message in report["issues"]["messages"]
+        if message["code"] != "IMAGE_NPOT_DIMENSIONS"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("fitted", "config", "expected"),
+    [
+        (AlphaMode("mask", 0.3), ExportConfig(), ("MASK", 0.3)),
+        (AlphaMode("blend"), ExportConfig(), ("BLEND", None)),
+        (AlphaMode("hash"), ExportConfig(), ("BLEND", None)),
+        (AlphaMode("mask", 0.3), ExportConfig(alpha="blend"), ("BLEND", None)),
+        (AlphaMode("blend"), ExportConfig(alpha="mask", alpha_cutoff=0.7), ("MASK", 0.7)),
+        (AlphaMode("mask", 0.3), ExportConfig(alpha_cutoff=0.6), ("MASK", 0.6)),
+    ],
+)
+def test_a_file_has_the_mode_that_its_cloud_was_fitted_for_unless_another_is_asked(
+    crossed: BillboardCloud, tmp_path: Path, fitted: AlphaMode, config: ExportConfig, expected: tuple[str, float | None]
+) -> None:
+    cloud = replace(crossed, alpha=fitted)
+    (path,) = export(cloud, tmp_path / "model.glb", config)
+    (material,) = tree_of(path)[0]["materials"]
+    assert (material["alphaMode"], material.get("alphaCutoff")) == expected
+    shipped = as_shipped(cloud, config).alpha
+    assert ("MASK" if shipped.kind == "mask" else "BLEND") == expected[0]
+    assert shipped.kind != "mask" or shipped.cutoff == expected[1]
+    assert material.get("extras") == ({"alphaMode": "HASH"} if shipped.kind == "hash" else None)
+
+
+@pytest.mark.parametrize("fallback", [True, False])
+@pytest.mark.parametrize(("textures", "extension"), [("webp", "EXT_texture_webp"), ("ktx2", "KHR_texture_basisu")])
+def test_other_textures_stand_beside_png_or_in_its_place(
+    crossed: BillboardCloud, tmp_path: Path, textures: str, extension: str, fallback: bool
+) -> None:
+    config = ExportConfig(textures=textures, fallback=fallback)  # type: ignore[arg-type]
+    (path,) = export(crossed, tmp_path / "model.glb", config)
+    tree, views = tree_of(path)
+    (texture,) = tree["textures"]
+    assert (texture.get("source") == 0) == fallback and extension in tree["extensionsUsed"]
+    assert tree.get("extensionsRequired", []) == ([] if fallback else [extension])
+    image = tree["images"][texture["extensions"][extension]["source"]]
+    data = views[image["bufferView"]]
+    assert image["mimeType"] == f"image/{textures}" and len(tree["images"]) == 1 + fallback
+    atlas = shipped_cards(crossed, config).atlas.image
+    if textures == "webp":
+        np.testing.assert_array_equal(np.array(Image.open(io.BytesIO(data))), atlas)  # colours of transparent texels as well
+    else:
+        assert data.startswith(b"\xabKTX 20\xbb\r\n\x1a\n")
+    # Mip levels are asked for where the file brings them.
+    assert tree["samplers"][0]["minFilter"] == (9987 if textures == "ktx2" else 9729)
+    if fallback:
+        np.testing.assert_array_equal(np.array(Image.open(io.BytesIO(views[tree["images"][0]["bufferView"]]))), atlas)
+    # The validator does not know what KTX2 pictures are.
+    codes = {message["code"] for message in validated(path) if message["severity"] < 2}
+    assert codes <= ({"VALUE_NOT_IN_LIST", "IMAGE_UNRECOGNIZED_FORMAT"} if textures == "ktx2" else set())
+
+
+def test_split_nodes_stand_at_their_origins_and_their_bounds_are_centred_there(crossed: BillboardCloud, tmp_path: Path) -> None:
+    config = ExportConfig(alpha="blend", split=True)
+    (path,) = export(crossed, tmp_path / "model.glb", config)
+    tree, _ = tree_of(path)
+    cards = shipped_cards(crossed, config)
+    placed = [node for node in tree["nodes"] if "mesh" in node]
+    assert len(placed) == len(cards.cards) > len(crossed)
+    vertices = 0
+    for node, card in zip(placed, cards.cards, strict=True):
+        assert card.origin is not None
+        place = node.get("translation") or np.array(node["matrix"])[12:15]
+        np.testing.assert_allclose(place, card.origin, atol=1e-6)
+        accessor = tree["accessors"][tree["meshes"][node["mesh"]]["primitives"][0]["attributes"]["POSITION"]]
+        np.testing.assert_allclose(np.add(accessor["min"], accessor["max"]), 0, atol=1e-5)
+        vertices += accessor["count"]
+    assert vertices == cards.vertex_count
+    assert not validated(path)
+
+
+def test_only_blend_is_split_and_only_where_nodes_are_sorted(crossed: BillboardCloud) -> None:
+    def pieces(alpha: str, **options: Any) -> int:
+        return len(shipped_cards(crossed, ExportConfig(alpha=alpha, **options)).cards)  # type: ignore[arg-type]
+
+    assert pieces("mask", split=True) == pieces("hash", split=True) == pieces("blend") == pieces("blend", profile="blender") == 2
+    assert pieces("blend", profile="blender", split=True) == pieces("blend", profile="three") > 2
+    assert pieces("blend", profile="three", split=False) == 2
+
+
+def test_a_hull_saves_area_and_keeps_to_its_corners(crossed: BillboardCloud, tmp_path: Path) -> None:
+    for corners in (4, 6, 8):
+        cards = shipped_cards(crossed, ExportConfig(alpha="mask", hull=corners)).cards
+        assert all(len(card.corners) <= corners for card in cards)
+    (path,) = export(crossed, tmp_path / "model.glb", ExportConfig(alpha="mask", hull=8))
+    assert not validated(path)
+    obj, *_ = export(crossed, tmp_path / "model.obj", ExportConfig(alpha="mask", hull=8))
+    faces = [line for line in obj.read_text().splitlines() if line.startswith("f ")]
+    assert len(faces) == 2 and all(len(face.split()) - 1 == len(card.corners) for face, card in zip(faces, cards, strict=True))
+
+
+def test_mip_files_are_written_on_request(crossed: BillboardCloud, tmp_path: Path) -> None:
+    files = export(crossed, tmp_path / "model.obj", ExportConfig(mip_files=True))
+    pictures = [np.array(Image.open(file)) for file in files if "_mip" in file.name]
+    assert len(pictures) > 4 and pictures[-1].shape == (1, 1, 4)
+    np.testing.assert_array_equal(pictures[0], np.array(Image.open(tmp_path / "model.png")))
+    for coarse, fine in zip(pictures[1:], pictures, strict=False):
+        assert coarse.shape[:2] == tuple(max(1, side // 2) for side in fine.shape[:2])
+
+
+def test_the_materials_light_is_as_asked(crossed: BillboardCloud, tmp_path: Path) -> None:
+    for material, extensions in (("unlit", ["KHR_materials_unlit"]), ("pbr", None)):
+        (path,) = export(crossed, tmp_path / f"{material}.glb", ExportConfig(material=material))  # type: ignore[arg-type]
+        assert tree_of(path)[0].get("extensionsUsed") == extensions
+        assert not validated(path)
+
+
+def test_a_missing_encoder_is_named(crossed: BillboardCloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"bbfit\[ktx2\]"):
+        export(crossed, tmp_path / "model.glb", ExportConfig(textures="ktx2"))
+    assert not list(tmp_path.iterdir())
+    export(crossed, tmp_path / "model.glb", ExportConfig(profile="three"))
+
+
+def test_a_glb_taken_apart_and_joined_is_the_same(crossed: BillboardCloud, tmp_path: Path) -> None:
+    (path,) = export(crossed, tmp_path / "model.glb")
+    tree, views = tree_of(path)
+    assert split_glb(joined_glb(tree, views)) == (tree, views)
+    assert joined_glb(tree, views) == path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"profile": "maya"},
+        {"alpha": "opaque"},
+        {"alpha_cutoff": 0.0},
+        {"alpha_cutoff": 1},
+        {"alpha_cutoff": "half"},
+        {"hull": 3},
+        {"hull": 9},
+        {"textures": "jpeg"},
+        {"material": "toon"},
+        {"split": 2},
+    ],
+)
+def test_bad_wishes_are_refused_by_name(bad: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=next(iter(bad))):
+        ExportConfig(**bad)

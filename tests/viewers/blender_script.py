@@ -1,0 +1,82 @@
+"""Runs in a process of its own, started by blender_viewer.py: imports one model as a user does and renders it with Cycles.
+
+Standard input holds the job as JSON. Pictures are 16-bit PNGs, 0000.png, 0001.png, ... in the job's folder.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from typing import Any
+
+# A ray may have to cross this many billboards.
+TRANSPARENT_LAYERS = 128
+
+
+def main() -> None:
+    """Do one job."""
+    import bpy
+    from mathutils import Matrix
+
+    job = json.load(sys.stdin)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    if job["model"].endswith(".glb"):
+        bpy.ops.import_scene.gltf(filepath=job["model"])
+    else:
+        bpy.ops.wm.obj_import(filepath=job["model"])
+        unlight()
+    set_up(job)
+    scene, lens = bpy.context.scene, bpy.data.cameras.new("camera")
+    scene.camera = bpy.data.objects.new("camera", lens)
+    scene.collection.objects.link(scene.camera)
+    lens.sensor_fit = "HORIZONTAL"
+    for index, view in enumerate(job["views"]):
+        scene.camera.matrix_world = Matrix(view["camera_to_world"])
+        if job["orthographic"]:
+            lens.type, lens.ortho_scale = "ORTHO", view["extent"]
+        else:
+            lens.type, lens.angle = "PERSP", view["angle"]
+        lens.shift_x, lens.shift_y = view["shift"]
+        lens.clip_start, lens.clip_end = view["clip"]
+        scene.render.filepath = os.path.join(job["folder"], f"{index:04d}.png")  # noqa: PTH118
+        bpy.ops.render.render(write_still=True)
+
+
+def unlight() -> None:
+    """Let materials emit their colour in place of reflecting light: what an MTL's ``illum 0`` asks for and Blender's importer ignores."""
+    import bpy
+
+    for material in bpy.data.materials:
+        tree = material.node_tree
+        for surface in [node for node in tree.nodes if node.type == "BSDF_PRINCIPLED"]:
+            (link,) = surface.inputs["Base Color"].links
+            tree.links.new(link.from_socket, surface.inputs["Emission Color"])
+            tree.links.remove(link)
+            surface.inputs["Base Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+            surface.inputs["Emission Strength"].default_value = 1.0
+
+
+def set_up(job: dict[str, Any]) -> None:
+    """The renderer: one sample at the centre of each pixel, nothing but what the model itself emits."""
+    import bpy
+
+    scene = bpy.context.scene
+    render, cycles, image = scene.render, scene.cycles, scene.render.image_settings
+    render.engine, cycles.device = "CYCLES", "CPU"
+    cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = job["samples"], False, False
+    cycles.transparent_max_bounces = TRANSPARENT_LAYERS
+    # As narrow as Blender allows; of filters of this width a Gaussian keeps nearest to the centre.
+    cycles.pixel_filter_type, cycles.filter_width = "GAUSSIAN", 0.01
+    render.resolution_x, render.resolution_y, render.resolution_percentage = job["width"], job["height"], 100
+    render.threads_mode, render.threads = "FIXED", 1
+    render.film_transparent, render.dither_intensity = True, 0.0
+    render.use_persistent_data = True
+    image.file_format, image.color_mode, image.color_depth = "PNG", "RGBA", "16"
+    scene.view_settings.view_transform, scene.view_settings.look = "Standard", "None"
+
+
+if __name__ == "__main__":
+    main()
+    sys.stdout.flush()
+    os._exit(0)  # an ordinary exit crashes in Blender's own clean-up now and then

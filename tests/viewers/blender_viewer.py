@@ -1,0 +1,72 @@
+"""What the real Blender shows of a GLB or an OBJ: its importer's materials, rendered by Cycles, in a process of its own."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bbfit.geometry.camera import Camera, camera_to_nerf
+
+SCRIPT = Path(__file__).with_name("blender_script.py")
+# Cameras see from this share of their distance to the world's origin to this multiple of it, and a kilometre at least.
+CLIP = (1e-2, 1e2)
+
+
+def render_blender(model: Path, camera: Camera, *, samples: int = 1) -> NDArray[np.float64]:
+    """Display-referred RGB over white in [0, 1] of a batch of V cameras, [V, H, W, 3]; view transform Standard.
+
+    Every sample lies at the centre of its pixel, so more than one only matters where Cycles chooses at random. Blender blends layers in
+    linear light; the picture over the white is composited as bbfit does its own, display-referred.
+
+    The test fails where Blender is not installed; what Blender says is the message of an ``AssertionError`` where it fails itself.
+    """
+    if importlib.util.find_spec("bpy") is None:
+        pytest.fail("Blender is not installed: pip install bpy, or bbfit with its extra blender, on Python 3.11")
+    camera = camera.batch()
+    with tempfile.TemporaryDirectory(prefix="bbfit-") as folder:
+        job = {
+            "model": str(model),
+            "folder": folder,
+            "views": [_view(camera[index]) for index in range(len(camera))],
+            "orthographic": camera.orthographic,
+            "width": camera.width,
+            "height": camera.height,
+            "samples": samples,
+        }
+        # Its own folder for what Blender leaves behind, and no settings or add-ons of the user's.
+        environment = os.environ | dict.fromkeys(("TMPDIR", "TEMP", "TMP", "BLENDER_USER_RESOURCES"), folder)
+        done = subprocess.run(
+            [sys.executable, "-P", str(SCRIPT)], input=json.dumps(job), capture_output=True, text=True, env=environment, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+        pictures = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted(Path(folder).glob("*.png"))]
+    images = np.stack(pictures)[..., [2, 1, 0, 3]] / 65535.0
+    assert images.shape == (len(camera), camera.height, camera.width, 4)
+    colour, alpha = images[..., :3], images[..., 3:]
+    return colour * alpha + 1 - alpha
+
+
+def _view(camera: Camera) -> dict[str, Any]:
+    """One camera in Blender's terms: shifts are in widths of the picture, from its middle."""
+    k, width, height = camera.intrinsics.double().numpy(), camera.width, camera.height
+    assert math.isclose(k[0, 0], k[1, 1], rel_tol=1e-6) and k[0, 1] == 0, "pixels must be square"
+    distance = float(camera.position.norm())
+    return {
+        "camera_to_world": camera_to_nerf(camera.world_to_camera.double()[None])[0].tolist(),
+        "angle": 2 * math.atan(width / (2 * k[0, 0])),
+        "extent": width / k[0, 0],
+        "shift": [((width - 1) / 2 - k[0, 2]) / width, (k[1, 2] - (height - 1) / 2) / width],
+        "clip": [CLIP[0] * distance, max(CLIP[1] * distance, 1000.0)],
+    }

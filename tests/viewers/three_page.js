@@ -1,0 +1,92 @@
+// Loads one GLB with three.js and draws it from given cameras; three_viewer.py calls load() once and then draw() once a view.
+import * as THREE from "three";
+import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
+import { KTX2Loader } from "three/addons/loaders/KTX2Loader.js";
+
+const SIDES = { [THREE.FrontSide]: "front", [THREE.BackSide]: "back", [THREE.DoubleSide]: "double" };
+// three.js has its own numbers for filters; these are glTF's, which are OpenGL's.
+const FILTERS = {
+  [THREE.NearestFilter]: 9728,
+  [THREE.LinearFilter]: 9729,
+  [THREE.NearestMipmapNearestFilter]: 9984,
+  [THREE.LinearMipmapNearestFilter]: 9985,
+  [THREE.NearestMipmapLinearFilter]: 9986,
+  [THREE.LinearMipmapLinearFilter]: 9987,
+};
+// Objects in no other layer are drawn. Layers, unlike visible, are not inherited.
+const SHOWN = 0;
+const HIDDEN = 1;
+
+const renderer = new THREE.WebGLRenderer({ antialias: false, alpha: false });
+renderer.setPixelRatio(1);
+renderer.setClearColor(0xffffff, 1);
+renderer.outputColorSpace = THREE.SRGBColorSpace;
+renderer.toneMapping = THREE.NoToneMapping;
+const scene = new THREE.Scene();
+
+// Loads the model; node is the name of the only node to show, or null. Tells the extent of what is shown and its materials.
+window.load = async (node) => {
+  const textures = new KTX2Loader().setTranscoderPath("/three/examples/jsm/libs/basis/").detectSupport(renderer);
+  const gltf = await new GLTFLoader().setKTX2Loader(textures).loadAsync("/model.glb");
+  textures.dispose();
+  scene.add(gltf.scene);
+  if (node !== null) await showOnly(gltf, node);
+  scene.updateMatrixWorld(true);
+
+  const box = new THREE.Box3();
+  const materials = new Set();
+  scene.traverse((object) => {
+    if (!object.isMesh || !object.layers.isEnabled(SHOWN)) return;
+    object.geometry.computeBoundingBox(); // of the vertices; the loader's is what the file says it is
+    box.union(object.geometry.boundingBox.clone().applyMatrix4(object.matrixWorld));
+    materials.add(object.material);
+  });
+  return { low: box.min.toArray(), high: box.max.toArray(), materials: [...materials].map(describe) };
+};
+
+// Levels of detail are nodes beside the scene (MSFT_lod), which three.js does not load by itself.
+async function showOnly(gltf, name) {
+  const index = gltf.parser.json.nodes.findIndex((node) => node.name === name);
+  if (index < 0) throw new Error(`the model has no node ${name}`);
+  const chosen = await gltf.parser.getDependency("node", index);
+  if (chosen.parent === null) gltf.scene.add(chosen);
+  gltf.scene.traverse((object) => object.layers.set(HIDDEN));
+  chosen.traverse((object) => object.layers.set(SHOWN));
+}
+
+function describe(material) {
+  const { name, type, alphaTest, transparent, side, map } = material;
+  const picture = map && {
+    width: map.image.width,
+    height: map.image.height,
+    min: FILTERS[map.minFilter],
+    mag: FILTERS[map.magFilter],
+    compressed: Boolean(map.isCompressedTexture),
+  };
+  return { name, type, alphaTest, transparent, side: SIDES[side], map: picture };
+}
+
+// Draws one view. Matrices are lists of 16 numbers, row after row. Pixels are RGBA bytes in base 64, the bottom row first.
+window.draw = ({ projection, cameraToWorld, width, height }) => {
+  renderer.setSize(width, height, false);
+  const camera = new THREE.Camera();
+  camera.matrixAutoUpdate = camera.matrixWorldAutoUpdate = false;
+  camera.matrixWorld.set(...cameraToWorld);
+  camera.matrixWorldInverse.copy(camera.matrixWorld).invert();
+  camera.projectionMatrix.set(...projection);
+  camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+  renderer.render(scene, camera);
+
+  const gl = renderer.getContext();
+  if (gl.drawingBufferWidth !== width || gl.drawingBufferHeight !== height) throw new Error("the canvas has another size");
+  const pixels = new Uint8Array(4 * width * height);
+  gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+  const { calls, triangles } = renderer.info.render;
+  return { calls, triangles, pixels: encode(pixels) };
+};
+
+function encode(bytes) {
+  let text = "";
+  for (let start = 0; start < bytes.length; start += 8192) text += String.fromCharCode(...bytes.subarray(start, start + 8192));
+  return btoa(text);
+}

@@ -1,0 +1,192 @@
+"""What the real three.js shows of a GLB: its WebGLRenderer and GLTFLoader in a headless Chromium, by a software GPU."""
+
+from __future__ import annotations
+
+import base64
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from playwright.sync_api import Browser, ConsoleMessage, Page, Route, sync_playwright
+
+from bbfit.geometry.camera import Camera
+
+HERE = Path(__file__).parent
+NODE = HERE.parent / "node"
+BROWSERS = ("chromium", "google-chrome", "chromium-browser")
+FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox", "--disable-dev-shm-usage"]
+# No such host: every request is answered from the disk.
+ORIGIN = "https://viewer.invalid"
+TYPES = {".html": "text/html", ".js": "text/javascript", ".wasm": "application/wasm", ".glb": "model/gltf-binary"}
+# OpenCV's camera axes to OpenGL's: +Y up, -Z forward.
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class ThreeMaterial:
+    """A material as three.js's loader made it."""
+
+    name: str
+    """As in the file."""
+    kind: str
+    """three.js's class: MeshBasicMaterial is unlit, MeshStandardMaterial lit."""
+    alpha_test: float
+    """Least alpha drawn; 0 draws all."""
+    transparent: bool
+    """Whether it is blended, and sorted from back to front."""
+    side: str
+    """``front`` (back faces are culled), ``back`` or ``double``."""
+    size: tuple[int, int] | None
+    """Width and height of its colour texture, if it has one."""
+    min_filter: int | None
+    """glTF's number of the minification filter."""
+    mag_filter: int | None
+    """glTF's number of the magnification filter."""
+    compressed: bool
+    """Whether the texture lies compressed in the GPU's memory."""
+
+
+@dataclass(frozen=True)
+class ThreeShow:
+    """What three.js shows of a model."""
+
+    images: NDArray[np.float64]
+    """Display-referred RGB over white in [0, 1], one sample a pixel, [V, H, W, 3]."""
+    calls: tuple[int, ...]
+    """Draw calls of each view; a blended material that shows both sides takes two a mesh, the back faces first."""
+    triangles: tuple[int, ...]
+    """Triangles drawn in each view, counted once a draw call."""
+    materials: tuple[ThreeMaterial, ...]
+    """Materials of the meshes that are shown."""
+    warnings: tuple[str, ...]
+    """What three.js warned of."""
+
+
+class ThreeViewer:
+    """A running browser; made by :func:`open_three`."""
+
+    def __init__(self, browser: Browser, thread: ThreadPoolExecutor) -> None:
+        self._browser, self._thread = browser, thread
+
+    def render(self, glb: Path, camera: Camera, *, node: str | None = None) -> NDArray[np.float64]:
+        """Pictures over white of a batch of cameras, [V, H, W, 3]; see :meth:`show`."""
+        return self.show(glb, camera, node=node).images
+
+    def show(self, glb: Path, camera: Camera, *, node: str | None = None) -> ThreeShow:
+        """Load a GLB into a page of its own and draw it from a batch of V cameras.
+
+        ``node`` shows only the node of that name with its descendants, in the scene or beside it, as levels of detail are.
+        Whatever the page reports as an error is an ``AssertionError``.
+        """
+        return self._thread.submit(self._show, glb, camera.batch(), node).result()
+
+    def _show(self, glb: Path, camera: Camera, node: str | None) -> ThreeShow:
+        page, errors, warnings = self._browser.new_page(), list[str](), list[str]()
+
+        def hear(message: ConsoleMessage) -> None:
+            if message.type == "error":
+                errors.append(message.text)
+            elif message.type == "warning" and message.text.startswith("THREE."):  # others are the GPU driver's, on speed
+                warnings.append(message.text)
+
+        page.on("console", hear)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.route("**/*", lambda route: _answer(route, glb))
+        try:
+            page.goto(f"{ORIGIN}/three.html")
+            assert not errors, errors
+            found = page.evaluate("node => window.load(node)", node)
+            views = [_draw(page, camera[index], np.array([found["low"], found["high"]])) for index in range(len(camera))]
+        finally:
+            page.close()
+        assert not errors, errors
+        images, calls, triangles = zip(*views, strict=True)
+        return ThreeShow(np.stack(images), calls, triangles, tuple(map(_material, found["materials"])), tuple(warnings))
+
+
+@contextmanager
+def open_three() -> Iterator[ThreeViewer]:
+    """A browser for as many GLBs as wanted; the test fails where there is no browser or no three.js.
+
+    The browser is driven from a thread of its own, since playwright leaves an event loop running in the thread that it works in.
+    """
+    chromium = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if chromium is None:
+        pytest.fail(f"no browser is installed: install one of {', '.join(BROWSERS)} (apt-get install chromium)")
+    if not (NODE / "node_modules" / "three").is_dir():
+        pytest.fail(f"three.js is not installed: install Node.js and run `npm ci` in {NODE}")
+    with ThreadPoolExecutor(1) as thread:
+        driver = thread.submit(lambda: sync_playwright().start()).result()
+        try:
+            browser = thread.submit(lambda: driver.chromium.launch(executable_path=chromium, args=FLAGS)).result()
+            try:
+                yield ThreeViewer(browser, thread)
+            finally:
+                thread.submit(browser.close).result()
+        finally:
+            thread.submit(driver.stop).result()
+
+
+def projection_matrix(camera: Camera, near: float, far: float) -> NDArray[np.float64]:
+    """OpenGL's projection of one camera, [4, 4]: from its axes as OpenGL has them (+Y up, -Z forward) to clip coordinates.
+
+    Pixel x, whose centre is the whole number, lies at (2 x + 1) / width - 1 of OpenGL's picture, which reaches from -1 to 1.
+    """
+    to_clip = np.array([[2 / camera.width, 0, 1 / camera.width - 1], [0, -2 / camera.height, 1 - 1 / camera.height], [0, 0, 1]])
+    x, y, w = to_clip @ camera.camera_to_pixel.double().numpy()
+    if camera.orthographic:
+        z = np.array([0, 0, 2 / (far - near), -(far + near) / (far - near)])
+    else:
+        z = np.array([0, 0, (far + near) / (far - near), -2 * far * near / (far - near)])
+    return np.stack([x, y, z, w]) @ FLIP
+
+
+def _draw(page: Page, camera: Camera, bounds: NDArray[np.float64]) -> tuple[NDArray[np.float64], int, int]:
+    distance = float(np.linalg.norm(camera.position.double().numpy() - bounds.mean(0)))
+    radius = 1.01 * float(np.linalg.norm(bounds[1] - bounds[0])) / 2
+    view = {
+        "projection": projection_matrix(camera, max(distance - radius, 1e-3 * distance), distance + radius).ravel().tolist(),
+        "cameraToWorld": (camera.camera_to_world.double().numpy() @ FLIP).ravel().tolist(),
+        "width": camera.width,
+        "height": camera.height,
+    }
+    drawn = page.evaluate("view => window.draw(view)", view)
+    pixels = np.frombuffer(base64.b64decode(drawn["pixels"]), np.uint8).reshape(camera.height, camera.width, 4)
+    return pixels[::-1, :, :3] / 255.0, drawn["calls"], drawn["triangles"]
+
+
+def _material(found: dict[str, Any]) -> ThreeMaterial:
+    picture = found["map"] or {}
+    return ThreeMaterial(
+        name=found["name"],
+        kind=found["type"],
+        alpha_test=found["alphaTest"],
+        transparent=found["transparent"],
+        side=found["side"],
+        size=(picture["width"], picture["height"]) if picture else None,
+        min_filter=picture.get("min"),
+        mag_filter=picture.get("mag"),
+        compressed=picture.get("compressed", False),
+    )
+
+
+def _answer(route: Route, glb: Path) -> None:
+    """Serve the page, three.js and the model under the page's own origin; refuse everything else."""
+    path = route.request.url.removeprefix(ORIGIN)
+    if path == "/model.glb":
+        file = glb
+    elif path.startswith("/three/"):
+        file = NODE / "node_modules" / path.removeprefix("/")
+    else:
+        file = HERE / path.removeprefix("/")
+    if not file.is_file():
+        route.abort()
+        return
+    route.fulfill(path=file, content_type=TYPES[file.suffix])
