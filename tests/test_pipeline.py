@@ -70,14 +70,14 @@ def test_nothing_is_done_twice(views_folder: Path, done: RunResult) -> None:
 
 def test_only_what_depends_on_a_change_is_done_again(views_folder: Path, tmp_path: Path, done: RunResult) -> None:
     run(views_folder, tmp_path, CONFIG)
-    masked = dataclasses.replace(CONFIG, export=ExportConfig(alpha="mask"))
-    assert run(views_folder, tmp_path, masked).skipped == ("fit",)
+    blended = dataclasses.replace(CONFIG, export=ExportConfig(alpha="blend"))
+    assert run(views_folder, tmp_path, blended).skipped == ("fit",)
     (tmp_path / "comparison.png").unlink()
-    assert run(views_folder, tmp_path, masked).skipped == ("fit", "export")
+    assert run(views_folder, tmp_path, blended).skipped == ("fit", "export")
     (tmp_path / "model.obj").write_text("spoilt")
-    assert "fit" in run(views_folder, tmp_path, masked).skipped
+    assert "fit" in run(views_folder, tmp_path, blended).skipped
     assert (tmp_path / "model.obj").read_text() != "spoilt"
-    other = dataclasses.replace(masked, fit=dataclasses.replace(CONFIG.fit, seed=1))
+    other = dataclasses.replace(blended, fit=dataclasses.replace(CONFIG.fit, seed=1))
     assert run(views_folder, tmp_path, other).skipped == ()
     for damage in ("{", '{"stages": {"fit": {"inputs": 3}, "evaluate": 5, "old": {"x": 1}}}'):
         (tmp_path / "run.json").write_text(damage)

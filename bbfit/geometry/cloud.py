@@ -124,7 +124,8 @@ class BillboardCloud:
         from bbfit.files import write_tensors
 
         tensors = {name: getattr(self, name).detach().cpu().clone(memory_format=torch.contiguous_format) for name in TENSORS}
-        write_tensors(path, tensors, {"format": FORMAT, "alpha": json.dumps({"kind": self.alpha.kind, "cutoff": self.alpha.cutoff})})
+        alpha = json.dumps({"kind": self.alpha.kind, "cutoff": self.alpha.cutoff})
+        write_tensors(path, tensors, {"format": f"{FORMAT} {alpha}"})  # in one entry: several would come in any order
 
     @staticmethod
     def load(path: str | Path) -> BillboardCloud:
@@ -140,14 +141,14 @@ class BillboardCloud:
         path = check_file("cloud", path)
         try:
             with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                known = metadata.get("format") == FORMAT
+                form = (file.metadata() or {}).get("format", "")
+                known = form == FORMAT or form.startswith(f"{FORMAT} ")
                 tensors = {name: file.get_tensor(name) for name in TENSORS} if known else {}
             if tensors:
                 for name, tensor in tensors.items():
                     if not tensor.isfinite().all():
                         fail(name, "expected finite values")
-                return BillboardCloud(**tensors, alpha=AlphaMode(**json.loads(metadata.get("alpha", "{}"))))
+                return BillboardCloud(**tensors, alpha=AlphaMode(**json.loads(form[len(FORMAT) :] or "{}")))
         except (SafetensorError, InputError, TypeError, json.JSONDecodeError) as error:
             fail("cloud", f"{path} is damaged ({error})", "expected a file written by bbfit fit")
         fail("cloud", f"{path} is not a billboard cloud", "expected a file written by bbfit fit")

@@ -51,7 +51,7 @@ def test_ratio_is_table_1s() -> None:
 
 def test_schema() -> None:
     content = REPORT.to_json()
-    assert list(content) == [*MEASURES, "sharpness", "brightness", "vertices", "bytes", "seconds", "rings", "views"]
+    assert list(content) == [*MEASURES, "sharpness", "brightness", "vertices", "bytes", "overdraw", "alpha", "seconds", "rings", "views"]
     assert list(content["views"][0]) == ["name", "azimuth_degrees", "elevation_degrees", *MEASURES, "sharpness", "brightness"]
     assert list(content["rings"][0]) == ["elevation_degrees", "views", *MEASURES, "sharpness", "brightness"]
     for part in (content, *content["views"], *content["rings"]):

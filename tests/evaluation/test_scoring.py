@@ -15,7 +15,7 @@ from bbfit.checks import InputError
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import OriginalTree, evaluate, held_out, measure, view_angles
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
-from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.geometry.orbit import Orbit
 from bbfit.images import over_colour
 from bbfit.views import ViewDataset
@@ -55,7 +55,7 @@ def test_another_split_and_another_cloud_score_less(views: ViewDataset) -> None:
 def test_nothing_drawn(views: ViewDataset) -> None:
     """No billboards are white over white: every measure is finite, and as bad as it should be."""
     cloud = crossing_billboards()
-    parts = {name: getattr(cloud, name)[:0] for name in cloud.__dataclass_fields__}
+    parts = {name: getattr(cloud, name)[:0] for name in TENSORS}
     report = evaluate(BillboardCloud(**parts), views.test)
     assert report.mean.rgba.iou == report.mean.sharpness == report.mean.brightness == 0
     target = over_colour(views.test.targets([2], torch.float64)[0]).numpy()

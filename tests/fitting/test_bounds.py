@@ -94,8 +94,8 @@ def test_silhouette_bounds_are_tight(views: ViewDataset) -> None:
 
 
 def test_bounds_save_texels_and_keep_their_density(views: ViewDataset) -> None:
-    whole = start_cloud(views.train, FitConfig(bounds="viewport"))
-    part = start_cloud(views.train, FitConfig(bounds="silhouette"))
+    whole = start_cloud(views.train, FitConfig(bounds="viewport", texel_density=1.25))
+    part = start_cloud(views.train, FitConfig(bounds="silhouette", texel_density=1.25))
     assert len(part.texels) < len(whole.texels)
     for cloud in (whole, part):
         density = cloud.texture_sizes.flip(-1) / (2 * cloud.half_extents)

@@ -145,7 +145,7 @@ def test_a_killed_fit_goes_on_to_the_same_result(views: ViewDataset, tmp_path: P
 
 
 def test_a_snapshot_is_a_copy_of_the_cloud_at_its_level(views: ViewDataset) -> None:
-    config, seen = quick(billboards=2, placement="even", placement_rate=0, steps=8), []
+    config, seen = quick(alpha="blend", billboards=2, placement="even", placement_rate=0, steps=8), []
     result = fit(views, config, on_step=lambda step: seen.append(step.snapshot()))
     sizes = [tuple(cloud.texture_sizes[0].tolist()) for cloud in seen]
     assert sizes == sorted(sizes) and len(set(sizes)) == len(levels_of(config.resolve(), views.train.cameras)) > 1
