@@ -61,6 +61,7 @@ def _run(
     with _progress() as tell:
         result = run(tree, out, config, on_progress=tell)
     _show(result)
+    _show_missed(export)
 
 
 def _grow(
@@ -147,6 +148,7 @@ def _fit(
     with _progress() as tell:
         result = run(views, out, RunConfig(tree=tree, fit=config, budget=budget, export=export), on_progress=tell)
     _show(result)
+    _show_missed(export)
 
 
 def _evaluate(
@@ -185,7 +187,8 @@ def _evaluate(
             seconds=Report.load(earlier).seconds if earlier.is_file() else None,
             on_view=lambda done, total: tell("evaluate", done, total),
         )
-    report = with_model(report, shipped_cards(billboards, export))
+        cards = shipped_cards(billboards, export)
+        report = with_model(report, cards, dataset.test, on_size=lambda done, total: tell("sizes", done, total))
     report.save(out)
     _out.print(report_table(report))
     _out.print(f"measures in {out}", soft_wrap=True)
@@ -209,6 +212,7 @@ def _export(
 
     for path in export(BillboardCloud.load(cloud), out, config):
         _out.print(f"{path}  {path.stat().st_size:,} bytes")
+    _show_missed(config)
 
 
 def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
@@ -285,6 +289,11 @@ def _show(result: RunResult) -> None:
     _out.print(
         f"results in {result.folder}: comparison.png, model.glb, model.obj, metrics.json, cloud.safetensors, loss.png", soft_wrap=True
     )
+
+
+def _show_missed(config: ExportConfig) -> None:
+    if config.missed is not None:
+        _out.print(f"textures are PNG alone, without mip levels; for KTX2 {config.missed}", style="yellow", soft_wrap=True)
 
 
 @contextlib.contextmanager

@@ -21,8 +21,10 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, check_file, fail
 from bbfit.evaluation.report import Report
 from bbfit.evaluation.scoring import OriginalTree, evaluate
+from bbfit.evaluation.sizes import score_sizes
 from bbfit.exporting.cards import Cards
 from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.drawing import draw_cards
 from bbfit.exporting.hulls import overdraw
 from bbfit.exporting.model import as_shipped, shipped_cards, shows_from, write_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
@@ -35,11 +37,11 @@ from bbfit.trees.config import GrowConfig
 from bbfit.trees.growth import grow
 from bbfit.trees.species import Species, load_species
 from bbfit.trees.tree_file import write_tree
-from bbfit.views import ViewDataset
+from bbfit.views import ViewDataset, ViewSet
 
 RECORD_FILE = "run.json"
 # Raise a stage's number when its results change for the same inputs, so that old results are made anew.
-_STAGE_VERSIONS = {"grow": 1, "budget": 3, "fit": 6, "export": 2, "evaluate": 4}
+_STAGE_VERSIONS = {"grow": 1, "budget": 3, "fit": 6, "export": 3, "evaluate": 5}
 _PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headless", "bpy", "trimesh", "xatlas", "scikit-image", "warp-lang")
 
 
@@ -147,10 +149,14 @@ def run(
     return RunResult(record.folder, cloud, report, tuple(record.skipped), missed)
 
 
-def with_model(report: Report, cards: Cards) -> Report:
-    """The report with what a model file of these cards has."""
+def with_model(report: Report, cards: Cards, views: ViewSet, *, on_size: Callable[[int, int], None] | None = None) -> Report:
+    """The report with what a model file of these cards has and shows in pictures of 1 to 1/16 of the held-out views' size.
+
+    ``on_size`` is called after each size with the number of sizes done and of all.
+    """
     vertices = replace(report.vertices, model=cards.vertex_count)
-    return replace(report, vertices=vertices, overdraw=overdraw(cards, shows_from(cards)))
+    sizes = score_sizes(lambda camera: draw_cards(cards, camera, cards.chain), views, on_size=on_size)
+    return replace(report, vertices=vertices, overdraw=overdraw(cards, shows_from(cards)), sizes=sizes)
 
 
 def original_tree(views: ViewDataset) -> OriginalTree:
@@ -350,7 +356,7 @@ def _evaluate(cloud: BillboardCloud, cards: Callable[[], Cards], views: ViewData
         seconds={name: seconds for name, seconds in record.seconds.items() if name != "evaluate"},
         on_view=lambda done, total: tell("evaluate", done, total),
     )
-    report = with_model(report, cards())
+    report = with_model(report, cards(), views.test, on_size=lambda done, total: tell("sizes", done, total))
     report.save(path)
     comparison_picture(cloud, views.test, record.folder / "comparison.png")
     record.done("evaluate", inputs, [path.name, "comparison.png"], time.perf_counter() - begun)

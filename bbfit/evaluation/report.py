@@ -99,6 +99,23 @@ class RingScore:
 
 
 @dataclass(frozen=True)
+class SizeScore:
+    """How close the model as it is exported comes to the held-out views in pictures of one size (:mod:`bbfit.evaluation.sizes`)."""
+
+    width: int
+    """Width of the pictures in pixels."""
+    height: int
+    """Height of the pictures in pixels."""
+    psnr: float
+    """Peak signal-to-noise ratio over white in dB, at most 120, the mean over views (:func:`bbfit.evaluation.metrics.psnr`)."""
+    coverage: float | None
+    """Mean alpha of the draws over that of the targets, of all views together: 1 is as dense, below thins out, above thickens; ``None``
+    if the targets are empty."""
+    alpha: float
+    """Root mean squared difference of alpha over all pixels of all views, in [0, 1]."""
+
+
+@dataclass(frozen=True)
 class Cost:
     """A count of the model beside that of the original tree; ``None`` where it is not known."""
 
@@ -136,6 +153,8 @@ class Report:
     """The alpha mode that was measured."""
     overdraw: float | None = None
     """Share of the model's area that is drawn and shows nothing, in [0, 1]."""
+    sizes: tuple[SizeScore, ...] = ()
+    """The exported model seen from afar, the largest size first."""
 
     @property
     def mean(self) -> Measures:
@@ -169,7 +188,7 @@ class Report:
         -------
         ``{"over_white": {"psnr", "ssim", "flip"}, "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
         "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw",
-        "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
+        "alpha": {"mode", "cutoff"}, "seconds": {stage: ..}, "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
         "rings": [{"elevation_degrees", "views", and the measures as above}],
         "views": [{"name", "azimuth_degrees", "elevation_degrees", and the measures as above}]}``
         """
@@ -179,6 +198,7 @@ class Report:
             "overdraw": self.overdraw,
             "alpha": {"mode": self.alpha.kind, "cutoff": self.alpha.cutoff},
             "seconds": dict(self.seconds),
+            "sizes": [asdict(size) for size in self.sizes],
             "rings": [ring.to_json() for ring in self.rings],
             "views": [view.to_json() for view in self.views],
         }
@@ -202,7 +222,8 @@ class Report:
             vertices, sizes = (Cost(content[name]["model"], content[name]["original"]) for name in ("vertices", "bytes"))
             alpha = AlphaMode(content["alpha"]["mode"], content["alpha"]["cutoff"])
             scores = tuple(_view(entry) for entry in content["views"])
-            return Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"])
+            afar = tuple(SizeScore(**size) for size in content["sizes"])
+            return Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar)
         except (KeyError, TypeError, ValueError):
             fail("metrics", f"{path} is not a report", "expected a metrics.json that bbfit evaluate wrote")
 

@@ -48,6 +48,9 @@ class Cards:
     """The textures: per billboard the front, then the back if there is one."""
     alpha: AlphaMode = field(default_factory=AlphaMode)
     """What their alpha means."""
+    chain: tuple[NDArray[np.uint8], ...] | None = None
+    """Mip levels that files of them bring, straight RGBA, level 0 first and down to 1 x 1 texel; without any, level 0 is filtered
+    bilinearly at every distance."""
 
     @property
     def vertex_count(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -10,7 +11,7 @@ from bbfit.geometry.alpha import AlphaKind, check_cutoff
 
 Up = Literal["auto", "y", "z"]
 Profile = Literal["three", "babylon", "godot", "unity", "unreal", "blender"]
-Textures = Literal["png", "webp", "ktx2"]
+Textures = Literal["auto", "png", "webp", "ktx2"]
 Material = Literal["unlit", "pbr"]
 
 # What is taken where it is left open. Programs that rasterize sort what is blended node by node, so they need split cards; Blender's Cycles
@@ -45,7 +46,8 @@ class ExportConfig:
     drawn. The rectangle when left out."""
     textures: Textures | None = None
     """Format of a GLB's texture beside PNG, which every program reads: webp is smaller; ktx2 stays compressed on the graphics card and
-    brings mip levels that keep their coverage (needs the extra ktx2). Left open, PNG alone."""
+    brings mip levels that keep their coverage (needs the extra ktx2); auto is ktx2 where that extra is installed, else PNG alone. Left
+    open, PNG: the textures as they were scored."""
     fallback: bool = True
     """Keep the PNG beside a texture in another format, for programs that cannot read it."""
     mip_files: bool = False
@@ -75,6 +77,29 @@ class ExportConfig:
         check_choice("up", self.up, get_args(Up))
 
     def resolve(self) -> ExportConfig:
-        """The same with what the profile decides over; ``alpha`` and ``alpha_cutoff``, which the cloud decides over, stay as they are."""
+        """The same with what the profile and the encoders that are there decide over.
+
+        ``alpha`` and ``alpha_cutoff``, which the cloud decides over, stay as they are.
+        """
         taken = _OPEN | (_PROFILES[self.profile] if self.profile else {})
-        return replace(self, **{name: value for name, value in taken.items() if getattr(self, name) is None})
+        resolved = replace(self, **{name: value for name, value in taken.items() if getattr(self, name) is None})
+        if resolved.textures != "auto":
+            return resolved
+        return replace(resolved, textures="png" if ktx2_missing() else "ktx2")
+
+    @property
+    def brings_mips(self) -> bool:
+        """Whether files bring mip levels of their own."""
+        return self.mip_files or self.resolve().textures == "ktx2"
+
+    @property
+    def missed(self) -> str | None:
+        """What to install for the textures that were wished for but not insisted on, if they are not had."""
+        return ktx2_missing() if self.textures == "auto" else None
+
+
+def ktx2_missing() -> str | None:
+    """What to install before :func:`~bbfit.exporting.encoders.encode_ktx2` works; None if nothing is missing."""
+    if importlib.util.find_spec("alktx2") is None:
+        return 'install bbfit with its extra, pip install "bbfit[ktx2]" (".[ktx2]" in its source folder), on Python 3.11 or newer'
+    return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 
 import numpy as np
@@ -10,16 +9,10 @@ from numpy.typing import NDArray
 
 from bbfit.checks import check_shape, fail
 from bbfit.exporting.atlas import BLOCK
+from bbfit.exporting.config import ktx2_missing
 
 # The longest side that WebP has bits for.
 _WEBP_SIDE = 16383
-
-
-def ktx2_missing() -> str | None:
-    """What to install before :func:`encode_ktx2` works; None if nothing is missing."""
-    if importlib.util.find_spec("alktx2") is None:
-        return 'install bbfit with its extra, pip install "bbfit[ktx2]" (".[ktx2]" in its source folder), on Python 3.11 or newer'
-    return None
 
 
 def encode_ktx2(levels: list[NDArray[np.uint8]]) -> bytes:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from bbfit.exporting.cards import Card, Cards
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.encoders import encode_ktx2, encode_webp
-from bbfit.exporting.mips import mip_chain
 from bbfit.exporting.splitting import centred
 from bbfit.images import encode_png
 from bbfit.model_files import glb_of_scene, joined_glb, split_glb
@@ -88,7 +87,7 @@ def _complete(tree: dict[str, Any], cards: Cards, config: ExportConfig) -> None:
     assert len({image["bufferView"] for image in tree["images"]}) == 1
     tree["images"] = [{"bufferView": tree["images"][0]["bufferView"]}]
     tree["textures"] = [{"sampler": 0, "name": "atlas"}]
-    tree["samplers"] = [_WITH_MIPS if config.textures == "ktx2" else _SAMPLER]
+    tree["samplers"] = [_WITH_MIPS if config.textures == "ktx2" and cards.chain else _SAMPLER]
     used = set(tree.get("extensionsUsed", ()))
     for material in tree["materials"]:
         material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
@@ -110,7 +109,7 @@ def _with_pictures(tree: dict[str, Any], views: list[bytes], cards: Cards, confi
         if config.textures == "webp":
             pictures[kind] = encode_webp(cards.atlas.image)
         else:
-            pictures[kind] = encode_ktx2(mip_chain(cards.atlas, cards.alpha.cutoff if cards.alpha.kind == "mask" else None))
+            pictures[kind] = encode_ktx2(list(cards.chain or [cards.atlas.image]))
         tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), extension})
         tree["textures"][0]["extensions"] = {extension: {"source": len(pictures) - 1}}
         if not config.fallback:

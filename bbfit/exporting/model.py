@@ -9,7 +9,7 @@ from bbfit.exporting.cards import Cards, cloud_cards
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import with_hulls
-from bbfit.exporting.mips import mip_chain
+from bbfit.exporting.mip_matching import with_mips
 from bbfit.exporting.obj import mtl_bytes, obj_bytes
 from bbfit.exporting.splitting import split
 from bbfit.files import write_bytes
@@ -51,8 +51,8 @@ def write_model(cards: Cards, path: Path, config: ExportConfig) -> list[Path]:
             texture: encode_png(cards.atlas.image),
         }
     if config.mip_files:
-        chain = mip_chain(cards.atlas, cards.alpha.cutoff if cards.alpha.kind == "mask" else None)
-        contents |= {path.with_name(f"{path.stem}_mip{level}.png"): encode_png(image) for level, image in enumerate(chain)}
+        levels = enumerate(cards.chain or [cards.atlas.image])
+        contents |= {path.with_name(f"{path.stem}_mip{level}.png"): encode_png(image) for level, image in levels}
     for file, data in reversed(contents.items()):  # what is referred to before what refers to it
         write_bytes(file, data)
     return list(contents)
@@ -65,7 +65,7 @@ def as_shipped(cloud: BillboardCloud, config: ExportConfig) -> BillboardCloud:
 
 
 def shipped_cards(cloud: BillboardCloud, config: ExportConfig) -> Cards:
-    """The polygons that a model file of the cloud has, cut up and trimmed as asked for.
+    """The polygons that a model file of the cloud has, cut up and trimmed as asked for, and their mip levels if the file brings any.
 
     Raises
     ------
@@ -76,7 +76,9 @@ def shipped_cards(cloud: BillboardCloud, config: ExportConfig) -> Cards:
     cards = cloud_cards(as_shipped(cloud, config), config.padding)
     if config.split and cards.alpha.kind == "blend":
         cards = split(cards)
-    return cards if config.hull is None else with_hulls(cards, config.hull, shows_from(cards))
+    if config.hull is not None:
+        cards = with_hulls(cards, config.hull, shows_from(cards))
+    return with_mips(cards) if config.brings_mips else cards
 
 
 def shows_from(cards: Cards) -> float:

@@ -65,6 +65,12 @@ def report_table(report: Report, title: str = "Held-out views") -> Table:
             name = f"PSNR, dB, at {ring.elevation_degrees:.0f}°"
             table.add_row(name, _UP, f"{white.psnr:.2f}", f"{rgba.psnr:.2f}", f"{thesis.psnr:.3f}")
 
+    if report.sizes:
+        table.add_section()
+        table.add_row("[bold]as exported[/]", "", "[bold]PSNR, dB[/]", "[bold]coverage[/]", "")
+        for size in report.sizes:
+            table.add_row(f"{size.width} x {size.height} pixels", f"{_UP} {_ONE}", f"{size.psnr:.2f}", _share(size.coverage), "")
+
     table.add_section()
     table.add_row("[bold]cost[/]", "", "[bold]model[/]", "[bold]original[/]", "[bold not dim]ratio[/]")
     for name, cost in (("vertices", report.vertices), ("file, bytes", report.bytes)):

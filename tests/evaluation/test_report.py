@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from bbfit.checks import InputError, MissingFileError
-from bbfit.evaluation.report import Cost, Measures, OverWhite, Report, Rgba, ThesisScale, ViewScore
+from bbfit.evaluation.report import Cost, Measures, OverWhite, Report, Rgba, SizeScore, ThesisScale, ViewScore
 
 
 def score(name: str, scale: float, sharpness: float | None = 1.0) -> ViewScore:
@@ -19,7 +19,8 @@ def score(name: str, scale: float, sharpness: float | None = 1.0) -> ViewScore:
     return ViewScore(name, 12.0, 0.0, measures)
 
 
-REPORT = Report((score("a", 1.0), score("b", 1.5, None)), Cost(16, 113_152), Cost(None, 5_000), {"fit": 2.0})
+SIZES = (SizeScore(64, 48, 20.5, 1.01, 0.1), SizeScore(32, 24, 21.5, None, 0.09))
+REPORT = Report((score("a", 1.0), score("b", 1.5, None)), Cost(16, 113_152), Cost(None, 5_000), {"fit": 2.0}, sizes=SIZES)
 MEASURES = {
     "over_white": {"psnr", "ssim", "flip"},
     "rgba": {"rmse", "psnr", "iou"},
@@ -51,7 +52,19 @@ def test_ratio_is_table_1s() -> None:
 
 def test_schema() -> None:
     content = REPORT.to_json()
-    assert list(content) == [*MEASURES, "sharpness", "brightness", "vertices", "bytes", "overdraw", "alpha", "seconds", "rings", "views"]
+    assert list(content) == [
+        *MEASURES,
+        "sharpness",
+        "brightness",
+        "vertices",
+        "bytes",
+        "overdraw",
+        "alpha",
+        "seconds",
+        "sizes",
+        "rings",
+        "views",
+    ]
     assert list(content["views"][0]) == ["name", "azimuth_degrees", "elevation_degrees", *MEASURES, "sharpness", "brightness"]
     assert list(content["rings"][0]) == ["elevation_degrees", "views", *MEASURES, "sharpness", "brightness"]
     for part in (content, *content["views"], *content["rings"]):
@@ -59,6 +72,7 @@ def test_schema() -> None:
     for cost in ("vertices", "bytes"):
         assert set(content[cost]) == {"model", "original", "ratio"}
     assert content["views"][1]["sharpness"] is None
+    assert content["sizes"][0] == {"width": 64, "height": 48, "psnr": 20.5, "coverage": 1.01, "alpha": 0.1}
     assert json.loads(json.dumps(content, allow_nan=False)) == content
 
 

@@ -153,7 +153,19 @@ def test_a_missing_encoder_is_named(crossed: BillboardCloud, tmp_path: Path, mon
     with pytest.raises(InputError, match=r"bbfit\[ktx2\]"):
         export(crossed, tmp_path / "model.glb", ExportConfig(textures="ktx2"))
     assert not list(tmp_path.iterdir())
-    export(crossed, tmp_path / "model.glb", ExportConfig(profile="three"))
+
+
+def test_ktx2_is_shipped_where_it_can_be(crossed: BillboardCloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without its encoder the file is what it would be in PNG, and the configuration tells what to install."""
+    config = ExportConfig(textures="auto")
+    (path,) = export(crossed, tmp_path / "model.glb", config)
+    assert "KHR_texture_basisu" in tree_of(path)[0]["extensionsUsed"] and config.missed is None
+    (png,) = export(crossed, tmp_path / "png.glb", replace(config, textures="png"))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    (without,) = export(crossed, tmp_path / "without.glb", config)
+    assert without.read_bytes() == png.read_bytes()
+    assert config.missed is not None and "bbfit[ktx2]" in config.missed
+    assert ExportConfig().missed is None
 
 
 def test_a_glb_taken_apart_and_joined_is_the_same(crossed: BillboardCloud, tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from three_viewer import ThreeViewer
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import evaluate, held_out
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import as_shipped, export
+from bbfit.exporting.drawing import draw_cards
+from bbfit.exporting.model import as_shipped, export, shipped_cards
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import fit
 from bbfit.geometry.cloud import BillboardCloud
@@ -68,6 +69,26 @@ def test_what_is_not_split_is_shown_in_the_wrong_order(
         (path,) = export(fits["blend"], tmp_path / "model.glb", ExportConfig(split=split))
         own.append(psnrs(three.render(path, views.test.cameras), fits["blend"], views)[0])
     assert own[0] > own[1] + 3
+
+
+def test_three_shows_mip_levels_as_dense_as_the_views_from_afar(
+    three: ThreeViewer, fits: dict[str, BillboardCloud], views: ViewDataset, tmp_path: Path
+) -> None:
+    """At a half, a quarter and an eighth of the size, by textures in KTX2; all pixels that are not white are covered.
+
+    Measured: 25.0, 23.7 and 22.9 dB from bbfit's own, of which without levels it is 5 to 7 dB less; coverage 0.99, 0.99 and 0.97.
+    """
+    config = ExportConfig(profile="three", textures="ktx2", fallback=False)
+    (path,) = export(fits["mask"], tmp_path / "model.glb", config)
+    cards = shipped_cards(fits["mask"], config)
+    wanted = float(views.test.targets(range(len(views.test)))[..., 3].mean())
+    width, height = views.test.cameras.width, views.test.cameras.height
+    for halving in (1, 2, 3):
+        cameras = views.test.cameras.resized(width >> halving, height >> halving)
+        shown = three.render(path, cameras)
+        own, without = (over_colour(draw_cards(cards, cameras, chain).double()).numpy() for chain in (cards.chain, None))
+        assert metrics.psnr(own, shown) >= max(21, metrics.psnr(without, shown) + 4)
+        assert float((shown < 1).any(-1).mean()) / wanted == pytest.approx(1, abs=0.05)
 
 
 def test_blender_shows_what_was_scored(fits: dict[str, BillboardCloud], views: ViewDataset, tmp_path: Path) -> None:

@@ -1,0 +1,158 @@
+"""Mip levels with which cards together stay as dense on the screen as their tree, however far away they are.
+
+Levels that keep the coverage of each texture (:func:`~bbfit.exporting.mips.mip_chain`) are not enough. Mixing two levels trilinearly
+before the test loses what only one of them shows. And cards overlap: what ever coarser texels keep of each is where it is densest,
+which is in the same places of the picture, so that together they cover less and less. Blended cards cover more instead, as averages
+no longer have their leaves and their gaps in different places. All of it is made up for by one factor on alpha for each level.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bbfit.checks import fail
+from bbfit.exporting.cards import Cards
+from bbfit.exporting.drawing import filtered, hits, joined, sheets_of
+from bbfit.exporting.mips import mip_chain
+from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.orbit import Orbit
+from bbfit.rendering.compositing import opacity
+
+# Pictures in which coverage is counted have so many pixels a side at most.
+_SIDE = 96
+# Where they are taken from.
+_ORBIT = Orbit(24)
+# Levels count up to the last that matters to views so many pixels wide; those beyond take its factor.
+_LEAST_WIDTH = 8
+# Each level's factor is sought so often, since its neighbours' factors matter to it; the first time with one factor for all beyond it.
+_SWEEPS = 2
+# A factor is sought within so many doublings of 1, later of what it was, which are halved so often; it is good if coverage is as wanted
+# but for this share.
+_FIRST, _LATER, _TOLERANCE = (2.0, 8), (0.25, 5), 0.002
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """What V cameras see of the cards, each sheet's hits in all views in one row."""
+
+    pixels: list[Tensor]
+    """Number of each hit's pixel among those of all views, int64 [M] for each sheet."""
+    uvs: list[Tensor]
+    """Float64 [M, 2] each."""
+    details: list[Tensor]
+    """Level of detail less the median over all hits, float64 [M] each."""
+    count: int
+    """Pixels of all views."""
+
+
+def with_mips(cards: Cards) -> Cards:
+    """Cards with mip levels that look as dense from afar as the cards do from near, by views from all around.
+
+    Takes some seconds for textures of a million texels.
+    """
+    chain = mip_chain(cards.atlas, cards.alpha.cutoff if cards.alpha.kind == "mask" else None)
+    points = np.concatenate([card.corners for card in cards.cards])
+    target = torch.from_numpy((points.min(0) + points.max(0)) / 2)
+    cameras = _ORBIT.frame(points, target=target, width=_SIDE, height=_SIDE)
+    return replace(cards, chain=tuple(matched_chain(cards, chain, cameras)))
+
+
+def matched_chain(cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Camera) -> list[NDArray[np.uint8]]:
+    """Mip levels whose alpha is multiplied by what makes the cards cover as much of the picture from afar as they do by level 0.
+
+    For each level there is a distance from which half of all pixels of the cards are filtered with this or coarser levels. As seen from
+    there, though on more pixels, so that few of them do not decide by chance, coverage is counted in all views together, and the level's
+    factor found by bisection. Level 0 stays as it was fitted. Alpha is clipped at 1, colours are left alone.
+
+    The modes blend and hash are matched alike: a hash covers as much as a blend does, on average.
+
+    Some twenty views from all around are enough, and take a few seconds; four are not.
+
+    Parameters
+    ----------
+    cards : with the alpha mode that they are shown with.
+    chain : their mip levels, level 0 first (:func:`~bbfit.exporting.mips.mip_chain`, with the cutoff where there is one).
+    cameras : V views of the tree; none that the result is scored on.
+
+    Returns
+    -------
+    As many levels; level 0 is the same array.
+
+    Raises
+    ------
+    InputError
+        if the cards show in no view.
+    """
+    cameras = cameras.batch()
+    joined(chain, cards.atlas.image.shape)  # for its checks
+    reduction = max(1.0, max(cameras.width, cameras.height) / _SIDE)
+    width, height = (max(1, round(side / reduction)) for side in (cameras.width, cameras.height))
+    sight, detail = _look(cards, cameras.resized(width, height))
+    # Pictures a quarter as large have a median level of detail that is two more, and so on.
+    last = min(len(chain) - 1, math.ceil(detail + math.log2(width / _LEAST_WIDTH)))
+    factors = np.ones(len(chain))
+    alphas = [level[..., 3:] for level in chain]
+    wanted = _coverage(sight, alphas[:1], 0, cards.alpha)
+    if wanted == 0:
+        return list(chain)  # nothing shows, near or far
+    for sweep in range(_SWEEPS):
+        for level in range(1, last + 1):
+            beyond = len(chain) if sweep == 0 or level == last else level + 1
+
+            def excess(factor: float, level: int = level, beyond: int = beyond) -> float:
+                factors[level:beyond] = factor
+                return _coverage(sight, _scaled(alphas, factors), level, cards.alpha) / wanted - 1
+
+            factors[level:beyond] = _root(excess, factors[level], *(_LATER if sweep else _FIRST))
+    scaled = _scaled(alphas, factors)
+    return [chain[0], *(np.concatenate([level[..., :3], alpha], -1) for level, alpha in zip(chain[1:], scaled[1:], strict=True))]
+
+
+def _look(cards: Cards, cameras: Camera) -> tuple[_Sight, float]:
+    """What the cameras see, and the median level of detail."""
+    pixels, uvs, details, count = [], [], [], cameras.width * cameras.height
+    for sheet in sheets_of(cards):
+        seen = [hits(cards, sheet, cameras[index]) for index in range(len(cameras))]
+        pixels.append(torch.cat([index * count + met.y * cameras.width + met.x for index, met in enumerate(seen)]))
+        uvs.append(torch.cat([met.uv for met in seen]))
+        details.append(torch.cat([met.detail for met in seen]))
+    if not any(map(len, pixels)):
+        fail("cameras", "see nothing of the cards", "give those of the views that they were fitted to")
+    detail = float(torch.cat(details).median())
+    return _Sight(pixels, uvs, [each - detail for each in details], count * len(cameras)), detail
+
+
+def _scaled(alphas: list[NDArray[np.uint8]], factors: NDArray[np.float64]) -> list[NDArray[np.uint8]]:
+    return [
+        alpha if factor == 1 else np.rint(np.minimum(alpha * np.float32(factor), 255)).astype(np.uint8)
+        for alpha, factor in zip(alphas, factors, strict=True)
+    ]
+
+
+def _coverage(sight: _Sight, alphas: list[NDArray[np.uint8]], level: int, mode: AlphaMode) -> float:
+    """Mean alpha of the pictures if that level is the median level of detail, in [0, 1]; ``alphas`` are the levels' [h, w, 1]."""
+    levels, clear = joined(alphas, alphas[0].shape), torch.ones(sight.count)
+    for pixels, uv, detail in zip(sight.pixels, sight.uvs, sight.details, strict=True):
+        alpha = filtered(levels, uv, detail + level)[:, 0] / 255
+        clear[pixels] *= 1 - (alpha if mode.kind == "hash" else opacity(alpha, mode))  # whatever the order of depth
+    return 1 - float(clear.double().mean())
+
+
+def _root(excess: Callable[[float], float], around: float, doublings: float, halvings: int) -> float:
+    """The factor at which an excess that grows with it vanishes, or the bound that comes nearest, by bisection of its logarithm."""
+    low, high = -doublings, doublings
+    for _ in range(halvings + 1):
+        middle = (low + high) / 2
+        now = excess(around * 2.0**middle)
+        if abs(now) <= _TOLERANCE:
+            break
+        low, high = (middle, high) if now < 0 else (low, middle)
+    return around * 2.0**middle
