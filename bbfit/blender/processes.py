@@ -142,6 +142,27 @@ class BlenderPool:
             )
         return event
 
+    def convert(self, triangles: int | None) -> Path:
+        """Write the tree as a GLB file with at most about so many triangles; the file goes when the pool does.
+
+        Raises
+        ------
+        BlenderError
+            when Blender crashes.
+        InputError
+            when the tree cannot be read or written.
+        """
+        path = Path(self._scratch.name) / "tree.glb"
+        self._job = self._job | {"convert": {"path": str(path), "triangles": triangles}}
+        self._start(measure=False)
+        worker, event = self._next()
+        if event["event"] == "exit":
+            raise BlenderError(
+                f"Blender: crashed while converting {self._job['tree']} ({worker.last_words()}); "
+                "open the file in Blender itself to see whether it is damaged"
+            )
+        return path
+
     def render(self, frames: list[dict[str, Any]], workers: int, kept: int, on_done: Callable[[int], None]) -> None:
         """Render frames on the loaded process and ``workers - 1`` more.
 

@@ -1,15 +1,17 @@
-"""Runs in a process of its own, as the only importer of bpy: loads one tree, measures it, renders the frames that it is told to.
+"""Runs in a process of its own, with Blender in it: loads one tree, measures it, renders the frames that it is told to.
 
 It is started by path and knows nothing of bbfit, so that it starts fast. It speaks JSON lines: on standard input one job, then one
 line a frame; on standard output ``ready`` (followed by the vertices as raw float32, if the job asks for them), ``done`` a frame, or
-``refused`` with the reason. What Blender itself prints goes to standard error. When standard input ends, because the parent closed it
-or died, so does this process, in the middle of a render if need be.
+``refused`` with the reason. A job that holds ``convert`` has the tree written as a GLB file, by worker_glb.py beside this file, and is
+answered by ``converted`` or ``refused``. What Blender itself prints goes to standard error. When standard input ends, because the
+parent closed it or died, so does this process, in the middle of a render if need be.
 
 One process renders one frame at a time and never two scenes: two renders at once crash Blender.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 import os
@@ -28,6 +30,7 @@ UNRENDERED = {"LIGHT", "LIGHT_PROBE", "VOLUME", "CURVES", "POINTCLOUD", "GREASEP
 # Foliage made of pictures with alpha: a ray may have to cross this many leaves.
 TRANSPARENT_LAYERS = 64
 AGAIN = "free the disk or make the folder writable, then start again; finished views are kept"
+AGAIN_GLB = "free the disk of temporary files, then start again, or look at the file in Blender itself"
 
 
 class Refused(Exception):
@@ -52,6 +55,9 @@ def main() -> NoReturn:
 
     job = requests.get()
     try:
+        if "convert" in job:
+            convert(job, answer)
+            os._exit(0)
         prepare(job, answer)
         while True:
             frame = requests.get()
@@ -75,17 +81,42 @@ def _listen(requests: queue.Queue[dict[str, Any]]) -> None:
     os._exit(1)
 
 
-def prepare(job: dict[str, Any], answer: Any) -> None:
-    """Load the tree, set up light, camera and renderer, and report what was found."""
+def open_tree(path: str) -> tuple[np.ndarray, dict[str, Any]]:
+    """Load the tree as it renders, materials included; its vertices and what is reported of it."""
     try:
         import bpy
     except ImportError as error:
         raise Refused("Blender", f"its module bpy cannot be loaded ({error})", "install what it misses") from error
-    load(job["tree"])
+    load(path)
     show_what_renders()
-    points, faces = measure(job["tree"])
-    report = {"vertices": len(points), "faces": faces, "blender": bpy.app.version_string}
+    points, faces = measure(path)
     add_plain_material()
+    return points, {"vertices": len(points), "faces": faces, "blender": bpy.app.version_string}
+
+
+def convert(job: dict[str, Any], answer: Any) -> None:
+    """Load the tree and write it as a GLB file."""
+    _, report = open_tree(job["tree"])
+    spec = importlib.util.spec_from_file_location("worker_glb", Path(__file__).with_name("worker_glb.py"))
+    assert spec and spec.loader
+    writer = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = writer  # where dataclasses look for their module
+    spec.loader.exec_module(writer)
+    wanted = job["convert"]
+    try:
+        left = writer.write(wanted["path"], wanted["triangles"])
+    except RuntimeError as error:  # the exporter's, whatever went wrong in it
+        raise Refused("tree", f"{job['tree']} cannot be written as .glb ({' '.join(str(error).split())[-200:]})", AGAIN_GLB) from error
+    if not left:
+        raise Refused("triangles", f"nothing is left of {job['tree']} with {wanted['triangles']}", "allow more triangles")
+    answer("converted", **report, triangles=left)
+
+
+def prepare(job: dict[str, Any], answer: Any) -> None:
+    """Load the tree, set up light, camera and renderer, and report what was found."""
+    import bpy
+
+    points, report = open_tree(job["tree"])
     add_light(job)
     set_up_cycles(job)
     camera = bpy.data.objects.new("bbfit camera", bpy.data.cameras.new("bbfit camera"))
@@ -230,7 +261,7 @@ def plain_material(attribute: str) -> Any:
     """A matt material, grey or coloured by a vertex attribute."""
     import bpy
 
-    name = f"bbfit plain {attribute}"
+    name = f"bbfit plain {attribute}".strip()
     if name in bpy.data.materials:
         return bpy.data.materials[name]
     material = bpy.data.materials.new(name)
