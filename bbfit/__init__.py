@@ -14,13 +14,14 @@ if TYPE_CHECKING:
     from bbfit.checks import InputError
     from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
-    from bbfit.exporting.config import ExportConfig
+    from bbfit.exporting.config import ExportConfig, LodConfig
     from bbfit.exporting.model import export
     from bbfit.fitting.config import FitConfig
     from bbfit.fitting.loop import FitResult, fit
     from bbfit.geometry.camera import Camera
     from bbfit.geometry.cloud import BillboardCloud
     from bbfit.geometry.orbit import Orbit
+    from bbfit.lod import build_lod
     from bbfit.pipeline import RunConfig, run
     from bbfit.rendering.dispatch import render
     from bbfit.trees.config import GrowConfig
@@ -39,12 +40,14 @@ _HOMES = {
     "FitResult": "bbfit.fitting.loop",
     "GrowConfig": "bbfit.trees.config",
     "InputError": "bbfit.checks",
+    "LodConfig": "bbfit.exporting.config",
     "Orbit": "bbfit.geometry.orbit",
     "Report": "bbfit.evaluation.report",
     "RunConfig": "bbfit.pipeline",
     "Species": "bbfit.trees.species",
     "ViewDataset": "bbfit.views",
     "ViewsConfig": "bbfit.blender.config",
+    "build_lod": "bbfit.lod",
     "choose": "bbfit.budget.choice",
     "evaluate": "bbfit.evaluation.scoring",
     "export": "bbfit.exporting.model",
@@ -67,12 +70,14 @@ __all__ = [
     "FitResult",
     "GrowConfig",
     "InputError",
+    "LodConfig",
     "Orbit",
     "Report",
     "RunConfig",
     "Species",
     "ViewDataset",
     "ViewsConfig",
+    "build_lod",
     "choose",
     "evaluate",
     "export",

@@ -20,7 +20,7 @@ from rich.console import Console
 from bbfit.blender.config import ViewsConfig
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, fail
-from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.trees.config import GrowConfig
 
@@ -215,6 +215,40 @@ def _export(
     _show_missed(config)
 
 
+def _lod(
+    tree: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TREE")],
+    /,
+    out: Path,
+    work: Path | None = None,
+    config: Annotated[LodConfig, tyro.conf.arg(name="")] = LodConfig(),  # noqa: B008
+    views: ViewsConfig = ViewsConfig(),  # noqa: B008
+    fit: FitConfig = FitConfig(),  # noqa: B008
+    export: ExportConfig = ExportConfig(),  # noqa: B008
+) -> None:
+    """Make levels of detail: the tree and ever fewer billboards in one GLB, each shown from where its error does not show.
+
+    Killed and started again, it goes on where it stopped.
+
+    Args:
+        tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
+        out: The file, ending in .glb.
+        work: Folder for views, a run for each level, lod.json and lod.png; left out, it is called as the file is without its ending.
+        config: Which levels there are.
+        views: How the tree is rendered.
+        fit: How the billboards are fitted.
+        export: How they are written.
+    """
+    from bbfit.lod import build_lod
+    from bbfit.pipeline import RunConfig
+    from bbfit.reporting.tables import lod_table
+
+    with _progress() as tell:
+        result = build_lod(tree, out, config, RunConfig(views=views, fit=fit, export=export), work=work, on_progress=tell)
+    _out.print(lod_table(result.levels))
+    _show_missed(export)
+    _out.print(f"levels of detail in {result.path}, {result.path.stat().st_size:,} bytes; measures in {result.folder}", soft_wrap=True)
+
+
 def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     """The same command line, but parsing it only returns what to do."""
 
@@ -232,6 +266,7 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "fit": _later(_fit),
     "evaluate": _later(_evaluate),
     "export": _later(_export),
+    "lod": _later(_lod),
 }
 
 

@@ -34,7 +34,7 @@ GROUPS = (
     ("budget",),
     ("reporting",),
     ("pipeline",),
-    ("sweep",),
+    ("lod", "sweep"),
     ("cli",),
     ("__main__",),
 )
@@ -42,7 +42,7 @@ LEVEL = {name: level for level, group in enumerate(GROUPS) for name in group}
 
 # Heavy or optional modules, and the only files that import them.
 ONLY_IN = {
-    "bpy": {"blender/worker.py"},
+    "bpy": {"blender/worker.py", "blender/worker_glb.py"},
     "cv2": {"images.py", "fitting/bounds.py"},
     "xatlas": {"exporting/packing.py"},
     "warp": {

@@ -42,7 +42,7 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["grow"], ["views"], ["fit"], ["evaluate"], ["export"]])
+@pytest.mark.parametrize("command", [[], ["run"], ["grow"], ["views"], ["fit"], ["evaluate"], ["export"], ["lod"]])
 def test_help_shows_defaults_and_needs_no_torch(command: list[str]) -> None:
     script = (
         "import sys; from bbfit.cli import main\n"

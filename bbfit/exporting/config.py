@@ -6,7 +6,7 @@ import importlib.util
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
-from bbfit.checks import check_choice, check_count, fail
+from bbfit.checks import check_choice, check_count, check_range, fail
 from bbfit.geometry.alpha import AlphaKind, check_cutoff
 
 Up = Literal["auto", "y", "z"]
@@ -96,6 +96,41 @@ class ExportConfig:
     def missed(self) -> str | None:
         """What to install for the textures that were wished for but not insisted on, if they are not had."""
         return ktx2_missing() if self.textures == "auto" else None
+
+
+@dataclass(frozen=True)
+class LodConfig:
+    """How a tree and billboard clouds of it become levels of detail in one file."""
+
+    planes: tuple[int, ...] = (16, 8, 4, 2)
+    """Billboards of each level, falling."""
+    error_pixels: float = 1.0
+    """Most that a level's silhouette, gaps included, may be off on the screen where it takes over, in pixels: for 95 of 100 pixels of the
+    silhouette, in every training view."""
+    original: bool = True
+    """Keep the tree itself as the finest level."""
+    triangles: int | None = None
+    """Triangles that the tree is thinned out to at most, by Blender; all of them when left out."""
+    screen_width: int = 1920
+    """Width in pixels of the screen that distances and screen coverages are given for."""
+    screen_height: int = 1080
+    """Height of that screen in pixels."""
+    screen_fov_degrees: float = 50.0
+    """Vertical field of view of that screen in degrees."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.planes, tuple | list) or not self.planes:
+            fail("planes", "expected one or more numbers of billboards", "say for example 16 8 4 2")
+        for count in self.planes:
+            check_count("planes", count)
+        if any(coarse >= fine for fine, coarse in zip(self.planes, self.planes[1:], strict=False)):
+            fail("planes", f"expected falling numbers, got {' '.join(map(str, self.planes))}", "name the finest level first")
+        check_range("error_pixels", self.error_pixels, 0, 100, open_low=True)
+        if self.triangles is not None:
+            check_count("triangles", self.triangles)
+        check_count("screen_width", self.screen_width)
+        check_count("screen_height", self.screen_height)
+        check_range("screen_fov_degrees", self.screen_fov_degrees, 0, 170, open_low=True)
 
 
 def ktx2_missing() -> str | None:

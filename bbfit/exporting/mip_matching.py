@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bbfit.checks import fail
+from bbfit.exporting.atlas import Atlas
 from bbfit.exporting.cards import Cards
 from bbfit.exporting.drawing import filtered, hits, joined, sheets_of
 from bbfit.exporting.mips import mip_chain
@@ -58,11 +59,39 @@ def with_mips(cards: Cards) -> Cards:
 
     Takes some seconds for textures of a million texels.
     """
-    chain = mip_chain(cards.atlas, cards.alpha.cutoff if cards.alpha.kind == "mask" else None)
+    return replace(cards, chain=tuple(matched_chain(cards, _chain(cards), _around(cards))))
+
+
+def reduced(cards: Cards, halvings: int) -> Cards:
+    """Cards with textures of 2^-halvings of their sides, which by themselves look as dense as before in views from all around.
+
+    The atlas's padding is halved as often, so there must be 2^halvings texels of it and that many times the block that sides are
+    multiples of.
+    """
+    if halvings == 0:
+        return cards
+    image = _chain(cards)[halvings]
+    sight, _ = _look(cards, _around(cards))
+    wanted = _coverage(sight, [cards.atlas.image[..., 3:]], 0, cards.alpha)
+
+    def excess(factor: float) -> float:
+        return _coverage(sight, _scaled([image[..., 3:]], np.array([factor])), 0, cards.alpha) / wanted - 1
+
+    factor = _root(excess, 1.0, *_FIRST) if wanted else 1.0
+    image = np.concatenate([image[..., :3], *_scaled([image[..., 3:]], np.array([factor]))], -1)
+    atlas = Atlas(image, cards.atlas.corners >> halvings, -(-cards.atlas.sizes >> halvings))
+    return replace(cards, atlas=atlas)
+
+
+def _chain(cards: Cards) -> list[NDArray[np.uint8]]:
+    return mip_chain(cards.atlas, cards.alpha.cutoff if cards.alpha.kind == "mask" else None)
+
+
+def _around(cards: Cards) -> Camera:
+    """Views of the cards from all around."""
     points = np.concatenate([card.corners for card in cards.cards])
     target = torch.from_numpy((points.min(0) + points.max(0)) / 2)
-    cameras = _ORBIT.frame(points, target=target, width=_SIDE, height=_SIDE)
-    return replace(cards, chain=tuple(matched_chain(cards, chain, cameras)))
+    return _ORBIT.frame(points, target=target, width=_SIDE, height=_SIDE)
 
 
 def matched_chain(cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Camera) -> list[NDArray[np.uint8]]:

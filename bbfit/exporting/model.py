@@ -9,7 +9,7 @@ from bbfit.exporting.cards import Cards, cloud_cards
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import with_hulls
-from bbfit.exporting.mip_matching import with_mips
+from bbfit.exporting.mip_matching import reduced, with_mips
 from bbfit.exporting.obj import mtl_bytes, obj_bytes
 from bbfit.exporting.splitting import split
 from bbfit.files import write_bytes
@@ -64,8 +64,10 @@ def as_shipped(cloud: BillboardCloud, config: ExportConfig) -> BillboardCloud:
     return replace(cloud, alpha=AlphaMode(kind, cutoff))
 
 
-def shipped_cards(cloud: BillboardCloud, config: ExportConfig) -> Cards:
+def shipped_cards(cloud: BillboardCloud, config: ExportConfig, halvings: int = 0) -> Cards:
     """The polygons that a model file of the cloud has, cut up and trimmed as asked for, and their mip levels if the file brings any.
+
+    With ``halvings`` the sides of the textures are halved so often, for a model that is never seen from near.
 
     Raises
     ------
@@ -73,11 +75,12 @@ def shipped_cards(cloud: BillboardCloud, config: ExportConfig) -> Cards:
         if the cloud is empty or has values that are not finite.
     """
     config = config.resolve()
-    cards = cloud_cards(as_shipped(cloud, config), config.padding)
+    cards = cloud_cards(as_shipped(cloud, config), config.padding << halvings)
     if config.split and cards.alpha.kind == "blend":
         cards = split(cards)
     if config.hull is not None:
         cards = with_hulls(cards, config.hull, shows_from(cards))
+    cards = reduced(cards, halvings)
     return with_mips(cards) if config.brings_mips else cards
 
 

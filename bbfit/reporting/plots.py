@@ -14,6 +14,10 @@ from bbfit.budget.choice import Choice, pareto_front
 from bbfit.checks import check_count, fail
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import held_out, view_angles
+from bbfit.evaluation.sizes import shrunk
+from bbfit.exporting.cards import Cards
+from bbfit.exporting.drawing import draw_cards
+from bbfit.exporting.lod import LodLevel
 from bbfit.files import write_bytes
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png, over_colour, to_bytes
@@ -220,6 +224,33 @@ def _draw_front(axes: Any, choice: Choice, cost: Cost) -> None:
     axes.set_xlabel(cost)
     axes.grid(True, color="#e4e7ea", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def lod_picture(levels: Sequence[tuple[LodLevel, Cards]], views: ViewSet, path: str | Path) -> None:
+    """Write a PNG of levels of detail, a column each: one held-out view and the level, as large as where the level takes over.
+
+    Both are enlarged without smoothing until they fill the column.
+    """
+    from PIL import Image, ImageDraw
+
+    width, height = views.cameras.width, views.cameras.height
+    alpha = views.targets([0])[0][..., 3]
+    tall = int(np.ptp(np.flatnonzero(alpha.amax(1).numpy() > 0))) + 1
+    side, gap, text = 384, 16, 14
+    sheet = Image.new("RGB", (gap + len(levels) * (side + gap), 2 * (side + gap) + gap + 3 * text), _PAPER)
+    draw, font, bold = ImageDraw.Draw(sheet), _font("DejaVuSans.ttf", text), _font("DejaVuSans-Bold.ttf", text)
+    for column, (level, cards) in enumerate(levels):
+        share = min(1.0, (level.tree_pixels or tall) / tall)
+        size = max(metrics.SSIM_WINDOW, round(width * share)), max(metrics.SSIM_WINDOW, round(height * share))
+        target = shrunk(views.targets([0])[0], *size)
+        image = draw_cards(cards, views.cameras[0].resized(*size), cards.chain)
+        left = gap + column * (side + gap)
+        draw.text((left, gap // 2), level.name, _INK, bold)
+        draw.text((left, gap // 2 + text * 5 // 4), f"the tree is {tall * share:.0f} pixels high", _FAINT, font)
+        for row, picture in enumerate((target, image)):
+            pixels = Image.fromarray(to_bytes(over_colour(picture))).resize((side, side * height // width), Image.Resampling.NEAREST)
+            sheet.paste(pixels, (left, 3 * text + gap + row * (side + gap)))
+    write_bytes(path, encode_png(np.asarray(sheet)))
 
 
 def running_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from bbfit.evaluation.report import Cost, Report
+from bbfit.exporting.lod import LodLevel
 from bbfit.trees.species import Species
 
 if TYPE_CHECKING:
@@ -80,6 +81,31 @@ def report_table(report: Report, title: str = "Held-out views") -> Table:
     if report.seconds:
         table.caption = "seconds: " + "  ·  ".join(f"{stage} {seconds:,.1f}" for stage, seconds in report.seconds.items())
         table.caption_justify = "left"
+    return table
+
+
+def lod_table(levels: Sequence[LodLevel]) -> Table:
+    """A ``rich`` table of levels of detail: what each costs, and from where on it is shown."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("level")
+    for name in ("planes", "vertices", "bytes", "from, m", "tree, px", "error, px", "held out"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for level in levels:
+        below = "-" if level.tree_pixels is None else f"{level.tree_pixels:.0f}"
+        errors = ["-"] * 2 if level.planes is None else [f"{level.error_pixels:.2f}", f"{level.held_out_error_pixels:.2f}"]
+        planes = "tree" if level.planes is None else str(level.planes)
+        table.add_row(
+            level.name.rsplit("_", 1)[-1],
+            planes,
+            _count(level.vertices),
+            _count(level.bytes),
+            f"{level.distance_metres:.1f}",
+            below,
+            *errors,
+        )
     return table
 
 

@@ -156,3 +156,25 @@ def test_unequal_shapes(measure: object) -> None:
     assert callable(measure)
     with pytest.raises(InputError, match="render: expected shape"):
         measure(np.zeros((16, 16, channels)), np.zeros((1, 16, channels)))
+
+
+def test_silhouettes_are_as_far_apart_as_most_of_their_pixels() -> None:
+    """A block moved by three pixels; a speck that is less than a twentieth of it does not count, a hole that is more does."""
+    target = np.zeros((40, 60, 4))
+    target[10:30, 10:30, 3] = 0.5
+    moved = np.roll(target, 3, 1)
+    assert metrics.silhouette_distance(target, target) == 0
+    # Of 20 columns one each is 1, 2 and 3 pixels off, so that 19 of 20 are within 2.
+    assert metrics.silhouette_distance(target, moved) == metrics.silhouette_distance(moved, target) == 2
+    assert metrics.silhouette_distance(target, np.roll(target, 1, 0)) == 0
+    speck = target.copy()
+    speck[2, 50, 3] = 1
+    assert metrics.silhouette_distance(target, speck) == 0
+    faint = target * 0.9
+    assert metrics.silhouette_distance(target, faint) == np.hypot(40, 60) == metrics.silhouette_distance(faint, target)
+    assert metrics.silhouette_distance(faint, faint) == 0
+    holed = target.copy()
+    holed[16:24, 16:24] = 0
+    assert metrics.silhouette_distance(target, holed) == metrics.silhouette_distance(holed, target) >= 2
+    with pytest.raises(InputError, match="render"):
+        metrics.silhouette_distance(target, target[:-1])

@@ -15,6 +15,7 @@ from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import evaluate, held_out
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.drawing import draw_cards
+from bbfit.exporting.lod import LodLevel, lod_glb
 from bbfit.exporting.model import as_shipped, export, shipped_cards
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import fit
@@ -96,3 +97,19 @@ def test_blender_shows_what_was_scored(fits: dict[str, BillboardCloud], views: V
     (path,) = export(fits["mask"], tmp_path / "model.glb", ExportConfig(profile="blender"))
     own, score, told = psnrs(render_blender(path, views.test.cameras), fits["mask"], views)
     assert own >= LEAST and abs(score - told) <= SCORE
+
+
+def test_three_shows_each_level_of_detail_as_its_own_file(
+    three: ThreeViewer, fits: dict[str, BillboardCloud], views: ViewDataset, tmp_path: Path
+) -> None:
+    """Levels are nodes, the coarser ones beside the scene, which alone is shown by itself."""
+    config = ExportConfig(split=True)
+    paths = [export(fits[alpha], tmp_path / f"{alpha}.glb", config)[0] for alpha in ("mask", "blend")]
+    coverages = {"tree_LOD0": 0.1, "tree_LOD1": 0.0}
+    levels = [LodLevel(name, 4, 0, 0, 0, 0.0, 0.0, 0.0, None, 0.0, None, coverage) for name, coverage in coverages.items()]
+    (both := tmp_path / "both.glb").write_bytes(lod_glb([path.read_bytes() for path in paths], levels))
+    alone = [three.render(path, views.test.cameras) for path in paths]
+    np.testing.assert_array_equal(three.render(both, views.test.cameras), alone[0])
+    for level, image in zip(levels, alone, strict=True):
+        np.testing.assert_array_equal(three.render(both, views.test.cameras, node=level.name), image)
+    assert metrics.psnr(*alone) < 30

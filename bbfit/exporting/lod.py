@@ -1,0 +1,148 @@
+"""Several models of one tree as levels of detail in one GLB, by the extension MSFT_lod."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bbfit.model_files import generator, joined_glb, split_glb
+
+# The lists of a glTF that bbfit's own have.
+_ITEMS = ("bufferViews", "accessors", "images", "samplers", "textures", "materials", "meshes", "nodes")
+
+
+@dataclass(frozen=True)
+class LodLevel:
+    """One level of a file of levels of detail."""
+
+    name: str
+    """Of its node."""
+    planes: int | None
+    """Billboards; ``None`` for the tree itself."""
+    vertices: int
+    """Vertices, counted in the file."""
+    triangles: int
+    """Triangles, counted in the file."""
+    bytes: int
+    """Size as a file of its own."""
+    error_metres: float
+    """How far its silhouette is off (:func:`bbfit.evaluation.metrics.silhouette_distance`) in the training view that is worst; 0 for the
+    tree itself."""
+    error_pixels: float
+    """The same on the screen where the level takes over."""
+    held_out_error_pixels: float
+    """The same by the worst held-out view, which had no say."""
+    psnr: float | None
+    """Over white, in held-out views at their full size; ``None`` for the tree itself."""
+    tree_pixels: float | None
+    """Height of the tree on the screen, in pixels, below which the level is shown; ``None`` for the finest, which has no such bound."""
+    distance_metres: float
+    """Distance of the tree from the camera from which on the level is shown, on the screen that was asked for."""
+    screen_coverage: float
+    """Least share of the screen that the tree's bounding sphere covers where the level is shown; 0 for the coarsest."""
+
+
+def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel]) -> bytes:
+    """Join models into one whose first node has the others as its coarser levels.
+
+    The scene holds the first level alone, under a node of its own; programs that do not know MSFT_lod show just that. The nodes of the
+    other levels stand beside the scene, as the extension has it. The first level's node says in its ``extras`` down to which coverage of
+    the screen each level is shown (``MSFT_screencoverage``) and from which distance on (``lod_distances``, in metres).
+
+    Parameters
+    ----------
+    models : GLB files, finest first. The first may be any for which :func:`stands_alone` holds, and keeps its items and their numbers;
+        the others are ones that :func:`~bbfit.exporting.gltf.glb_bytes` wrote.
+    levels : what they are, one for each.
+    """
+    assert len(models) == len(levels) > 0
+    tree, views = split_glb(models[0])
+    roots = [_rooted(tree, levels[0].name, _scene(tree)["nodes"])]
+    for level, model in zip(levels[1:], models[1:], strict=True):
+        other, contents = split_glb(model)
+        roots.append(_append(tree, other, level.name))
+        views += contents
+    first = tree["nodes"][roots[0]]
+    first["extras"] = {
+        "MSFT_screencoverage": [level.screen_coverage for level in levels],
+        "lod_distances": [level.distance_metres for level in levels],
+    }
+    if len(roots) > 1:
+        first["extensions"] = {"MSFT_lod": {"ids": roots[1:]}}
+        tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), "MSFT_lod"})
+    _scene(tree)["nodes"] = roots[:1]
+    tree["asset"]["generator"] = generator()
+    return joined_glb(tree, views)
+
+
+def stands_alone(path: Path) -> bool:
+    """Whether a file is a GLB of glTF 2.0 with all of its data in its one binary chunk, so that others can be joined to it."""
+    with path.open("rb") as file:
+        head = file.read(20)
+        if len(head) < 20 or head[:4] != b"glTF" or head[16:] != b"JSON" or int.from_bytes(head[4:8], "little") != 2:
+            return False
+        tree = json.loads(file.read(int.from_bytes(head[12:16], "little")))
+    uris = [item for kind in ("buffers", "images") for item in tree.get(kind, []) if "uri" in item]
+    return len(tree.get("buffers", [])) == 1 and not uris and bool(tree.get("scenes"))
+
+
+def _scene(tree: dict[str, Any]) -> dict[str, Any]:
+    """The scene that is shown."""
+    scene: dict[str, Any] = tree["scenes"][tree.get("scene", 0)]
+    return scene
+
+
+def _append(tree: dict[str, Any], other: dict[str, Any], name: str) -> int:
+    """Append the items of another glTF in place, called after a new node above its scene's; that node's number."""
+    at = {kind: len(tree.setdefault(kind, [])) for kind in _ITEMS}
+
+    def moved(item: dict[str, Any], **kinds: str) -> dict[str, Any]:
+        return item | {key: item[key] + at[kind] for key, kind in kinds.items() if key in item}
+
+    tree["bufferViews"] += other["bufferViews"]
+    tree["accessors"] += [moved(accessor, bufferView="bufferViews") for accessor in other["accessors"]]
+    tree["images"] += [moved(image, bufferView="bufferViews") for image in other["images"]]
+    tree["samplers"] += other["samplers"]
+    for texture in other["textures"]:
+        sources = {extension: moved(entry, source="images") for extension, entry in texture.get("extensions", {}).items()}
+        tree["textures"].append(moved(texture, sampler="samplers", source="images") | ({"extensions": sources} if sources else {}))
+    for material in other["materials"]:
+        surface = material["pbrMetallicRoughness"]
+        picture = moved(surface["baseColorTexture"], index="textures")
+        tree["materials"].append(material | {"pbrMetallicRoughness": surface | {"baseColorTexture": picture}})
+    for mesh in other["meshes"]:
+        primitives = [
+            moved(primitive, indices="accessors", material="materials")
+            | {"attributes": {key: index + at["accessors"] for key, index in primitive["attributes"].items()}}
+            for primitive in mesh["primitives"]
+        ]
+        tree["meshes"].append(mesh | {"name": f"{name}_{mesh['name']}", "primitives": primitives})
+    for node in other["nodes"]:
+        children = {"children": [child + at["nodes"] for child in node["children"]]} if "children" in node else {}
+        tree["nodes"].append(moved(node, mesh="meshes") | children | {"name": f"{name}_{node['name']}"})
+    for key in ("extensionsUsed", "extensionsRequired"):
+        if key in other:
+            tree[key] = sorted({*tree.get(key, ()), *other[key]})
+    return _rooted(tree, name, [node + at["nodes"] for node in _scene(other)["nodes"]])
+
+
+def _rooted(tree: dict[str, Any], name: str, children: list[int]) -> int:
+    """Put nodes under a new one; its number."""
+    tree["nodes"].append({"name": name, "children": children})
+    return len(tree["nodes"]) - 1
+
+
+def glb_counts(glb: bytes) -> tuple[int, int]:
+    """Vertices and triangles of everything that nodes of a GLB show; a mesh counts for each of its nodes, strips and fans as they are."""
+    tree, _ = split_glb(glb)
+    vertices = triangles = 0
+    for node in tree["nodes"]:
+        for primitive in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
+            count = tree["accessors"][primitive["attributes"]["POSITION"]]["count"]
+            corners = tree["accessors"][primitive["indices"]]["count"] if "indices" in primitive else count
+            vertices += count
+            triangles += {4: corners // 3, 5: max(0, corners - 2), 6: max(0, corners - 2)}.get(primitive.get("mode", 4), 0)
+    return vertices, triangles

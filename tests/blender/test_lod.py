@@ -1,0 +1,161 @@
+"""Levels of detail of a real tree, by the real Blender: small and coarse, but all of the way."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from bbfit.blender.config import ViewsConfig
+from bbfit.checks import InputError
+from bbfit.evaluation.metrics import silhouette_distance
+from bbfit.evaluation.scoring import held_out
+from bbfit.exporting.config import ExportConfig, LodConfig
+from bbfit.exporting.lod import glb_counts
+from bbfit.files import read_json
+from bbfit.fitting.config import FitConfig
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.lod import LodLevel, LodResult, build_lod
+from bbfit.model_files import split_glb
+from bbfit.pipeline import RunConfig
+from bbfit.views import ViewDataset
+
+TREE = Path(__file__).resolve().parents[2] / "data" / "tree.glb"
+SMALL = RunConfig(views=ViewsConfig(count=12, size=64, samples=4), fit=FitConfig(steps=40, candidates=2, revisions=1, searches=1))
+LEVELS = LodConfig(planes=(4, 2), error_pixels=0.5)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> LodResult:
+    """Four and two billboards, and the tree."""
+    return build_lod(TREE, tmp_path_factory.mktemp("lod") / "oak.glb", LEVELS, SMALL)
+
+
+def test_the_file_has_the_tree_and_the_clouds(built: LodResult) -> None:
+    tree, _ = split_glb(built.path.read_bytes())
+    (root,) = tree["scenes"][tree["scene"]]["nodes"]
+    numbers = [root, *tree["nodes"][root]["extensions"]["MSFT_lod"]["ids"]]
+    names = [tree["nodes"][number]["name"] for number in numbers]
+    assert names == [level.name for level in built.levels] == [f"oak_LOD{number}" for number in range(3)]
+    assert [level.planes for level in built.levels] == [None, 4, 2]
+    assert (built.levels[0].vertices, built.levels[0].triangles) == glb_counts(TREE.read_bytes())
+    assert [level.vertices for level in built.levels[1:]] == [16, 8] and [level.triangles for level in built.levels[1:]] == [8, 4]
+    together = sum(level.vertices for level in built.levels), sum(level.triangles for level in built.levels)
+    assert glb_counts(built.path.read_bytes()) == together
+    extras = tree["nodes"][root]["extras"]
+    assert extras["MSFT_screencoverage"] == [level.screen_coverage for level in built.levels]
+    assert extras["lod_distances"] == [level.distance_metres for level in built.levels]
+
+
+def test_levels_take_over_where_their_error_is_within_the_bound(built: LodResult) -> None:
+    """By the tree's own geometry: distance times pixels a metre is the screen's focal length, coverage that of the bounding sphere."""
+    views = ViewDataset.load(built.folder / "views")
+    focal = 1080 / 2 / np.tan(np.radians(25))
+    points = trimesh.load(TREE, force="mesh").vertices
+    radius, height = np.linalg.norm(np.ptp(points, axis=0)) / 2, np.ptp(points[:, 1])
+    # The cameras look at the axis, from as far as they are from it.
+    axis = views.request["camera"]["distance"]
+    scale = float(views.train.cameras.intrinsics[0, 0, 0]) / axis
+    before: LodLevel = built.levels[0]
+    assert before.distance_metres == before.error_metres == 0 and before.tree_pixels is None
+    for level in built.levels[1:]:
+        cloud = BillboardCloud.load(built.folder / str(level.planes) / "cloud.safetensors")
+        worst = [
+            max(silhouette_distance(*(picture.numpy() for picture in held_out(cloud, split, index))) for index in range(len(split)))
+            for split in (views.train, views.test)
+        ]
+        assert level.error_metres == pytest.approx(worst[0] / scale, rel=1e-3) and worst[0] > 0
+        pixels_a_metre = focal / level.distance_metres
+        assert level.error_pixels == pytest.approx(level.error_metres * pixels_a_metre)
+        assert level.held_out_error_pixels == pytest.approx(worst[1] / scale * pixels_a_metre, rel=1e-3)
+        assert level.error_pixels <= LEVELS.error_pixels + 1e-9
+        assert level.tree_pixels == pytest.approx(height * pixels_a_metre, rel=1e-3) and level.distance_metres >= before.distance_metres
+        # The level before it ends where this one begins.
+        assert before.screen_coverage == pytest.approx(np.pi * (radius * pixels_a_metre) ** 2 / (1920 * 1080), rel=1e-3)
+        before = level
+    assert before.screen_coverage == 0
+
+
+def test_textures_are_as_fine_as_the_screen_shows(built: LodResult) -> None:
+    """One to two texels a pixel where the level takes over, by the file alone, as textures are halved."""
+    tree, views = split_glb(built.path.read_bytes())
+
+    def array(number: int) -> np.ndarray:
+        accessor = tree["accessors"][number]
+        return np.frombuffer(views[accessor["bufferView"]], "<f4").reshape(accessor["count"], -1)
+
+    for level in built.levels[1:]:
+        (primitive,) = next(mesh for mesh in tree["meshes"] if mesh["name"] == f"{level.name}_billboards")["primitives"]
+        surface = tree["materials"][primitive["material"]]["pbrMetallicRoughness"]
+        image = tree["images"][tree["textures"][surface["baseColorTexture"]["index"]]["source"]]
+        extent = Image.open(io.BytesIO(views[image["bufferView"]])).size
+        points, uvs = (array(primitive["attributes"][name]).reshape(level.planes, 4, -1) for name in ("POSITION", "TEXCOORD_0"))
+        sides = [np.linalg.norm(np.diff(values, axis=1), axis=-1) for values in (points, uvs * extent)]
+        texels_a_metre = np.median(sides[1] / sides[0])
+        seen = 1080 / 2 / np.tan(np.radians(25)) / level.distance_metres
+        assert 0.95 < texels_a_metre / seen < 2.05
+
+
+def test_what_was_measured_is_written_down(built: LodResult) -> None:
+    told = json.loads((built.folder / "lod.json").read_text())
+    assert [LodLevel(**level) for level in told["levels"]] == list(built.levels) and told["config"]["error_pixels"] == 0.5
+    picture = np.asarray(Image.open(built.folder / "lod.png"))
+    assert picture.shape[1] > picture.shape[0] * 0.8 and np.ptp(picture) > 100
+
+
+def test_started_again_nothing_is_done_twice(built: LodResult) -> None:
+    anew = {built.folder / name for name in ("lod.json", "lod.png")}
+    before = {path: path.stat().st_mtime_ns for path in built.folder.rglob("*") if path.is_file() and path not in anew}
+    data, stages = built.path.read_bytes(), set[str]()
+    again = build_lod(TREE, built.path, LEVELS, SMALL, on_progress=lambda stage, done, total, note="": stages.add(stage))
+    assert again == built and built.path.read_bytes() == data
+    assert {path: path.stat().st_mtime_ns for path in before} == before and stages == {"views", "join"}
+
+
+def test_without_the_tree_the_finest_cloud_is_shown_from_the_start(built: LodResult, tmp_path: Path) -> None:
+    config = replace(LEVELS, original=False)
+    result = build_lod(TREE, tmp_path / "oak.glb", config, replace(SMALL, export=ExportConfig(textures="png")), work=built.folder)
+    assert [level.planes for level in result.levels] == [4, 2] and result.levels[0].distance_metres == 0
+    assert result.levels[1].distance_metres == built.levels[2].distance_metres
+    assert result.path.stat().st_size < built.path.stat().st_size - TREE.stat().st_size / 2
+
+
+def test_a_thinned_tree_goes_through_blender(built: LodResult) -> None:
+    count = built.levels[0].triangles // 3
+    result = build_lod(TREE, built.path.with_name("thin.glb"), replace(LEVELS, triangles=count), SMALL, work=built.folder)
+    assert 0.5 * count < result.levels[0].triangles <= count
+    assert read_json("original", built.folder / "original.json")["triangles"] == count
+
+
+def test_bad_wishes(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="billboards: the levels have their own"):
+        build_lod(TREE, tmp_path / "oak.glb", LEVELS, replace(SMALL, fit=FitConfig(billboards=8)))
+    with pytest.raises(InputError, match=r"out: .* ends in \.obj"):
+        build_lod(TREE, tmp_path / "oak.obj", LEVELS, SMALL)
+    with pytest.raises(InputError, match="does not exist"):
+        build_lod(tmp_path / "none.glb", tmp_path / "oak.glb", LEVELS, SMALL)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"planes": ()}, "planes: expected one or more"),
+        ({"planes": (4, 4)}, "planes: expected falling numbers, got 4 4"),
+        ({"planes": (2, 4)}, "planes: expected falling"),
+        ({"planes": (4, 0)}, "planes: expected at least 1"),
+        ({"error_pixels": 0.0}, "error_pixels"),
+        ({"triangles": 0}, "triangles"),
+        ({"screen_width": 0}, "screen_width"),
+        ({"screen_fov_degrees": 180.0}, "screen_fov_degrees"),
+    ],
+)
+def test_bad_numbers(bad: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        LodConfig(**bad)  # type: ignore[arg-type]
