@@ -59,7 +59,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
 # What the default preset takes by the alpha mode: what is cut off has no half-transparent texels to smooth it, and drawing by chance is
 # the noisier the more there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
-    "mask": {"texel_density": 0.85, "sharpness_weight": 24.0, "crispness_weight": 0.015},
+    "mask": {"texel_density": 1.0, "sharpness_weight": 24.0, "crispness_weight": 0.06},
     "blend": {"texel_density": 1.25, "sharpness_weight": 14.0, "crispness_weight": 0.004},
     "hash": {"texel_density": 1.25, "sharpness_weight": 14.0, "crispness_weight": 0.03},
 }
@@ -99,8 +99,7 @@ class FitConfig:
     """Evenly placed rectangles that cover the viewport (viewport), the silhouette in the facing view (thesis) or the silhouettes in all
     training views (silhouette); clustered ones are bounded by what they carry. Preset: silhouette; thesis: viewport."""
     texel_density: float | None = None
-    """Texels per pixel, both ways, where the tree's axis is seen face on. Preset: 0.85 (mask) or 1.25;
-    thesis: 1."""
+    """Texels per pixel, both ways, where the tree's axis is seen face on. Preset: 1 (mask) or 1.25; thesis: 1."""
     loss: Loss | None = None
     """Absolute (l1) or squared (l2) difference of premultiplied RGBA, summed over channels and averaged over pixels, or the squared
     difference over random backgrounds in expectation (backgrounds). Preset: backgrounds; thesis: l2."""
@@ -113,7 +112,7 @@ class FitConfig:
     or 14; thesis: 0."""
     crispness_weight: float | None = None
     """Weight, at full resolution, of alpha * (1 - alpha), summed over texels and divided by a view's pixels, which makes leaves opaque and
-    the air between them clear. Preset: 0.015 (mask), 0.004 (blend) or 0.03 (hash); thesis: 0."""
+    the air between them clear. Preset: 0.06 (mask), 0.004 (blend) or 0.03 (hash); thesis: 0."""
     levels: int | None = None
     """Resolutions of views and textures, coarse to fine, sides doubling from each to the next; the steps are shared out evenly.
     Preset: 4; thesis: 1."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bbfit.geometry.alpha import AlphaMode
 
-STEEPEST = 4.0
+STEEPEST = 6.0
 """Slope that a mask's gradient has at most, within 1 / (2 * slope) of the cutoff, and nowhere else: a test has no gradient of its own."""
 HASH = (0x8DA6B343, 0xD8163841, 0xCB1AB31F, 0x7FEB352D, 0x846CA68B)
 """Factors of :func:`thresholds`: of a pixel's column and row and of a texture, and of the two rounds of mixing."""
