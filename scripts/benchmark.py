@@ -253,7 +253,7 @@ def quality(folders: list[Path]) -> list[Row]:
         views = bbfit.ViewDataset.load(folder)
         views.train.check()
         views.test.check()
-        thesis, default = bbfit.FitConfig(preset="thesis"), bbfit.FitConfig(billboards=4)
+        thesis, default = bbfit.FitConfig(preset="thesis"), bbfit.FitConfig(billboards=4, alpha="blend")
         bbfit.fit(views, replace(default, steps=4))  # compiles the kernels
         slow = reference_step(views.train, thesis)
         row: Row = {
@@ -283,9 +283,11 @@ def placement(folders: list[Path]) -> list[Row]:
     """Rows ``placement``."""
     rows = []
     thesis = bbfit.FitConfig(preset="thesis", sides="two")
+    fits = {"thesis l2": thesis, "thesis l1": replace(thesis, loss="l1")}
+    fits |= {f"default, {alpha}": bbfit.FitConfig(alpha=alpha) for alpha in ("blend", "mask")}
     for folder in folders:
         views = bbfit.ViewDataset.load(folder)
-        for name, config in {"thesis l2": thesis, "thesis l1": replace(thesis, loss="l1"), "default": bbfit.FitConfig()}.items():
+        for name, config in fits.items():
             result = bbfit.fit(views, config)
             report = bbfit.evaluate(result.cloud, views.test).to_json()
             scores = {**report["over_white"], "sharpness": report["sharpness"], "brightness": report["brightness"]}

@@ -34,14 +34,14 @@ def picture(name: str, folder: Path) -> np.ndarray:
 
 
 def acer() -> None:
-    """Draw acer.png: a column of views, one of the thesis preset's four two-sided billboards, one of the default preset's eight."""
+    """Draw acer.png: a column of views, one of the thesis preset's four two-sided billboards, one of the default preset's eight, blended."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "acer.glb"
         bbfit.write_tree(bbfit.grow("acer", seed=2), tree)
         bbfit.render_views(tree, Path(folder) / "views", bbfit.ViewsConfig(count=60, size=512, samples=16))
         views = bbfit.ViewDataset.load(Path(folder) / "views")
         thesis = bbfit.fit(views, bbfit.FitConfig(preset="thesis", sides="two")).cloud
-        default = bbfit.fit(views, tree=tree).cloud
+        default = bbfit.fit(views, bbfit.FitConfig(alpha="blend"), tree=tree).cloud
         draw_acer(views, thesis, default)
 
 
