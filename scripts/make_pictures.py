@@ -34,7 +34,7 @@ def picture(name: str, folder: Path) -> np.ndarray:
 
 
 def acer() -> None:
-    """Draw acer.png: a column of views, one of the thesis preset's four two-sided billboards, one of the default preset's eight, blended."""
+    """Draw acer.png: columns of views, of the thesis preset's four two-sided billboards and of the default preset's eight, blended."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "acer.glb"
         bbfit.write_tree(bbfit.grow("acer", seed=2), tree)
