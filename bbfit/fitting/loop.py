@@ -124,7 +124,7 @@ def fit(
     if config.placement == "even":
         tree = None  # it has no say
     mesh = None if tree is None else sha256(check_file("tree", tree).read_bytes()).hexdigest()
-    mark = sha256(json.dumps([7, asdict(config), views.train.fingerprint, mesh], sort_keys=True).encode()).hexdigest()
+    mark = sha256(json.dumps([8, asdict(config), views.train.fingerprint, mesh], sort_keys=True).encode()).hexdigest()
     checkpoint = Path(checkpoint) if checkpoint is not None else None
     done = _load(checkpoint, mark) if checkpoint is not None else None
     if done is None:
