@@ -179,8 +179,9 @@ def _evaluate(
     out, earlier = out or cloud.with_name("metrics.json"), cloud.with_name("metrics.json")
     output_folder("out", out.parent)
     with _progress() as tell:
+        shipped = as_shipped(billboards, export)
         report = evaluate(
-            as_shipped(billboards, export),
+            shipped,
             dataset.test,
             original=original_tree(dataset),
             model_bytes=model.stat().st_size if (model := cloud.with_name("model.glb")).is_file() else None,
@@ -188,7 +189,7 @@ def _evaluate(
             on_view=lambda done, total: tell("evaluate", done, total),
         )
         cards = shipped_cards(billboards, export)
-        report = with_model(report, cards, dataset.test, on_size=lambda done, total: tell("sizes", done, total))
+        report = with_model(report, shipped, cards, dataset.test, on_size=lambda done, total: tell("sizes", done, total))
     report.save(out)
     _out.print(report_table(report))
     _out.print(f"measures in {out}", soft_wrap=True)

@@ -32,6 +32,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
 from bbfit.fitting.points import MESH_SUFFIXES
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.rendering.dispatch import render
 from bbfit.reporting.plots import Cost, comparison_picture, loss_plot, pareto_plot
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.growth import grow
@@ -149,13 +150,17 @@ def run(
     return RunResult(record.folder, cloud, report, tuple(record.skipped), missed)
 
 
-def with_model(report: Report, cards: Cards, views: ViewSet, *, on_size: Callable[[int, int], None] | None = None) -> Report:
-    """The report with what a model file of these cards has and shows in pictures of 1 to 1/16 of the held-out views' size.
+def with_model(
+    report: Report, cloud: BillboardCloud, cards: Cards, views: ViewSet, *, on_size: Callable[[int, int], None] | None = None
+) -> Report:
+    """The report with what a model file has and shows in pictures of 1 to 1/16 of the held-out views' size.
 
-    ``on_size`` is called after each size with the number of sizes done and of all.
+    ``cloud`` and ``cards`` are what ships (:func:`~bbfit.exporting.model.as_shipped`, :func:`~bbfit.exporting.model.shipped_cards`).
+    Without mip levels they show the same, and the cloud is drawn faster. ``on_size`` is called after each size with the number of sizes
+    done and of all.
     """
     vertices = replace(report.vertices, model=cards.vertex_count)
-    sizes = score_sizes(lambda camera: draw_cards(cards, camera, cards.chain), views, on_size=on_size)
+    sizes = score_sizes(lambda camera: draw_cards(cards, camera) if cards.chain else render(cloud, camera), views, on_size=on_size)
     return replace(report, vertices=vertices, overdraw=overdraw(cards, shows_from(cards)), sizes=sizes)
 
 
@@ -356,7 +361,7 @@ def _evaluate(cloud: BillboardCloud, cards: Callable[[], Cards], views: ViewData
         seconds={name: seconds for name, seconds in record.seconds.items() if name != "evaluate"},
         on_view=lambda done, total: tell("evaluate", done, total),
     )
-    report = with_model(report, cards(), views.test, on_size=lambda done, total: tell("sizes", done, total))
+    report = with_model(report, cloud, cards(), views.test, on_size=lambda done, total: tell("sizes", done, total))
     report.save(path)
     comparison_picture(cloud, views.test, record.folder / "comparison.png")
     record.done("evaluate", inputs, [path.name, "comparison.png"], time.perf_counter() - begun)

@@ -70,7 +70,7 @@ class Levels:
     """In texels, int64 [L]."""
 
 
-def draw_cards(cards: Cards, camera: Camera, chain: Sequence[NDArray[np.uint8]] | None = None) -> Tensor:
+def draw_cards(cards: Cards, camera: Camera) -> Tensor:
     """Draw cards as a graphics card does, one sample a pixel.
 
     Without mip levels the picture is that of :func:`~bbfit.rendering.dispatch.render` up to the rounding of textures to 8 bits, for cards
@@ -87,10 +87,9 @@ def draw_cards(cards: Cards, camera: Camera, chain: Sequence[NDArray[np.uint8]] 
 
     Parameters
     ----------
-    cards : polygons and their atlas, whose picture is level 0.
+    cards : polygons, their atlas, and their mip levels; there need not be all down to one texel. Without any, the atlas is filtered
+        bilinearly at every distance (sampler LINEAR).
     camera : one camera, or V of them.
-    chain : the mip levels, level 0 first, straight RGBA, uint8 [h, w, 4] each (:func:`~bbfit.exporting.mips.mip_chain`); there need not
-        be all down to one texel. Left out, level 0 is filtered bilinearly at every distance (sampler LINEAR).
 
     Returns
     -------
@@ -101,7 +100,7 @@ def draw_cards(cards: Cards, camera: Camera, chain: Sequence[NDArray[np.uint8]] 
     InputError
         if a level is not half the one before, rounded down, or not of bytes.
     """
-    levels, sheets = joined([cards.atlas.image] if chain is None else chain, cards.atlas.image.shape), sheets_of(cards)
+    levels, sheets = joined([cards.atlas.image] if cards.chain is None else cards.chain, cards.atlas.image.shape), sheets_of(cards)
     cameras = camera.batch()
     with torch.no_grad():
         image = torch.stack([_view(cards, sheets, levels, cameras[index]) for index in range(len(cameras))])

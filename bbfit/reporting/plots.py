@@ -243,7 +243,7 @@ def lod_picture(levels: Sequence[tuple[LodLevel, Cards]], views: ViewSet, path: 
         share = min(1.0, (level.tree_pixels or tall) / tall)
         size = max(metrics.SSIM_WINDOW, round(width * share)), max(metrics.SSIM_WINDOW, round(height * share))
         target = shrunk(views.targets([0])[0], *size)
-        image = draw_cards(cards, views.cameras[0].resized(*size), cards.chain)
+        image = draw_cards(cards, views.cameras[0].resized(*size))
         left = gap + column * (side + gap)
         draw.text((left, gap // 2), level.name, _INK, bold)
         draw.text((left, gap // 2 + text * 5 // 4), f"the tree is {tall * share:.0f} pixels high", _FAINT, font)
