@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -31,7 +32,7 @@ def score_sizes(
 
     Parameters
     ----------
-    draw : premultiplied RGBA over nothing, [H, W, 4], as one camera sees it: a renderer of clouds, or of what was exported.
+    draw : premultiplied RGBA over nothing, [B, H, W, 4], as a batch of cameras sees it: a renderer of clouds, or of what was exported.
     views : V held-out views.
     halvings : how often to halve; sizes of which a side is below 11 pixels (:data:`bbfit.evaluation.metrics.SSIM_WINDOW`) are left out.
     on_size : called after each size with the number of sizes done and of all.
@@ -72,9 +73,10 @@ def shrunk(picture: Tensor, width: int, height: int) -> Tensor:
         if side > old:
             fail(name, f"expected at most the picture's {old}, got {side}")
     rows, columns = (_overlap(old, new).to(picture) for old, new in zip(picture.shape[:2], (height, width), strict=True))
-    return torch.einsum("hy,yxc,wx->hwc", rows, picture, columns)
+    return columns @ (rows @ picture.flatten(1)).view(height, *picture.shape[1:])
 
 
+@cache
 def _overlap(old: int, new: int) -> Tensor:
     """Weight of each of ``old`` pixels in the mean of each of ``new`` ones along the same length, float64 [new, old]."""
     edges = torch.arange(new + 1, dtype=torch.float64) * (old / new)
@@ -86,31 +88,28 @@ def _overlap(old: int, new: int) -> Tensor:
 def _score(draw: Callable[[Camera], Tensor], views: ViewSet, halving: int, width: int, height: int) -> SizeScore:
     cameras = views.cameras.resized(width, height)
     psnrs, squares, drawn, wanted = [], [], 0.0, 0.0
-
-    def image(camera: Camera, name: str) -> Tensor:
-        with torch.no_grad():
-            drawn = draw(camera).detach().cpu().double()
-        check_shape(f"what is drawn of view {name}", tuple(drawn.shape), (height, width, 4))
-        if not drawn.isfinite().all():
-            fail("draw", f"gives numbers that are not finite for view {name} at {width} x {height} pixels", "check the model")
-        return drawn.clamp(0, 1)
-
     for index, name in enumerate(views.names):
         target = shrunk(views.targets([index], torch.float64)[0], width, height)
-        seen = image(cameras[index], name)
+        batch = _shifted(cameras[index], min(halving, 2))
+        with torch.no_grad():
+            images = draw(batch).detach().cpu().double()
+        check_shape(f"what is drawn of view {name}", tuple(images.shape), (len(batch), height, width, 4))
+        if not images.isfinite().all():
+            fail("draw", f"gives numbers that are not finite for view {name} at {width} x {height} pixels", "check the model")
+        seen, *shifted = images.clamp(0, 1)
         psnrs.append(metrics.psnr(over_colour(target).numpy(), over_colour(seen).numpy()))
         squares.append(metrics.mean_squared_error(target[..., 3].numpy(), seen[..., 3].numpy()))
-        shifted = [seen] if halving == 0 else [image(camera, name) for camera in _shifted(cameras[index], min(halving, 2))]
-        drawn += sum(float(picture[..., 3].sum()) for picture in shifted) / len(shifted)
+        covers = [float(image[..., 3].sum()) for image in shifted or [seen]]
+        drawn += sum(covers) / len(covers)
         wanted += float(target[..., 3].sum())
     mean_square = sum(squares) / len(views)
     return SizeScore(width, height, sum(psnrs) / len(views), drawn / wanted if wanted else None, mean_square**0.5)
 
 
-def _shifted(camera: Camera, halvings: int) -> Iterator[Camera]:
-    """The camera with its pixels' centres moved to those of their 4^halvings parts."""
+def _shifted(camera: Camera, halvings: int) -> Camera:
+    """The camera, and if there are halvings itself with its pixels' centres moved to those of their 4^halvings parts."""
     parts = 2**halvings
     steps = [(part + 0.5) / parts - 0.5 for part in range(parts)]
-    for right, down in itertools.product(steps, steps):
-        move = torch.tensor([[0, 0, right], [0, 0, down], [0, 0, 0]]).to(camera.intrinsics)
-        yield replace(camera, intrinsics=camera.intrinsics + move)
+    moves = [(0.0, 0.0), *(itertools.product(steps, steps) if halvings else ())]
+    shift = torch.tensor([[[0, 0, right], [0, 0, down], [0, 0, 0]] for right, down in moves]).to(camera.intrinsics)
+    return replace(camera, world_to_camera=camera.world_to_camera.expand(len(moves), 4, 4), intrinsics=camera.intrinsics + shift)

@@ -26,6 +26,11 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> ViewSet:
     return write_views(tmp_path_factory.mktemp("views"), crossing_billboards(), width=98, height=70).test
 
 
+def plain(camera: Camera, value: float) -> Tensor:
+    """The same in all channels of all pixels."""
+    return torch.full((len(camera), camera.height, camera.width, 4), value)
+
+
 def averaged(views: ViewSet, index: int, width: int, height: int) -> Tensor:
     """A view's mean over areas: every pixel is cut into width x height parts, of which each new one takes as many as it covers."""
     target = views.targets([index], torch.float64)[0]
@@ -50,15 +55,15 @@ def test_targets_are_means_by_area_of_premultiplied_display_values(views: ViewSe
 
     def draw(camera: Camera) -> Tensor:
         asked.append(camera)
-        index = numbers[tuple(camera.world_to_camera.flatten().tolist())]
-        return averaged(views, index, camera.width, camera.height)
+        (index,) = {numbers[tuple(pose.flatten().tolist())] for pose in camera.world_to_camera}
+        return averaged(views, index, camera.width, camera.height).expand(len(camera), -1, -1, -1)
 
     for score in score_sizes(draw, views):
         assert score.psnr == 120 and score.alpha < 1e-9 and score.coverage == pytest.approx(1, abs=1e-12)
-    assert not any(camera.batched for camera in asked)
     for size, moved in (((98, 70), [0]), ((49, 35), [0, 4]), ((24, 17), [0, 16])):
         shifts = torch.stack([camera.intrinsics for camera in asked if (camera.width, camera.height) == size])
-        shifts = shifts.reshape(4, sum(moved) + 1, 3, 3) - views.cameras.resized(*size).intrinsics[:, None]
+        assert shifts.shape == (4, sum(moved) + 1, 3, 3)
+        shifts = shifts - views.cameras.resized(*size).intrinsics[:, None]
         assert not shifts[:, 0].any() and not shifts[:, :, [0, 1, 2, 2, 2], [0, 1, 0, 1, 2]].any()
         if moved[1:]:
             x, y = shifts[:, 1:, :2, 2].unbind(-1)
@@ -71,8 +76,8 @@ def test_small_pictures_are_drawn_at_several_places_for_their_coverage(views: Vi
     """A plate that hides what is left of the optical axis."""
 
     def draw(camera: Camera) -> Tensor:
-        covered = torch.arange(camera.width) < camera.intrinsics[0, 2]
-        return covered[None, :, None].expand(camera.height, camera.width, 4).float()
+        covered = torch.arange(camera.width) < camera.intrinsics[:, 0, 2, None]
+        return covered[:, None, :, None].expand(-1, camera.height, camera.width, 4).float()
 
     for score, parts in zip(score_sizes(draw, views), (1, 2, 4), strict=True):
         middle = float(views.cameras.resized(score.width, score.height).intrinsics[0, 0, 2])
@@ -84,16 +89,14 @@ def test_small_pictures_are_drawn_at_several_places_for_their_coverage(views: Vi
 def test_measures_are_those_of_known_differences(views: ViewSet) -> None:
     """Nothing at all, and white of alpha 1/4 everywhere, at half the size."""
     targets = torch.stack([averaged(views, index, 49, 35) for index in range(4)])
-    nothing = score_sizes(lambda camera: torch.zeros(camera.height, camera.width, 4), views, 1)[1]
+    nothing = score_sizes(lambda camera: plain(camera, 0.0), views, 1)[1]
     errors = (over_colour(targets) - 1).square().mean((1, 2, 3))
     assert nothing.coverage == 0 and nothing.alpha == pytest.approx(float(targets[..., 3].square().mean().sqrt()))
     assert nothing.psnr == pytest.approx(float((-10 * errors.log10()).mean()))
-    haze = score_sizes(lambda camera: torch.full((camera.height, camera.width, 4), 0.25), views, 1)[1]
+    haze = score_sizes(lambda camera: plain(camera, 0.25), views, 1)[1]
     assert haze.psnr == pytest.approx(nothing.psnr) and haze.coverage == pytest.approx(float(0.25 / targets[..., 3].mean()))
     assert haze.alpha == pytest.approx(float((targets[..., 3] - 0.25).square().mean().sqrt()))
-    assert score_sizes(lambda camera: torch.full((camera.height, camera.width, 4), 7.0), views, 0)[0].coverage == pytest.approx(
-        4 * haze.coverage
-    )
+    assert score_sizes(lambda camera: plain(camera, 7.0), views, 0)[0].coverage == pytest.approx(4 * haze.coverage)
 
 
 def test_coverage_is_of_all_views_together(views: ViewSet) -> None:
@@ -102,14 +105,14 @@ def test_coverage_is_of_all_views_together(views: ViewSet) -> None:
     pose, target = views.cameras.world_to_camera[2], averaged(views, 2, 49, 35)
 
     def draw(camera: Camera) -> Tensor:
-        shown = target if torch.equal(camera.world_to_camera, pose) else torch.zeros(4)
-        return shown.expand(camera.height, camera.width, 4) if camera.width == 49 else torch.zeros(camera.height, camera.width, 4)
+        shown = torch.equal(camera.world_to_camera[0], pose) and camera.width == 49
+        return target.expand(len(camera), -1, -1, -1) if shown else plain(camera, 0.0)
 
     assert score_sizes(draw, views, 1)[1].coverage == pytest.approx(float(sums[2] / sums.sum()))
 
 
 def test_scores_can_be_written_as_json(views: ViewSet) -> None:
-    score = score_sizes(lambda camera: torch.zeros(camera.height, camera.width, 4), views, 0)[0]
+    score = score_sizes(lambda camera: plain(camera, 0.0), views, 0)[0]
     assert json.loads(json.dumps(asdict(score), allow_nan=False)) == asdict(score) and (score.width, score.height) == (98, 70)
 
 
@@ -127,10 +130,10 @@ def test_bad_input(views: ViewSet, tmp_path: Path) -> None:
         score_sizes(lambda camera: render(cloud, camera), replace(views, paths=()))
     with pytest.raises(InputError, match="halvings: expected at least 0"):
         score_sizes(lambda camera: render(cloud, camera), views, -1)
-    with pytest.raises(InputError, match=r"what is drawn of view 0000: expected shape \[70, 98, 4\], got \[1, 70, 98, 4\]"):
-        score_sizes(lambda camera: render(cloud, camera.batch()), views)
+    with pytest.raises(InputError, match=r"what is drawn of view 0000: expected shape \[1, 70, 98, 4\], got \[70, 98, 4\]"):
+        score_sizes(lambda camera: render(cloud, camera[0]), views)
     with pytest.raises(InputError, match="numbers that are not finite for view 0000 at 98 x 70"):
-        score_sizes(lambda camera: torch.full((camera.height, camera.width, 4), math.nan), views)
+        score_sizes(lambda camera: plain(camera, math.nan), views)
     with pytest.raises(InputError, match="width: expected at most the picture's 98, got 99"):
         shrunk(views.targets([0])[0], 99, 5)
     write_views(tmp_path, cloud, count=4, width=12, height=11)
