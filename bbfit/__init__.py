@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from bbfit.lod import build_lod
     from bbfit.pipeline import RunConfig, run
     from bbfit.rendering.dispatch import render
+    from bbfit.sweep.config import SweepConfig
+    from bbfit.sweep.scheduling import run_sweep
     from bbfit.trees.config import GrowConfig
     from bbfit.trees.growth import grow
     from bbfit.trees.species import Species, load_species
@@ -45,6 +47,7 @@ _HOMES = {
     "Report": "bbfit.evaluation.report",
     "RunConfig": "bbfit.pipeline",
     "Species": "bbfit.trees.species",
+    "SweepConfig": "bbfit.sweep.config",
     "ViewDataset": "bbfit.views",
     "ViewsConfig": "bbfit.blender.config",
     "build_lod": "bbfit.lod",
@@ -57,6 +60,7 @@ _HOMES = {
     "render": "bbfit.rendering.dispatch",
     "render_views": "bbfit.blender.views_folder",
     "run": "bbfit.pipeline",
+    "run_sweep": "bbfit.sweep.scheduling",
     "write_tree": "bbfit.trees.tree_file",
 }
 
@@ -75,6 +79,7 @@ __all__ = [
     "Report",
     "RunConfig",
     "Species",
+    "SweepConfig",
     "ViewDataset",
     "ViewsConfig",
     "build_lod",
@@ -87,6 +92,7 @@ __all__ = [
     "render",
     "render_views",
     "run",
+    "run_sweep",
     "write_tree",
 ]
 

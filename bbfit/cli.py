@@ -22,6 +22,7 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, fail
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.fitting.config import FitConfig
+from bbfit.sweep.config import SweepConfig
 from bbfit.trees.config import GrowConfig
 
 if TYPE_CHECKING:
@@ -250,6 +251,49 @@ def _lod(
     _out.print(f"levels of detail in {result.path}, {result.path.stat().st_size:,} bytes; measures in {result.folder}", soft_wrap=True)
 
 
+def _sweep(
+    out: Path,
+    species: tuple[str, ...] = (),
+    trees: tuple[Path, ...] = (),
+    folders: Annotated[tuple[Path, ...], tyro.conf.arg(name="views")] = (),
+    config: Annotated[SweepConfig, tyro.conf.arg(name="")] = SweepConfig(),  # noqa: B008
+    grow: Annotated[GrowConfig, tyro.conf.arg(name="")] = GrowConfig(detail=0.5),  # noqa: B008
+    views: ViewsConfig = ViewsConfig(),  # noqa: B008
+    fit: FitConfig = FitConfig(),  # noqa: B008
+    export: ExportConfig = ExportConfig(),  # noqa: B008
+) -> None:
+    """Fit a grid of configurations to many trees, on this machine or on a Ray cluster, and compare them: the thesis's 72 experiments if
+    nothing else is said.
+
+    Killed and started again, it goes on where it stopped; every run is made once.
+
+    Args:
+        out: Folder for trees, runs and the tables table.csv, table.md and table.png.
+        species: Species to grow; `bbfit grow --list` names them.
+        trees: Tree files to render.
+        folders: Folders of views.
+        config: What is varied, and what it runs on.
+        grow: How trees are grown.
+        views: How trees are rendered.
+        fit: What all runs have in common besides what the grid says.
+        export: How the models are written.
+    """
+    from bbfit.pipeline import RunConfig
+    from bbfit.reporting.tables import sweep_table
+    from bbfit.sweep.scheduling import run_sweep
+
+    stages = RunConfig(grow=grow, views=views, fit=fit, export=export)
+    with _progress() as tell:
+        result = run_sweep(out, config, stages, species=species, trees=trees, views=folders, on_progress=tell)
+    _out.print(sweep_table(result.rows))
+    failed = sum(row.reason is not None for row in result.rows)
+    if result.kept:
+        _out.print(f"{result.kept} results stood from an earlier start", style="dim")
+    if failed:
+        _out.print(f"{failed} runs failed; table.md says why, and --retry-failed tries them again", style="yellow")
+    _out.print(f"tables in {result.folder}: table.csv, table.md, table.png", soft_wrap=True)
+
+
 def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     """The same command line, but parsing it only returns what to do."""
 
@@ -268,6 +312,7 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "evaluate": _later(_evaluate),
     "export": _later(_export),
     "lod": _later(_lod),
+    "sweep": _later(_sweep),
 }
 
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import platform
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
-from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.budget.choice import Choice, Trial, choose, within_bytes
@@ -32,6 +30,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
 from bbfit.fitting.points import MESH_SUFFIXES
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.records import Record, hash_file, hash_inputs, plain
 from bbfit.rendering.dispatch import render
 from bbfit.reporting.plots import Cost, comparison_picture, loss_plot, pareto_plot
 from bbfit.trees.config import GrowConfig
@@ -40,9 +39,6 @@ from bbfit.trees.species import Species, load_species
 from bbfit.trees.tree_file import write_tree
 from bbfit.views import ViewDataset, ViewSet
 
-RECORD_FILE = "run.json"
-# Raise a stage's number when its results change for the same inputs, so that old results are made anew.
-_STAGE_VERSIONS = {"grow": 1, "budget": 3, "fit": 8, "export": 3, "evaluate": 5}
 _PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headless", "bpy", "trimesh", "xatlas", "scikit-image", "warp-lang")
 
 
@@ -115,39 +111,54 @@ def run(
     """
     config = config or RunConfig()
     tell = on_progress or (lambda stage, done, total, note="": None)
-    tree = config.tree
-    if tree is not None and (source is None or not Path(source).is_dir()):
-        fail("tree", f"{tree} is given beside {source or 'a tree to grow'}", "a mesh goes with a folder of views")
-    if source is None:
-        species = load_species(config.species or (None if config.grow.species_file else "quaking_aspen"), config.grow.species_file)
-        record = _Record(output_folder("out", out), species, config)
-        tree = _grow(species, record, config.grow, tell)
-        views = _render(tree, record, config.views, tell)
-    else:
-        source = Path(source)
-        if config.species is not None or config.grow != RunConfig().grow:
-            fail("run", f"{source} is given, so that no tree is grown", "leave out the species and the options of growing one")
-        if not source.is_dir():
-            check_file("tree", source)
-        record = _Record(output_folder("out", out), source, config)
-        if source.is_dir():
-            views = ViewDataset.load(source, seed=config.fit.seed)
-        else:
-            tree, views = source, _render(source, record, config.views, tell)
-            if tree.suffix.lower() not in MESH_SUFFIXES:
-                tree = None  # only Blender can read it; the views tell enough
+    record, tree, views = _prepare(source, out, config, tell)
     views.train.check()
     views.test.check()
     asked, missed, exported = config.fit, None, export_config(views, config.export)
     if config.budget.given:
         choice = _choose(views, tree, record, config, exported, tell)
         asked, missed = choice.config, None if choice.met else config.budget.target_psnr
-        record.decided(asked)
+        record.head["config"]["fit"] = plain(asdict(asked))  # what is fitted where that was left to a budget
     cloud = _fit(views, tree, record, asked, tell, (config.budget.most_bytes, exported))
     cards = cache(lambda: shipped_cards(cloud, exported))
     _export(cards, record, exported, tell)
     report = _evaluate(as_shipped(cloud, exported), cards, views, record, tell)
     return RunResult(record.folder, cloud, report, tuple(record.skipped), missed)
+
+
+def prepare(
+    source: str | Path | None, out: str | Path, config: RunConfig | None = None, *, on_progress: Progress | None = None
+) -> tuple[Path | None, ViewDataset]:
+    """The first stages of :func:`run`, with the same arguments and errors: grow a tree if none is given, and render its views.
+
+    Returns
+    -------
+    the mesh to place billboards by, if there is one that can be read without Blender, and the views.
+    """
+    tell = on_progress or (lambda stage, done, total, note="": None)
+    return _prepare(source, out, config or RunConfig(), tell)[1:]
+
+
+def _prepare(source: str | Path | None, out: str | Path, config: RunConfig, tell: Progress) -> tuple[Record, Path | None, ViewDataset]:
+    tree = config.tree
+    if tree is not None and (source is None or not Path(source).is_dir()):
+        fail("tree", f"{tree} is given beside {source or 'a tree to grow'}", "a mesh goes with a folder of views")
+    if source is None:
+        species = load_species(config.species or (None if config.grow.species_file else "quaking_aspen"), config.grow.species_file)
+        record = _record(output_folder("out", out), species, config)
+        tree = _grow(species, record, config.grow, tell)
+        return record, tree, _render(tree, record, config.views, tell)
+    source = Path(source)
+    if config.species is not None or config.grow != RunConfig().grow:
+        fail("run", f"{source} is given, so that no tree is grown", "leave out the species and the options of growing one")
+    if not source.is_dir():
+        check_file("tree", source)
+    record = _record(output_folder("out", out), source, config)
+    if source.is_dir():
+        return record, tree, ViewDataset.load(source, seed=config.fit.seed)
+    views = _render(source, record, config.views, tell)
+    readable = source.suffix.lower() in MESH_SUFFIXES  # else only Blender can read it; the views tell enough
+    return record, source if readable else None, views
 
 
 def with_model(
@@ -178,71 +189,31 @@ def export_config(views: ViewDataset, config: ExportConfig) -> ExportConfig:
     return replace(config, up="z") if known else config
 
 
-class _Record:
-    """``run.json``: which stage was done with which inputs, what it wrote, how long it took."""
-
-    def __init__(self, folder: Path, source: Path | Species, config: RunConfig) -> None:
-        self.folder, self.skipped = folder, list[str]()
-        path = folder / RECORD_FILE
-        try:
-            earlier = read_json("run", path) if path.is_file() else {}
-        except InputError:
-            earlier = {}  # a damaged record only costs the skipping
-        stages = earlier.get("stages") if isinstance(earlier, dict) else None
-        self.stages = {name: stage for name, stage in stages.items() if _is_stage(stage)} if isinstance(stages, dict) else {}
-        grown = asdict(source) if isinstance(source, Species) else None
-        resolved = {
-            "species": grown,
-            "grow": asdict(config.grow) if grown else None,
-            "tree": str(config.tree.resolve()) if config.tree else None,
-            "views": None if isinstance(source, Path) and source.is_dir() else asdict(config.views),
-            "fit": asdict(config.fit.resolve()),
-            "budget": asdict(config.budget),
-            "export": asdict(config.export),
-        }
-        self._head = {
-            "source": source.name if isinstance(source, Species) else str(source.resolve()),
-            "config": json.loads(json.dumps(resolved, default=str)),
-            "seeds": ({"grow": config.grow.seed} if grown else {}) | {"views": config.views.seed, "fit": config.fit.seed},
-            "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
-            "machine": platform.platform(),
-        }
-
-    def decided(self, config: FitConfig) -> None:
-        """Note what is fitted where that was left to a budget."""
-        self._head["config"]["fit"] = json.loads(json.dumps(asdict(config), default=str))
-
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Seconds of the stages done so far."""
-        return {name: stage["seconds"] for name, stage in self.stages.items()}
-
-    def stands(self, stage: str, inputs: str) -> bool:
-        """Whether a stage was done with these inputs and nobody touched what it wrote."""
-        done = self.stages.get(stage)
-        if done is None or done["inputs"] != inputs:
-            return False
-        if any(_hash_file(self.folder / name) != digest for name, digest in done["outputs"].items()):
-            return False
-        self.skipped.append(stage)
-        return True
-
-    def done(self, stage: str, inputs: str, outputs: list[str], seconds: float) -> None:
-        """Note a finished stage."""
-        hashes = {name: _hash_file(self.folder / name) for name in outputs}
-        self.stages[stage] = {"inputs": inputs, "outputs": hashes, "seconds": round(seconds, 3)}
-        write_json(self.folder / RECORD_FILE, self._head | {"stages": self.stages})
+def _record(folder: Path, source: Path | Species, config: RunConfig) -> Record:
+    """The record of a run in a folder, with its resolved configuration, seeds, versions and machine."""
+    grown = asdict(source) if isinstance(source, Species) else None
+    resolved = {
+        "species": grown,
+        "grow": asdict(config.grow) if grown else None,
+        "tree": str(config.tree.resolve()) if config.tree else None,
+        "views": None if isinstance(source, Path) and source.is_dir() else asdict(config.views),
+        "fit": asdict(config.fit.resolve()),
+        "budget": asdict(config.budget),
+        "export": asdict(config.export),
+    }
+    head = {
+        "source": source.name if isinstance(source, Species) else str(source.resolve()),
+        "config": plain(resolved),
+        "seeds": ({"grow": config.grow.seed} if grown else {}) | {"views": config.views.seed, "fit": config.fit.seed},
+        "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
+        "machine": platform.platform(),
+    }
+    return Record(folder, head)
 
 
-def _is_stage(entry: Any) -> bool:
-    """Whether an entry of ``run.json`` is whole."""
-    kinds = {"inputs": str, "outputs": dict, "seconds": int | float}
-    return isinstance(entry, dict) and all(isinstance(entry.get(name), kind) for name, kind in kinds.items())
-
-
-def _grow(species: Species, record: _Record, config: GrowConfig, tell: Progress) -> Path:
+def _grow(species: Species, record: Record, config: GrowConfig, tell: Progress) -> Path:
     path = record.folder / "tree.glb"
-    inputs = _hash("grow", asdict(species), config.seed, config.detail, config.leaves)
+    inputs = hash_inputs("grow", asdict(species), config.seed, config.detail, config.leaves)
     if not record.stands("grow", inputs):
         earlier = record.stages.get("grow")
         if earlier is not None and earlier["inputs"] != inputs and (record.folder / "views").exists():
@@ -256,7 +227,7 @@ def _grow(species: Species, record: _Record, config: GrowConfig, tell: Progress)
     return path
 
 
-def _render(tree: Path, record: _Record, config: ViewsConfig, tell: Progress) -> ViewDataset:
+def _render(tree: Path, record: Record, config: ViewsConfig, tell: Progress) -> ViewDataset:
     from bbfit.blender.views_folder import render_views
 
     standing: list[int] = []
@@ -274,12 +245,12 @@ def _render(tree: Path, record: _Record, config: ViewsConfig, tell: Progress) ->
     return views
 
 
-def _choose(views: ViewDataset, tree: Path | None, record: _Record, config: RunConfig, export: ExportConfig, tell: Progress) -> Choice:
+def _choose(views: ViewDataset, tree: Path | None, record: Record, config: RunConfig, export: ExportConfig, tell: Progress) -> Choice:
     """What the budget's trials speak for; ``pareto.json`` holds those done, so that none is done twice."""
     path, budget = record.folder / "pareto.json", config.budget
-    mesh = None if tree is None else _hash_file(check_file("tree", tree))
+    mesh = None if tree is None else hash_file(check_file("tree", tree))
     asked = {**asdict(config.fit), "checkpoint_every": None}
-    inputs = _hash("budget", asked, asdict(budget), asdict(export), views.train.fingerprint, mesh)
+    inputs = hash_inputs("budget", asked, asdict(budget), asdict(export), views.train.fingerprint, mesh)
     stands = record.stands("budget", inputs)
     try:
         earlier = read_json("budget", path) if path.is_file() else {}
@@ -309,14 +280,14 @@ def _choose(views: ViewDataset, tree: Path | None, record: _Record, config: RunC
 
 
 def _fit(
-    views: ViewDataset, tree: Path | None, record: _Record, config: FitConfig, tell: Progress, limit: tuple[int | None, ExportConfig]
+    views: ViewDataset, tree: Path | None, record: Record, config: FitConfig, tell: Progress, limit: tuple[int | None, ExportConfig]
 ) -> BillboardCloud:
     """``limit`` is the most bytes that the model may have, and how it will be exported."""
     config, path = config.resolve(), record.folder / "cloud.safetensors"
     if config.placement == "even":
         tree = None  # it has no say
-    mesh = None if tree is None else _hash_file(check_file("tree", tree))
-    inputs = _hash("fit", {**asdict(config), "checkpoint_every": None}, views.train.fingerprint, mesh, limit if limit[0] else None)
+    mesh = None if tree is None else hash_file(check_file("tree", tree))
+    inputs = hash_inputs("fit", {**asdict(config), "checkpoint_every": None}, views.train.fingerprint, mesh, limit if limit[0] else None)
     if record.stands("fit", inputs):
         return BillboardCloud.load(path)
 
@@ -334,8 +305,8 @@ def _fit(
     return cloud
 
 
-def _export(cards: Callable[[], Cards], record: _Record, config: ExportConfig, tell: Progress) -> None:
-    inputs = _hash("export", asdict(config.resolve()), _hash_file(record.folder / "cloud.safetensors"))
+def _export(cards: Callable[[], Cards], record: Record, config: ExportConfig, tell: Progress) -> None:
+    inputs = hash_inputs("export", asdict(config.resolve()), hash_file(record.folder / "cloud.safetensors"))
     if record.stands("export", inputs):
         return
     begun, written = time.perf_counter(), list[Path]()
@@ -345,11 +316,11 @@ def _export(cards: Callable[[], Cards], record: _Record, config: ExportConfig, t
     record.done("export", inputs, [path.name for path in written], time.perf_counter() - begun)
 
 
-def _evaluate(cloud: BillboardCloud, cards: Callable[[], Cards], views: ViewDataset, record: _Record, tell: Progress) -> Report:
+def _evaluate(cloud: BillboardCloud, cards: Callable[[], Cards], views: ViewDataset, record: Record, tell: Progress) -> Report:
     """The score of the cloud in the alpha mode that its model has."""
     path = record.folder / "metrics.json"
-    results = [_hash_file(record.folder / name) for name in ("cloud.safetensors", "model.glb")]
-    inputs = _hash("evaluate", results, asdict(cloud.alpha), views.fingerprint)
+    results = [hash_file(record.folder / name) for name in ("cloud.safetensors", "model.glb")]
+    inputs = hash_inputs("evaluate", results, asdict(cloud.alpha), views.fingerprint)
     if record.stands("evaluate", inputs):
         return Report.load(path)
     begun = time.perf_counter()
@@ -374,14 +345,6 @@ def _loss_table(losses: list[float]) -> bytes:
     writer.writerow(["step", "loss"])
     writer.writerows(enumerate(losses, 1))
     return text.getvalue().encode()
-
-
-def _hash(stage: str, *inputs: Any) -> str:
-    return sha256(json.dumps([stage, _STAGE_VERSIONS[stage], *inputs], sort_keys=True, default=str).encode()).hexdigest()
-
-
-def _hash_file(path: Path) -> str | None:
-    return sha256(path.read_bytes()).hexdigest() if path.is_file() else None
 
 
 def _version(package: str) -> str | None:

@@ -29,12 +29,12 @@ GROUPS = (
     ("images",),
     ("views", "trees", "blender"),
     ("rendering",),
-    ("fitting",),
+    ("fitting", "rivals"),
     ("evaluation", "exporting"),
     ("budget",),
-    ("reporting",),
+    ("reporting", "records"),
     ("pipeline",),
-    ("lod", "sweep"),
+    ("lod", "sweep", "comparison"),
     ("cli",),
     ("__main__",),
 )
@@ -49,7 +49,7 @@ ONLY_IN = {
         *(f"rendering/{name}.py" for name in ("launching", "sampling", "kernels", "fused", "fused_projection")),
         *(f"fitting/{name}.py" for name in ("adam", "fused_sharpness", "fused_ssim", "ssim_kernels")),
     },
-    "ray": {"sweep.py"},
+    "ray": {"sweep/cluster.py"},
 }
 NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib")
 
@@ -212,14 +212,14 @@ def test_nothing_from_a_file_is_ever_executed() -> None:
 
 
 def test_no_handler_catches_everything_and_goes_on() -> None:
-    """``except BaseException`` is for tidying up before the error is raised again."""
+    """``except BaseException`` is for tidying up before the error is raised again; a sweep records whatever fails in a run."""
     wide = []
     for path, tree in TREES.items():
         for node in ast.walk(tree):
             if isinstance(node, ast.ExceptHandler):
                 caught = ast.unparse(node.type) if node.type else ""
                 raises_again = any(isinstance(inner, ast.Raise) and inner.exc is None for inner in ast.walk(node))
-                if caught in ("", "Exception") or ("BaseException" in caught and not raises_again):
+                if (caught in ("", "Exception") and relative(path) != "sweep/tasks.py") or ("BaseException" in caught and not raises_again):
                     wide.append(f"{relative(path)}:{node.lineno}")
     assert not wide
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 
 import torch
 from torch import Tensor
@@ -72,17 +71,16 @@ def shrunk(picture: Tensor, width: int, height: int) -> Tensor:
         check_count(name, side)
         if side > old:
             fail(name, f"expected at most the picture's {old}, got {side}")
-    rows, columns = (_overlap(old, new).to(picture) for old, new in zip(picture.shape[:2], (height, width), strict=True))
-    return columns @ (rows @ picture.flatten(1)).view(height, *picture.shape[1:])
+    return _means(_means(picture.double(), height).transpose(0, 1), width).transpose(0, 1).to(picture)
 
 
-@cache
-def _overlap(old: int, new: int) -> Tensor:
-    """Weight of each of ``old`` pixels in the mean of each of ``new`` ones along the same length, float64 [new, old]."""
-    edges = torch.arange(new + 1, dtype=torch.float64) * (old / new)
-    start = torch.arange(old, dtype=torch.float64)
-    shared = torch.minimum(edges[1:, None], start + 1) - torch.maximum(edges[:-1, None], start)
-    return shared.clamp_min(0) * (new / old)
+def _means(values: Tensor, count: int) -> Tensor:
+    """Means of ``count`` equal parts of the first axis, by differences of the running sum, which is linear within a value."""
+    edges = torch.arange(count + 1, dtype=values.dtype) * (len(values) / count)
+    whole = edges.long().clamp(max=len(values) - 1)
+    before = torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)[:-1]])
+    sums = before[whole] + (edges - whole).view(-1, *[1] * (values.ndim - 1)) * values[whole]
+    return sums.diff(dim=0) * (count / len(values))
 
 
 def _score(draw: Callable[[Camera], Tensor], views: ViewSet, halving: int, width: int, height: int) -> SizeScore:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from bbfit.evaluation.report import Cost, Report
 from bbfit.exporting.lod import LodLevel
+from bbfit.reporting.sweep_tables import HONEST, SweepRow, label_names
 from bbfit.trees.species import Species
 
 if TYPE_CHECKING:
@@ -106,6 +107,29 @@ def lod_table(levels: Sequence[LodLevel]) -> Table:
             below,
             *errors,
         )
+    return table
+
+
+def sweep_table(rows: Sequence[SweepRow]) -> Table:
+    """A ``rich`` table with a line a run: the honest measures, what it costs, or why it failed."""
+    from rich import box
+    from rich.table import Table
+
+    labels = label_names(rows)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in ("tree", *labels):
+        table.add_column(name)
+    for name in ("PSNR, dB", "SSIM", "FLIP", "vertices", "bytes", "seconds"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        start = [row.tree, *(row.labels.get(name, "") for name in labels)]
+        if row.facts is None:
+            table.add_row(*start, f"failed: {row.reason}", style="yellow")
+            continue
+        report = row.facts["report"]
+        measures = [f"{measure.of(row):{measure.digits}}" for measure in HONEST[:3]]
+        costs = [_count(report[name]["model"]) for name in ("vertices", "bytes")]
+        table.add_row(*start, *measures, *costs, f"{row.seconds:.1f}")
     return table
 
 

@@ -1,0 +1,69 @@
+"""The picture of a sweep: how good each configuration is, tree by tree."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from bbfit.files import write_bytes
+from bbfit.reporting.sweep_tables import BILLBOARDS, HONEST, SweepRow, label_names
+
+_MEASURES = (HONEST[0], HONEST[2])
+# A loss, or another label, has a line style; everything else has a colour.
+_STYLES = ("-", "--", ":", "-.")
+
+
+def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
+    """Write a PNG: PSNR over white and FLIP against the number of billboards, a column for each tree and a line for each configuration.
+
+    Labels take the numbers' place on the axis where nothing but labels differs. Where nothing was done nothing is written.
+    """
+    done = [row for row in rows if row.reason is None]
+    if not done:
+        return
+    from matplotlib.figure import Figure
+
+    names = [name for name in label_names(done) if name != BILLBOARDS]
+    dashed = next((name for name in names if name == "loss"), None)
+    trees = list(dict.fromkeys(row.tree for row in done))
+    counted = len({row.labels.get(BILLBOARDS) for row in done}) > 1
+    figure = Figure(figsize=(1.5 + 3.4 * len(trees), 6.6), layout="constrained")
+    axes = figure.subplots(len(_MEASURES), len(trees), squeeze=False, sharex=True)
+    colours = {key: f"C{number}" for number, key in enumerate(dict.fromkeys(_key(row, names, dashed) for row in done))}
+    styles = {value: _STYLES[number % 4] for number, value in enumerate(dict.fromkeys(row.labels.get(dashed or "") for row in done))}
+    for (line, measure), (column, tree) in ((a, b) for a in enumerate(_MEASURES) for b in enumerate(trees)):
+        axis = axes[line][column]
+        for (key, style), group in _groups([row for row in done if row.tree == tree], names, dashed).items():
+            points = [(row.labels.get(BILLBOARDS, ""), value) for row in group if (value := measure.of(row)) is not None]
+            points.sort(key=lambda point: int(point[0] or 0))
+            label = ", ".join(filter(None, (key, style)))
+            where = [point[0] for point in points] if counted else [label or "runs"] * len(points)
+            axis.plot(where, [point[1] for point in points], styles[style], color=colours[key], marker="o", markersize=3, label=label)
+        axis.grid(alpha=0.3)
+        if line == 0:
+            axis.set_title(tree)
+        if column == 0:
+            axis.set_ylabel(measure.name + (", less is better" if measure.more is False else ""))
+        if not counted:
+            axis.tick_params(axis="x", rotation=60)
+        elif line == len(_MEASURES) - 1:
+            axis.set_xlabel(BILLBOARDS)
+    if counted and any(handles := axes[0][0].get_legend_handles_labels()[1]) and len(handles) > 1:
+        figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=110)
+    write_bytes(path, data.getvalue())
+
+
+def _key(row: SweepRow, names: Sequence[str], dashed: str | None) -> str:
+    """What gives a run its colour."""
+    return ", ".join(row.labels.get(name, "") for name in names if name != dashed)
+
+
+def _groups(rows: Sequence[SweepRow], names: Sequence[str], dashed: str | None) -> dict[tuple[str, str | None], list[SweepRow]]:
+    """Runs that make a line."""
+    found: dict[tuple[str, str | None], list[SweepRow]] = {}
+    for row in rows:
+        found.setdefault((_key(row, names, dashed), row.labels.get(dashed or "")), []).append(row)
+    return found

@@ -1,0 +1,333 @@
+"""Tables of many runs: a row a run as CSV, and, as Markdown, the thesis's figure 11 and table 1 with its figures beside ours."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from bbfit.evaluation.published import RATIOS_PERCENT, Experiment, published_figures
+from bbfit.evaluation.report import ThesisScale
+
+BILLBOARDS = "billboards"
+
+
+@dataclass(frozen=True)
+class SweepRow:
+    """One run of a sweep, or what kept it from being made."""
+
+    tree: str
+    """Name of the tree."""
+    labels: Mapping[str, str]
+    """What sets its configuration apart: names and values in the order of the grid."""
+    steps: int
+    """Optimiser steps."""
+    facts: Mapping[str, Any] | None
+    """What was found: ``report`` (:meth:`bbfit.evaluation.report.Report.to_json` without views and rings), ``billboards`` and ``texels``;
+    ``None`` if it failed."""
+    reason: str | None
+    """Why it failed."""
+    seconds: float
+    """That the run took."""
+    folder: str
+    """Where its results lie, within the sweep's folder."""
+
+    @property
+    def published(self) -> ThesisScale | None:
+        """What the thesis reports for this tree's species and configuration, if it does."""
+        count = self.labels.get(BILLBOARDS, "")
+        variant, loss = self.labels.get("variant", "base"), self.labels.get("loss", "l2")
+        return published_figures().get(Experiment(self.tree, int(count), variant, loss)) if count.isdecimal() else None
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number of a run."""
+
+    name: str
+    """As tables head it."""
+    path: tuple[str, ...]
+    """Where it stands in the report."""
+    digits: str
+    """Format."""
+    more: bool | None
+    """Whether more is better, less is, or neither."""
+
+    def of(self, row: SweepRow) -> float | None:
+        """The number, if the run has it."""
+        value: Any = None if row.facts is None else row.facts["report"]
+        for name in self.path:
+            value = None if value is None else value[name]
+        return None if value is None else float(value)
+
+    def published(self, row: SweepRow) -> float | None:
+        """The thesis's number."""
+        figures = row.published
+        return float(getattr(figures, self.path[-1])) if figures is not None and self.path[0] == "thesis_scale" else None
+
+    def best(self, values: Sequence[float]) -> float | None:
+        """The best of some."""
+        if self.more is None or len(values) < 2:
+            return None
+        return max(values) if self.more else min(values)
+
+
+THESIS_SCALE = (
+    Measure("RMSE", ("thesis_scale", "rmse"), ".2e", False),
+    Measure("SSIM", ("thesis_scale", "ssim"), ".7f", True),
+    Measure("PSNR", ("thesis_scale", "psnr"), ".2f", True),
+    Measure("SRE", ("thesis_scale", "sre"), ".2f", True),
+)
+HONEST = (
+    Measure("PSNR, dB", ("over_white", "psnr"), ".2f", True),
+    Measure("SSIM", ("over_white", "ssim"), ".4f", True),
+    Measure("FLIP", ("over_white", "flip"), ".4f", False),
+    Measure("silhouette IoU", ("rgba", "iou"), ".3f", True),
+    Measure("sharpness", ("sharpness",), ".2f", None),
+    Measure("brightness", ("brightness",), ".2f", None),
+)
+_COLUMNS = {
+    "psnr": ("over_white", "psnr"),
+    "ssim": ("over_white", "ssim"),
+    "flip": ("over_white", "flip"),
+    "rgba_rmse": ("rgba", "rmse"),
+    "rgba_psnr": ("rgba", "psnr"),
+    "iou": ("rgba", "iou"),
+    "sharpness": ("sharpness",),
+    "brightness": ("brightness",),
+    **{f"thesis_{name}": ("thesis_scale", name) for name in ("rmse", "ssim", "psnr", "sre")},
+    "vertices": ("vertices", "model"),
+    "original_vertices": ("vertices", "original"),
+    "vertex_ratio": ("vertices", "ratio"),
+    "bytes": ("bytes", "model"),
+    "original_bytes": ("bytes", "original"),
+    "fit_seconds": ("seconds", "fit"),
+}
+
+
+def table_csv(rows: Sequence[SweepRow]) -> bytes:
+    """A row a run: tree, labels, whether it is done or why it failed, every measure, the thesis's figures (``published_``), and costs."""
+    labels = label_names(rows)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    published = ("rmse", "ssim", "psnr", "sre")
+    counts = ("billboards_fitted", "texels")
+    writer.writerow(
+        [
+            "tree",
+            *labels,
+            "status",
+            "reason",
+            "steps",
+            *_COLUMNS,
+            *(f"published_{name}" for name in published),
+            *counts,
+            "seconds",
+            "folder",
+        ]
+    )
+    for row in rows:
+        facts = row.facts or {}
+        report = facts.get("report")
+        values = [_at(report, path) for path in _COLUMNS.values()]
+        figures = asdict(row.published) if row.published else {}
+        writer.writerow(
+            [
+                row.tree,
+                *(row.labels.get(name, "") for name in labels),
+                "failed" if row.reason else "done",
+                row.reason or "",
+                row.steps,
+                *values,
+                *(figures.get(name) for name in published),
+                facts.get("billboards"),
+                facts.get("texels"),
+                row.seconds,
+                row.folder,
+            ]
+        )
+    return text.getvalue().encode()
+
+
+def table_markdown(rows: Sequence[SweepRow]) -> str:
+    """What was found, as Markdown: the thesis scale, the honest measures, what changes what, vertices and ratios, failures.
+
+    In a table each tree has a column for each number of billboards. Bold is the best number of billboards of a tree, and in the last
+    column the best mean, as in the thesis's figure 11.
+    """
+    done = [row for row in rows if row.reason is None]
+    parts = ["# Sweep\n", f"{len(done)} of {len(rows)} runs done, {_steps(done)} steps each. Held-out views; plain means over them.\n"]
+    if done:
+        note = "; in parentheses what the thesis reports of its trees" if any(row.published for row in done) else ""
+        parts += [f"## Thesis scale\n\nRMSE, SSIM, PSNR and SRE with a peak of 4095{note}.\n", pivot(done, THESIS_SCALE)]
+        parts += ["## Honest measures\n", pivot(done, HONEST)]
+        changes = effects(done)
+        if changes:
+            parts += [
+                "## What changes what\n\nMean difference between runs that differ in nothing else: PSNR over white in dB, then FLIP; in "
+                "parentheses the thesis's difference in PSNR.\n",
+                effect_table(changes),
+            ]
+        parts += ["## Vertices\n\nOf the model, and in per cent of the tree's; in parentheses the thesis's ratio.\n", vertex_table(done)]
+    if failed := [row for row in rows if row.reason]:
+        parts.append("## Failed\n")
+        parts.append("\n".join(f"- {row.tree}, {', '.join(row.labels.values()) or 'its one run'}: {row.reason}" for row in failed) + "\n")
+    return "\n".join(parts)
+
+
+def pivot(rows: Sequence[SweepRow], measures: Sequence[Measure]) -> str:
+    """A table with a line for each measure of each configuration but for its number of billboards, which has columns, as trees have."""
+    columns = list(dict.fromkeys((row.tree, row.labels.get(BILLBOARDS, "")) for row in rows))
+    columns = [column for tree in dict.fromkeys(tree for tree, _ in columns) for column in sorted(c for c in columns if c[0] == tree)]
+    lines = list(dict.fromkeys(_line(row) for row in rows))
+    cells = {(_line(row), (row.tree, row.labels.get(BILLBOARDS, ""))): row for row in rows}
+    head = ["configuration", "measure", *(f"{tree} {count}".strip() for tree, count in columns), "mean"]
+    means: dict[tuple[str, Measure], float] = {}
+    for line, measure in itertools.product(lines, measures):
+        values = _values(cells, line, columns, measure.of)
+        if len(values) == len(columns):
+            means[line, measure] = sum(values.values()) / len(values)
+    table = []
+    for line, measure in itertools.product(lines, measures):
+        ours, theirs = (_values(cells, line, columns, of) for of in (measure.of, measure.published))
+        shown = [line, measure.name]
+        for column in columns:
+            best = measure.best([ours[other] for other in columns if other[0] == column[0] and other in ours])
+            shown.append(_cell(ours.get(column), theirs.get(column), measure.digits, best))
+        best = measure.best([value for (_, other), value in means.items() if other == measure])
+        whole = len(theirs) == len(columns)
+        shown.append(_cell(means.get((line, measure)), sum(theirs.values()) / len(theirs) if whole else None, measure.digits, best))
+        table.append(shown)
+    return markdown(head, table)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What a change of one label does to a tree's runs."""
+
+    change: str
+    """From what to what."""
+    tree: str
+    """Whose runs."""
+    pairs: int
+    """How many pairs of runs differ in this alone."""
+    psnr: float
+    """Mean difference in PSNR over white, in dB."""
+    flip: float
+    """Mean difference in FLIP."""
+    published_psnr: float | None
+    """The same of the thesis's PSNR, where it has all of them."""
+
+
+def effects(rows: Sequence[SweepRow]) -> list[Effect]:
+    """Mean differences between runs that differ in one label alone: between neighbouring numbers of billboards, and from the first value
+    of any other label to each of its others."""
+    found = []
+    psnr, flip, thesis_psnr = HONEST[0], HONEST[2], THESIS_SCALE[2]
+    for name in label_names(rows):
+        values = list(dict.fromkeys(row.labels[name] for row in rows if name in row.labels))
+        if name == BILLBOARDS:
+            values.sort(key=int)
+        for old, new in itertools.pairwise(values) if name == BILLBOARDS else [(values[0], value) for value in values[1:]]:
+            for tree in dict.fromkeys(row.tree for row in rows):
+                pairs = list(_pairs([row for row in rows if row.tree == tree], name, old, new))
+                if not pairs:
+                    continue
+                gains = [[_gain(measure.of, pair) for pair in pairs] for measure in (psnr, flip)]
+                theirs = [gain for pair in pairs if (gain := _gain(thesis_psnr.published, pair)) is not None]
+                means = [sum(known) / len(known) for gain in gains if (known := [one for one in gain if one is not None])]
+                published = sum(theirs) / len(pairs) if len(theirs) == len(pairs) else None
+                found.append(Effect(f"{name} {old} → {new}", tree, len(pairs), means[0], means[1], published))
+    return found
+
+
+def effect_table(found: Sequence[Effect]) -> str:
+    """Effects with a line for each change and a column for each tree."""
+    trees, changes = list(dict.fromkeys(one.tree for one in found)), list(dict.fromkeys(one.change for one in found))
+    by_place = {(one.change, one.tree): one for one in found}
+
+    def cell(change: str, tree: str) -> str:
+        one = by_place.get((change, tree))
+        if one is None:
+            return ""
+        theirs = "" if one.published_psnr is None else f" ({one.published_psnr:+.2f})"
+        return f"{one.psnr:+.2f}{theirs}, {one.flip:+.4f}"
+
+    return markdown(["change", *trees], [[change, *(cell(change, tree) for tree in trees)] for change in changes])
+
+
+def vertex_table(rows: Sequence[SweepRow]) -> str:
+    """The thesis's table 1: what a model's vertices are of its tree's."""
+    trees = list(dict.fromkeys(row.tree for row in rows))
+    originals = {row.tree: _at(row.facts and row.facts["report"], ("vertices", "original")) for row in rows}
+    kinds = sorted({(int(_at(row.facts and row.facts["report"], ("vertices", "model")) or 0)) for row in rows})
+    table = [["the tree", *("" if originals[tree] is None else f"{originals[tree]:,}" for tree in trees)]]
+    for count in kinds:
+        line = [f"{count}"]
+        for tree in trees:
+            theirs = RATIOS_PERCENT.get(tree, {}).get(count)
+            ours = "" if not originals[tree] else f"{100 * count / originals[tree]:.3g} %"
+            line.append(ours + ("" if theirs is None else f" ({theirs:g} %)"))
+        table.append(line)
+    return markdown(["vertices", *trees], table)
+
+
+def label_names(rows: Sequence[SweepRow]) -> list[str]:
+    """Names of all labels, in the order of the grid."""
+    return list(dict.fromkeys(name for row in rows for name in row.labels))
+
+
+def markdown(head: Sequence[str], table: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *table]
+    return "".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |\n" for line in lines)
+
+
+def _at(value: Any, path: tuple[str, ...]) -> Any:
+    for name in path:
+        value = None if value is None else value.get(name)
+    return value
+
+
+def _steps(rows: Sequence[SweepRow]) -> str:
+    counts = sorted({row.steps for row in rows})
+    return " or ".join(f"{count:,}" for count in counts) or "no"
+
+
+def _line(row: SweepRow) -> str:
+    return ", ".join(value for name, value in row.labels.items() if name != BILLBOARDS) or "all"
+
+
+def _values(
+    cells: Mapping[tuple[str, tuple[str, str]], SweepRow],
+    line: str,
+    columns: Sequence[tuple[str, str]],
+    of: Callable[[SweepRow], float | None],
+) -> dict[tuple[str, str], float]:
+    """A measure of each column in which a line has it."""
+    found = {column: of(cells[line, column]) for column in columns if (line, column) in cells}
+    return {column: value for column, value in found.items() if value is not None}
+
+
+def _cell(ours: float | None, theirs: float | None, digits: str, best: float | None) -> str:
+    if ours is None:
+        return ""
+    shown = f"{ours:{digits}}"
+    return (f"**{shown}**" if ours == best else shown) + ("" if theirs is None else f" ({theirs:{digits}})")
+
+
+def _pairs(rows: Sequence[SweepRow], name: str, old: str, new: str) -> Iterator[tuple[SweepRow, SweepRow]]:
+    """Runs that have ``old`` and ``new`` of a label and are otherwise the same."""
+    others = {tuple((n, v) for n, v in row.labels.items() if n != name): row for row in rows if row.labels.get(name) == new}
+    for row in rows:
+        rest = tuple((n, v) for n, v in row.labels.items() if n != name)
+        if row.labels.get(name) == old and rest in others:
+            yield row, others[rest]
+
+
+def _gain(of: Callable[[SweepRow], float | None], pair: tuple[SweepRow, SweepRow]) -> float | None:
+    before, after = map(of, pair)
+    return None if before is None or after is None else after - before

@@ -1,0 +1,147 @@
+"""Sweeps on Ray: a cluster of two nodes with one core each on this machine, of which one is killed in the middle."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import ray
+import sweep_works
+from billboard_scene import crossing_billboards, write_views
+from ray.cluster_utils import Cluster
+
+from bbfit.checks import InputError
+from bbfit.sweep.cluster import RayWorkers, place_files, read_files
+from bbfit.sweep.config import SweepConfig
+from bbfit.sweep.scheduling import run_sweep
+from bbfit.sweep.tasks import Outcome, Task
+
+# Ray leaves sockets to the garbage collector, and warns of its own coming changes.
+pytestmark = [pytest.mark.filterwarnings("ignore::ResourceWarning"), pytest.mark.filterwarnings("ignore::FutureWarning")]
+
+
+@pytest.fixture
+def cluster() -> Iterator[Cluster]:
+    """A head with one core; the tests add the node that they kill."""
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    yield made
+    ray.shutdown()
+    made.shutdown()
+
+
+def test_a_node_that_is_killed_costs_only_what_it_was_running(cluster: Cluster, tmp_path: Path) -> None:
+    """Twelve tasks of a second; the second node goes when it has finished something and is at the next."""
+    node = cluster.add_node(num_cpus=1)
+    marks, inputs = tmp_path / "marks", tmp_path / "views"
+    marks.mkdir()
+    (inputs / "images").mkdir(parents=True)
+    (inputs / "images" / "a.txt").write_text("1")
+    names = [f"t{number}" for number in range(12)]
+    outcomes = dict[str, Outcome]()
+    with RayWorkers(SweepConfig(ray=cluster.address)) as workers:
+        for name in names:
+            arguments = (str(marks), name, 1.0)
+            workers.submit(Task(name, sweep_works.copy, {"views": (inputs,)}, tmp_path / "out" / name, arguments))
+        killed, before = "", dict[str, str]()
+        while len(outcomes) < len(names):
+            task, outcome = workers.next()
+            outcomes[task.name] = outcome
+            if not killed and outcome.where == f"node {node.node_id}":
+                time.sleep(0.5)
+                killed, before = outcome.where, {name: known.where for name, known in outcomes.items()}
+                cluster.remove_node(node, allow_graceful=False)
+    assert killed and before and all(outcome.reason is None for outcome in outcomes.values())
+    began = Counter(sweep_works.begun(marks))
+    assert began.keys() == set(names), "every task began"
+    assert sum(began.values()) - len(names) == 1, "one task ran on the killed node's one core, and began again"
+    assert all(began[name] == 1 for name in before), "what was finished is not done again"
+    assert {outcomes[name].where for name in names if name not in before} - {killed} == {outcomes["t11"].where}
+    for name in names:
+        assert (tmp_path / "out" / name / "sub" / "copy.txt").read_text() == "views a.txt 1"
+
+
+def test_a_sweep_on_a_cluster_is_the_sweep_on_one_machine(cluster: Cluster, tmp_path: Path) -> None:
+    """Fits, with one node killed after the first result; then nothing is left to do, and this machine finds the same."""
+    node = cluster.add_node(num_cpus=1)
+    (tmp_path / "oak").mkdir()
+    write_views(tmp_path / "oak", crossing_billboards(), count=6)
+    config = {"steps": 12, "loss": ("l2",), "billboards": (2, 3, 4), "variants": ("base", "double")}
+
+    def kill(stage: str, done: int, total: int, note: str = "") -> None:
+        if stage == "runs" and done == 1 and node in cluster.list_all_nodes():
+            cluster.remove_node(node, allow_graceful=False)
+
+    on_ray = SweepConfig(ray=cluster.address, **config)
+    there = run_sweep(tmp_path / "ray", on_ray, views=[tmp_path / "oak"], on_progress=kill)
+    assert node not in cluster.list_all_nodes() and [row.reason for row in there.rows] == [None] * 6
+    results = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "ray" / "results").iterdir()}
+    assert run_sweep(tmp_path / "ray", on_ray, views=[tmp_path / "oak"]).kept == 6
+    assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "ray" / "results").iterdir()} == results
+    here = run_sweep(tmp_path / "here", SweepConfig(workers=1, **config), views=[tmp_path / "oak"])
+    for one, other in zip(there.rows, here.rows, strict=True):
+        assert one.folder == other.folder and one.facts and other.facts
+        assert one.facts["report"]["over_white"] == other.facts["report"]["over_white"]
+        made = tmp_path / "ray" / one.folder
+        assert (made / "model.glb").read_bytes() == (tmp_path / "here" / other.folder / "model.glb").read_bytes()
+        assert {path.name for path in made.iterdir()} == {path.name for path in (tmp_path / "here" / other.folder).iterdir()}
+
+
+def test_failures_on_a_cluster_are_recorded(cluster: Cluster, tmp_path: Path) -> None:
+    """Bad input, a fault, and a process that kills itself more often than it is started again."""
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    config = SweepConfig(ray=cluster.address, retries=1)
+    with RayWorkers(config) as workers:
+        tasks = [
+            Task("bad", sweep_works.bad_input, {}, tmp_path / "bad"),
+            Task("fault", sweep_works.fault, {}, tmp_path / "fault"),
+            Task("doomed", sweep_works.die, {}, tmp_path / "doomed", (str(marks), "doomed", 99)),
+            Task("hardy", sweep_works.die, {}, tmp_path / "hardy", (str(marks), "hardy", 1)),
+        ]
+        for task in tasks:
+            workers.submit(task)
+        outcomes = {task.name: outcome for task, outcome in (workers.next() for _ in tasks)}
+    assert outcomes["bad"].reason == "[Errno 2] No such file: 'leaf.png'"
+    assert outcomes["fault"].reason == "ZeroDivisionError: a fault of ours"
+    assert outcomes["doomed"].facts is None and "WorkerCrashedError" in str(outcomes["doomed"].reason)
+    assert outcomes["hardy"].facts == {"name": "hardy"}
+    assert sweep_works.begun(marks) == ["doomed", "doomed", "hardy", "hardy"]
+
+
+def test_tasks_ask_for_what_was_declared(cluster: Cluster, tmp_path: Path) -> None:
+    """What no node has is waited for; a task that wants a machine to itself asks for all cores of the smallest."""
+    cluster.add_node(num_cpus=3)
+    with RayWorkers(SweepConfig(ray=cluster.address, cpus=2, memory="50M")) as workers:
+        task = Task("nap", sweep_works.copy, {}, tmp_path, (str(tmp_path), "nap", 2.0))
+        workers.submit(task)
+        deadline = time.monotonic() + 20
+        while ray.available_resources().get("CPU") != 2 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert ray.available_resources()["CPU"] == 2
+        assert ray.cluster_resources()["memory"] - ray.available_resources()["memory"] == 50_000_000
+        assert workers.next()[1].reason is None
+
+
+def test_an_address_without_a_cluster_is_refused() -> None:
+    with (
+        pytest.raises(InputError, match=r"ray: no cluster answers at 127.0.0.1:1 .*; start one with ray start"),
+        RayWorkers(SweepConfig(ray="127.0.0.1:1")),
+    ):
+        pass
+
+
+def test_files_are_read_and_placed_as_they_lie(tmp_path: Path) -> None:
+    """A folder, a single file, and a file with what it refers to."""
+    (tmp_path / "tree" / "more").mkdir(parents=True)
+    (tmp_path / "tree" / "tree.gltf").write_bytes(b"g")
+    (tmp_path / "tree" / "more" / "part.bin").write_bytes(b"b")
+    (tmp_path / "tree" / "other.txt").write_bytes(b"o")
+    tree, part = tmp_path / "tree" / "tree.gltf", tmp_path / "tree" / "more" / "part.bin"
+    assert read_files(tree) == {"tree.gltf": b"g"}
+    assert read_files(tree, part) == {"tree.gltf": b"g", "more/part.bin": b"b"}
+    assert read_files(tmp_path / "tree") == {"more/part.bin": b"b", "other.txt": b"o", "tree.gltf": b"g"}
+    place_files(read_files(tmp_path / "tree"), tmp_path / "copy")
+    assert (tmp_path / "copy" / "more" / "part.bin").read_bytes() == b"b"

@@ -1,0 +1,116 @@
+"""Tasks in processes of their own: what they return, what they leave behind, and what happens when they die."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import sweep_works
+
+from bbfit.sweep.local import LocalWorkers
+from bbfit.sweep.tasks import Outcome, Task, Work
+
+
+def carried_out(workers: LocalWorkers, tasks: list[Task]) -> dict[str, Outcome]:
+    for task in tasks:
+        workers.submit(task)
+    return {task.name: outcome for task, outcome in (workers.next() for _ in tasks)}
+
+
+def task(name: str, work: Work, folder: Path, *arguments: object, alone: bool = False) -> Task:
+    return Task(name, work, {}, folder, arguments, alone)
+
+
+def test_tasks_read_and_write_where_they_are_told_to(tmp_path: Path) -> None:
+    (tmp_path / "views").mkdir()
+    (tmp_path / "views" / "a.txt").write_text("1")
+    (tmp_path / "views" / "b.txt").write_text("2")
+    (tmp_path / "tree.txt").write_text("3")
+    inputs = {"views": (tmp_path / "views",), "tree": (tmp_path / "tree.txt",)}
+    with LocalWorkers(2) as workers:
+        tasks = [Task(name, sweep_works.copy, inputs, tmp_path / name, (str(tmp_path), name)) for name in ("x", "y", "z")]
+        outcomes = carried_out(workers, tasks)
+    for name in ("x", "y", "z"):
+        assert outcomes[name].facts == {"name": name, "files": 3} and outcomes[name].reason is None and outcomes[name].seconds > 0
+        assert (tmp_path / name / "sub" / "copy.txt").read_text() == "tree tree.txt 3\nviews a.txt 1\nviews b.txt 2"
+
+
+def test_a_failure_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
+    with LocalWorkers(1) as workers:
+        tasks = [
+            task("fault", sweep_works.fault, tmp_path),
+            task("bad", sweep_works.bad_input, tmp_path),
+            task("good", sweep_works.copy, tmp_path / "good", str(tmp_path), "good"),
+        ]
+        outcomes = carried_out(workers, tasks)
+    assert outcomes["good"].facts == {"name": "good", "files": 0}
+    assert outcomes["fault"].reason == "ZeroDivisionError: a fault of ours" and "sweep_works.py" in (outcomes["fault"].trace or "")
+    assert outcomes["bad"].reason == "[Errno 2] No such file: 'leaf.png'" and outcomes["bad"].trace is None
+
+
+def test_a_process_that_dies_costs_its_own_task_only(tmp_path: Path) -> None:
+    """Killed twice a task is tried a third time; killed thrice it counts as failed."""
+    marks = str(tmp_path)
+    with LocalWorkers(2, retries=2) as workers:
+        tasks = [
+            task("hardy", sweep_works.die, tmp_path, marks, "hardy", 2),
+            task("doomed", sweep_works.die, tmp_path, marks, "doomed", 99),
+            *(task(name, sweep_works.copy, tmp_path / name, marks, name) for name in ("a", "b", "c")),
+        ]
+        outcomes = carried_out(workers, tasks)
+    assert outcomes["hardy"].facts == {"name": "hardy"}
+    assert outcomes["doomed"].reason == "its process died 3 times, last by SIGKILL"
+    assert all(outcomes[name].reason is None for name in ("a", "b", "c"))
+    assert sweep_works.begun(tmp_path) == ["a", "b", "c", *["doomed"] * 3, *["hardy"] * 3]
+
+
+def test_tasks_that_want_a_machine_to_themselves_run_alone(tmp_path: Path) -> None:
+    """Of two that take a while none begins before the one before it has ended."""
+    marks = str(tmp_path)
+    with LocalWorkers(2) as workers:
+        workers.submit(task("first", sweep_works.copy, tmp_path / "first", marks, "first", 0.5, alone=True))
+        workers.submit(task("second", sweep_works.copy, tmp_path / "second", marks, "second", 0.5))
+        ended, _ = workers.next()
+        assert ended.name == "first" and sweep_works.begun(tmp_path) == ["first"]
+        assert workers.next()[0].name == "second"
+
+
+def test_processes_end_with_their_parent(tmp_path: Path) -> None:
+    """Even when it is killed, in the middle of a task."""
+    script = f"""
+import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+import sweep_works
+from bbfit.sweep.local import LocalWorkers
+from bbfit.sweep.tasks import Task
+if __name__ == "__main__":
+    with LocalWorkers(1) as workers:
+        workers.submit(Task("nap", sweep_works.copy, {{}}, Path({str(tmp_path)!r}), ({str(tmp_path)!r}, "nap", 600.0)))
+        print(workers._workers[0].process.pid, flush=True)
+        workers.next()
+"""
+    (tmp_path / "parent.py").write_text(script)
+    parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py")], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout
+    child = int(parent.stdout.readline())
+    while not sweep_works.begun(tmp_path):
+        time.sleep(0.05)
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    parent.stdout.close()
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{child}/status").exists() and "zombie" not in Path(f"/proc/{child}/status").read_text():
+        assert time.monotonic() < deadline, f"{child} still runs"
+        time.sleep(0.05)
+
+
+def test_leaving_ends_what_still_runs(tmp_path: Path) -> None:
+    with LocalWorkers(1) as workers:
+        workers.submit(task("nap", sweep_works.copy, tmp_path / "nap", str(tmp_path), "nap", 600.0))
+        (process,) = [worker.process for worker in workers._workers]
+        while not sweep_works.begun(tmp_path):
+            time.sleep(0.05)
+    assert not process.is_alive()
