@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from bbfit.budget.choice import choose
     from bbfit.budget.config import BudgetConfig
     from bbfit.checks import InputError
+    from bbfit.comparison import compare
     from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
     from bbfit.exporting.config import ExportConfig, LodConfig
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from bbfit.lod import build_lod
     from bbfit.pipeline import RunConfig, run
     from bbfit.rendering.dispatch import render
+    from bbfit.rivals.config import CompareConfig
     from bbfit.sweep.config import SweepConfig
     from bbfit.sweep.scheduling import run_sweep
     from bbfit.trees.config import GrowConfig
@@ -37,6 +39,7 @@ _HOMES = {
     "BillboardCloud": "bbfit.geometry.cloud",
     "BudgetConfig": "bbfit.budget.config",
     "Camera": "bbfit.geometry.camera",
+    "CompareConfig": "bbfit.rivals.config",
     "ExportConfig": "bbfit.exporting.config",
     "FitConfig": "bbfit.fitting.config",
     "FitResult": "bbfit.fitting.loop",
@@ -52,6 +55,7 @@ _HOMES = {
     "ViewsConfig": "bbfit.blender.config",
     "build_lod": "bbfit.lod",
     "choose": "bbfit.budget.choice",
+    "compare": "bbfit.comparison",
     "evaluate": "bbfit.evaluation.scoring",
     "export": "bbfit.exporting.model",
     "fit": "bbfit.fitting.loop",
@@ -69,6 +73,7 @@ __all__ = [
     "BillboardCloud",
     "BudgetConfig",
     "Camera",
+    "CompareConfig",
     "ExportConfig",
     "FitConfig",
     "FitResult",
@@ -84,6 +89,7 @@ __all__ = [
     "ViewsConfig",
     "build_lod",
     "choose",
+    "compare",
     "evaluate",
     "export",
     "fit",

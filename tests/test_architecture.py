@@ -50,8 +50,13 @@ ONLY_IN = {
         *(f"fitting/{name}.py" for name in ("adam", "fused_sharpness", "fused_ssim", "ssim_kernels")),
     },
     "ray": {"sweep/cluster.py"},
+    "yaml": {"sweep/grid.py"},
+    "mitsuba": {"rivals/mesh_rays.py"},
+    "drjit": {"rivals/mesh_rays.py"},
+    "fast_simplification": {"rivals/decimation.py", "rivals/learned_mesh.py"},
+    "DracoPy": {"rivals/draco.py"},
 }
-NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib")
+NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification")
 
 
 def relative(path: Path) -> str:

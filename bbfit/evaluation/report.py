@@ -162,7 +162,7 @@ class Report:
 
         A view in which a measure is ``None`` does not count for it.
         """
-        return _mean(Measures, [view.measures for view in self.views])
+        return mean_measures(self.views)
 
     @property
     def rings(self) -> tuple[RingScore, ...]:
@@ -176,7 +176,7 @@ class Report:
             RingScore(
                 round(sum(view.elevation_degrees for view in ring) / len(ring), 3),
                 len(ring),
-                _mean(Measures, [view.measures for view in ring]),
+                mean_measures(ring),
             )
             for ring in rings
         )
@@ -226,6 +226,12 @@ class Report:
             return Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar)
         except (KeyError, TypeError, ValueError):
             fail("metrics", f"{path} is not a report", "expected a metrics.json that bbfit evaluate wrote")
+
+
+def mean_measures(views: Sequence[ViewScore]) -> Measures:
+    """Plain means over views; decibels are averaged as decibels. A view in which a measure is ``None`` does not count for it."""
+    means: Measures = _mean(Measures, [view.measures for view in views])
+    return means
 
 
 def _view(entry: dict[str, Any]) -> ViewScore:

@@ -67,24 +67,44 @@ def evaluate(
         if there are no views, they are too small, or the cloud draws numbers that are not finite.
     """
     began = time.perf_counter()
+    scores = score_views(lambda index: held_out(cloud, views, index)[1], views, on_view=on_view)
+    original = original or OriginalTree()
+    return Report(
+        scores,
+        Cost(cloud.vertex_count, original.vertices),
+        Cost(model_bytes, original.bytes),
+        {**(seconds or {}), "evaluate": time.perf_counter() - began},
+        cloud.alpha,
+    )
+
+
+def score_views(
+    draw: Callable[[int], Tensor], views: ViewSet, *, on_view: Callable[[int, int], None] | None = None
+) -> tuple[ViewScore, ...]:
+    """Measure whatever draws a tree against held-out views.
+
+    Parameters
+    ----------
+    draw : premultiplied RGBA in [0, 1] of the view with a number, [H, W, 4].
+    views : V held-out views, of at least 11 x 11 pixels.
+    on_view : called after each view with the number of views done and of all views.
+
+    Raises
+    ------
+    InputError
+        if there are no views or they are too small.
+    """
     if len(views) == 0:
         fail("views", "there is no held-out view to measure on", "give views with a test split")
     metrics.check_size(views.cameras.width, views.cameras.height)
     names, (azimuths, elevations) = views.names, view_angles(views.cameras).T.tolist()
     scores = []
     for index in range(len(views)):
-        target, image = held_out(cloud, views, index)
-        scores.append(ViewScore(names[index], azimuths[index], elevations[index], measure(target, image)))
+        target = views.targets([index], torch.float64)[0]
+        scores.append(ViewScore(names[index], azimuths[index], elevations[index], measure(target, draw(index))))
         if on_view is not None:
             on_view(index + 1, len(views))
-    original = original or OriginalTree()
-    return Report(
-        tuple(scores),
-        Cost(cloud.vertex_count, original.vertices),
-        Cost(model_bytes, original.bytes),
-        {**(seconds or {}), "evaluate": time.perf_counter() - began},
-        cloud.alpha,
-    )
+    return tuple(scores)
 
 
 def held_out(cloud: BillboardCloud, views: ViewSet, index: int) -> tuple[Tensor, Tensor]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Cost = Literal["vertices", "texels", "bytes"]
 """What a budget can limit."""
-_INK, _FAINT, _LINE, _PAPER = (32, 36, 42), (112, 118, 126), (214, 217, 222), (242, 243, 245)
+INK, FAINT, _LINE, PAPER = (32, 36, 42), (112, 118, 126), (214, 217, 222), (242, 243, 245)
 _CELL_LEAST = 220  # pixels: what the writing under a small picture needs
 
 
@@ -66,19 +66,19 @@ def comparison_picture(cloud: BillboardCloud, views: ViewSet, path: str | Path, 
     head = line * (3 if title else 2) - text // 2
     row = height + 3 * text
     size = (3 * cell + 4 * gap, head + len(rows) * row + text // 2)
-    sheet = Image.new("RGB", size, _PAPER)
+    sheet = Image.new("RGB", size, PAPER)
     draw = ImageDraw.Draw(sheet)
-    font, bold = _font("DejaVuSans.ttf", text), _font("DejaVuSans-Bold.ttf", text)
+    font, bold = picture_font("DejaVuSans.ttf", text), picture_font("DejaVuSans-Bold.ttf", text)
     left = [gap + column * (cell + gap) for column in range(3)]
 
     if title:
-        draw.text((gap, line // 2), title, _INK, _font("DejaVuSans-Bold.ttf", text * 5 // 4))
+        draw.text((gap, line // 2), title, INK, picture_font("DejaVuSans-Bold.ttf", text * 5 // 4))
     noun = "billboard" if len(cloud) == 1 else "billboards"
     for x, name, note in zip(
         left, ("Target", "Result", "Difference"), ("", f"{len(cloud)} {noun}, {cloud.vertex_count} vertices", "FLIP"), strict=True
     ):
-        draw.text((x, head - text * 3 // 2), name, _INK, bold)
-        draw.text((x + bold.getlength(name + "  "), head - text * 3 // 2), note, _FAINT, font)
+        draw.text((x, head - text * 3 // 2), name, INK, bold)
+        draw.text((x + bold.getlength(name + "  "), head - text * 3 // 2), note, FAINT, font)
     _colour_bar(sheet, draw, font, left[2] + cell, head - text * 3 // 2, text)
 
     for number, index in enumerate(rows):
@@ -96,7 +96,7 @@ def comparison_picture(cloud: BillboardCloud, views: ViewSet, path: str | Path, 
             f"mean FLIP {error.mean():.3f}",
         )
         for x, caption in zip(left, captions, strict=True):
-            draw.text((x, top + height + text // 2), caption, _INK, font)
+            draw.text((x, top + height + text // 2), caption, INK, font)
     write_bytes(path, encode_png(np.asarray(sheet)))
 
 
@@ -237,16 +237,16 @@ def lod_picture(levels: Sequence[tuple[LodLevel, Cards]], views: ViewSet, path: 
     alpha = views.targets([0])[0][..., 3]
     tall = int(np.ptp(np.flatnonzero(alpha.amax(1).numpy() > 0))) + 1
     side, gap, text = 384, 16, 14
-    sheet = Image.new("RGB", (gap + len(levels) * (side + gap), 2 * (side + gap) + gap + 3 * text), _PAPER)
-    draw, font, bold = ImageDraw.Draw(sheet), _font("DejaVuSans.ttf", text), _font("DejaVuSans-Bold.ttf", text)
+    sheet = Image.new("RGB", (gap + len(levels) * (side + gap), 2 * (side + gap) + gap + 3 * text), PAPER)
+    draw, font, bold = ImageDraw.Draw(sheet), picture_font("DejaVuSans.ttf", text), picture_font("DejaVuSans-Bold.ttf", text)
     for column, (level, cards) in enumerate(levels):
         share = min(1.0, (level.tree_pixels or tall) / tall)
         size = max(metrics.SSIM_WINDOW, round(width * share)), max(metrics.SSIM_WINDOW, round(height * share))
         target = shrunk(views.targets([0])[0], *size)
         image = draw_cards(cards, views.cameras[0].resized(*size))
         left = gap + column * (side + gap)
-        draw.text((left, gap // 2), level.name, _INK, bold)
-        draw.text((left, gap // 2 + text * 5 // 4), f"the tree is {tall * share:.0f} pixels high", _FAINT, font)
+        draw.text((left, gap // 2), level.name, INK, bold)
+        draw.text((left, gap // 2 + text * 5 // 4), f"the tree is {tall * share:.0f} pixels high", FAINT, font)
         for row, picture in enumerate((target, image)):
             pixels = Image.fromarray(to_bytes(over_colour(picture))).resize((side, side * height // width), Image.Resampling.NEAREST)
             sheet.paste(pixels, (left, 3 * text + gap + row * (side + gap)))
@@ -278,15 +278,15 @@ def _colour_bar(sheet: Any, draw: ImageDraw, font: FreeTypeFont, right: int, top
     end = right - int(font.getlength(" 1"))
     bar = np.broadcast_to(_magma(np.linspace(0, 1, length)), (thickness, length, 3))
     sheet.paste(Image.fromarray(np.ascontiguousarray(bar)), (end - length, top + text // 4))
-    draw.text((end, top), " 1", _FAINT, font)
-    draw.text((end - length, top), "0 ", _FAINT, font, anchor="ra")
+    draw.text((end, top), " 1", FAINT, font)
+    draw.text((end - length, top), "0 ", FAINT, font, anchor="ra")
 
 
 def _height(elevation: float) -> str:
     return f", elevation {elevation:.0f}°" if abs(elevation) >= 0.5 else ""
 
 
-def _font(name: str, size: int) -> FreeTypeFont:
+def picture_font(name: str, size: int) -> FreeTypeFont:
     """A font that comes with matplotlib, so that pictures look the same everywhere."""
     from matplotlib import get_data_path
     from PIL import ImageFont

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from bbfit.evaluation.report import Cost, Report
 from bbfit.exporting.lod import LodLevel
+from bbfit.reporting.comparison_tables import CompareRow
 from bbfit.reporting.sweep_tables import HONEST, SweepRow, label_names
 from bbfit.trees.species import Species
 
@@ -130,6 +131,23 @@ def sweep_table(rows: Sequence[SweepRow]) -> Table:
         measures = [f"{measure.of(row):{measure.digits}}" for measure in HONEST[:3]]
         costs = [_count(report[name]["model"]) for name in ("vertices", "bytes")]
         table.add_row(*start, *measures, *costs, f"{row.seconds:.1f}")
+    return table
+
+
+def compare_table(rows: Sequence[CompareRow]) -> Table:
+    """A ``rich`` table with a line a system: its score on the held-out views and what it costs."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("system")
+    for name in ("PSNR, dB", "SSIM", "FLIP", "planes", "vertices", "bytes", "seconds"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        white = None if row.measures is None else row.measures.over_white
+        scores = ["-"] * 3 if white is None else [f"{white.psnr:.2f}", f"{white.ssim:.3f}", f"{white.flip:.3f}"]
+        seconds = "-" if row.seconds is None else f"{row.seconds:,.1f}"
+        table.add_row(row.title, *scores, _count(row.planes), _count(row.vertices), _count(row.bytes), seconds)
     return table
 
 

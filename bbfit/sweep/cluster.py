@@ -55,12 +55,6 @@ class RayWorkers:
                 )
             self._started = True
         self._machine = int(min((node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]), default=0))
-        self._remote = ray.remote(_carry_out).options(
-            num_gpus=self._config.gpus,
-            memory=self._config.memory_bytes,
-            max_retries=self._config.retries,
-            scheduling_strategy="SPREAD",
-        )
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -74,7 +68,13 @@ class RayWorkers:
         contents = [self._shared(paths) for paths in task.inputs.values()]
         named = {name: paths[0].name if paths[0].is_file() else "" for name, paths in task.inputs.items()}
         cores = max(self._config.cpus, self._machine) if task.alone else self._config.cpus
-        remote = self._remote.options(num_cpus=cores)
+        remote = self._ray.remote(_carry_out).options(
+            num_cpus=cores,
+            num_gpus=self._config.gpus,
+            memory=self._config.memory_bytes,
+            max_retries=self._config.retries,
+            scheduling_strategy="SPREAD",
+        )
         self._running[remote.remote(replace(task, inputs={}, folder=Path()), cores, named, *contents)] = task
 
     def next(self) -> tuple[Task, Outcome]:

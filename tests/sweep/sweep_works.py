@@ -20,10 +20,11 @@ def mark(marks: str, name: str) -> None:
     Path(marks, f"{name} {uuid.uuid4()}").touch()
 
 
-def copy(inputs: Mapping[str, Path], folder: Path, marks: str, name: str, seconds: float = 0.0) -> dict[str, Any]:
-    """Put together what the inputs hold."""
+def copy(inputs: Mapping[str, Path], folder: Path, marks: str, name: str, gate: str = "") -> dict[str, Any]:
+    """Put together what the inputs hold, when the file ``gate`` is there."""
     mark(marks, name)
-    time.sleep(seconds)
+    while gate and not Path(gate).exists():
+        time.sleep(0.02)
     folder.mkdir(parents=True, exist_ok=True)
     texts = []
     for key in sorted(inputs):

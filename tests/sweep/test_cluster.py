@@ -17,7 +17,7 @@ from bbfit.checks import InputError
 from bbfit.sweep.cluster import RayWorkers, place_files, read_files
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.scheduling import run_sweep
-from bbfit.sweep.tasks import Outcome, Task
+from bbfit.sweep.tasks import Task
 
 # Ray leaves sockets to the garbage collector, and warns of its own coming changes.
 pytestmark = [pytest.mark.filterwarnings("ignore::ResourceWarning"), pytest.mark.filterwarnings("ignore::FutureWarning")]
@@ -33,33 +33,35 @@ def cluster() -> Iterator[Cluster]:
 
 
 def test_a_node_that_is_killed_costs_only_what_it_was_running(cluster: Cluster, tmp_path: Path) -> None:
-    """Twelve tasks of a second; the second node goes when it has finished something and is at the next."""
+    """Some tasks are finished, two run, one on each node's core, and more wait when the second node is killed."""
     node = cluster.add_node(num_cpus=1)
-    marks, inputs = tmp_path / "marks", tmp_path / "views"
+    marks, inputs, gate = tmp_path / "marks", tmp_path / "views", tmp_path / "gate"
     marks.mkdir()
     (inputs / "images").mkdir(parents=True)
     (inputs / "images" / "a.txt").write_text("1")
-    names = [f"t{number}" for number in range(12)]
-    outcomes = dict[str, Outcome]()
+    early, late = [f"early{number}" for number in range(4)], [f"late{number}" for number in range(6)]
     with RayWorkers(SweepConfig(ray=cluster.address)) as workers:
-        for name in names:
-            arguments = (str(marks), name, 1.0)
-            workers.submit(Task(name, sweep_works.copy, {"views": (inputs,)}, tmp_path / "out" / name, arguments))
-        killed, before = "", dict[str, str]()
-        while len(outcomes) < len(names):
-            task, outcome = workers.next()
-            outcomes[task.name] = outcome
-            if not killed and outcome.where == f"node {node.node_id}":
-                time.sleep(0.5)
-                killed, before = outcome.where, {name: known.where for name, known in outcomes.items()}
-                cluster.remove_node(node, allow_graceful=False)
-    assert killed and before and all(outcome.reason is None for outcome in outcomes.values())
+
+        def submit(name: str, *gates: str) -> None:
+            workers.submit(Task(name, sweep_works.copy, {"views": (inputs,)}, tmp_path / "out" / name, (str(marks), name, *gates)))
+
+        for name in early:
+            submit(name)
+        outcomes = {task.name: outcome for task, outcome in (workers.next() for _ in early)}
+        for name in late:
+            submit(name, str(gate))
+        while len(sweep_works.begun(marks)) < len(early) + 2:
+            time.sleep(0.05)
+        cluster.remove_node(node, allow_graceful=False)
+        gate.touch()
+        outcomes |= {task.name: outcome for task, outcome in (workers.next() for _ in late)}
+    assert all(outcome.reason is None for outcome in outcomes.values())
     began = Counter(sweep_works.begun(marks))
-    assert began.keys() == set(names), "every task began"
-    assert sum(began.values()) - len(names) == 1, "one task ran on the killed node's one core, and began again"
-    assert all(began[name] == 1 for name in before), "what was finished is not done again"
-    assert {outcomes[name].where for name in names if name not in before} - {killed} == {outcomes["t11"].where}
-    for name in names:
+    assert began.keys() == {*early, *late}
+    assert all(began[name] == 1 for name in early), "what was finished is not done again"
+    assert sum(began[name] for name in late) == len(late) + 1, "one task was running on the killed node, and began again"
+    assert len({outcomes[name].where for name in late}) == 1
+    for name in outcomes:
         assert (tmp_path / "out" / name / "sub" / "copy.txt").read_text() == "views a.txt 1"
 
 
@@ -115,13 +117,14 @@ def test_tasks_ask_for_what_was_declared(cluster: Cluster, tmp_path: Path) -> No
     """What no node has is waited for; a task that wants a machine to itself asks for all cores of the smallest."""
     cluster.add_node(num_cpus=3)
     with RayWorkers(SweepConfig(ray=cluster.address, cpus=2, memory="50M")) as workers:
-        task = Task("nap", sweep_works.copy, {}, tmp_path, (str(tmp_path), "nap", 2.0))
+        task = Task("nap", sweep_works.copy, {}, tmp_path, (str(tmp_path), "nap", str(tmp_path / "gate")))
         workers.submit(task)
         deadline = time.monotonic() + 20
         while ray.available_resources().get("CPU") != 2 and time.monotonic() < deadline:
             time.sleep(0.05)
         assert ray.available_resources()["CPU"] == 2
         assert ray.cluster_resources()["memory"] - ray.available_resources()["memory"] == 50_000_000
+        (tmp_path / "gate").touch()
         assert workers.next()[1].reason is None
 
 

@@ -68,11 +68,14 @@ def test_a_process_that_dies_costs_its_own_task_only(tmp_path: Path) -> None:
 
 
 def test_tasks_that_want_a_machine_to_themselves_run_alone(tmp_path: Path) -> None:
-    """Of two that take a while none begins before the one before it has ended."""
-    marks = str(tmp_path)
+    """The one behind it begins when it has ended."""
+    marks, gate = str(tmp_path), tmp_path / "gate"
     with LocalWorkers(2) as workers:
-        workers.submit(task("first", sweep_works.copy, tmp_path / "first", marks, "first", 0.5, alone=True))
-        workers.submit(task("second", sweep_works.copy, tmp_path / "second", marks, "second", 0.5))
+        workers.submit(task("first", sweep_works.copy, tmp_path / "first", marks, "first", str(gate), alone=True))
+        workers.submit(task("second", sweep_works.copy, tmp_path / "second", marks, "second"))
+        time.sleep(0.5)
+        assert sweep_works.begun(tmp_path) in ([], ["first"])
+        gate.touch()
         ended, _ = workers.next()
         assert ended.name == "first" and sweep_works.begun(tmp_path) == ["first"]
         assert workers.next()[0].name == "second"
@@ -88,7 +91,7 @@ from bbfit.sweep.local import LocalWorkers
 from bbfit.sweep.tasks import Task
 if __name__ == "__main__":
     with LocalWorkers(1) as workers:
-        workers.submit(Task("nap", sweep_works.copy, {{}}, Path({str(tmp_path)!r}), ({str(tmp_path)!r}, "nap", 600.0)))
+        workers.submit(Task("nap", sweep_works.copy, {{}}, Path({str(tmp_path)!r}), ({str(tmp_path)!r}, "nap", "never")))
         print(workers._workers[0].process.pid, flush=True)
         workers.next()
 """
@@ -109,7 +112,7 @@ if __name__ == "__main__":
 
 def test_leaving_ends_what_still_runs(tmp_path: Path) -> None:
     with LocalWorkers(1) as workers:
-        workers.submit(task("nap", sweep_works.copy, tmp_path / "nap", str(tmp_path), "nap", 600.0))
+        workers.submit(task("nap", sweep_works.copy, tmp_path / "nap", str(tmp_path), "nap", "never"))
         (process,) = [worker.process for worker in workers._workers]
         while not sweep_works.begun(tmp_path):
             time.sleep(0.05)

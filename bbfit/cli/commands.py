@@ -1,37 +1,22 @@
-"""The command line: parse, call, print, exit code; nothing else.
-
-Exit codes: 0 done, 2 bad input, 1 a failure of ours, 130 stopped from the keyboard.
-"""
+"""The commands that turn one tree into billboards, and the stages of it: parse, call, print."""
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import io
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.budget.config import BudgetConfig
-from bbfit.checks import InputError, fail
+from bbfit.checks import fail
+from bbfit.cli.console import out_console, progress, show, show_missed
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.fitting.config import FitConfig
-from bbfit.sweep.config import SweepConfig
 from bbfit.trees.config import GrowConfig
 
-if TYPE_CHECKING:
-    from bbfit.pipeline import Progress, RunResult
 
-_out, _err = Console(), Console(stderr=True)
-
-
-def _run(
+def run_command(
     tree: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[TREE]")] = None,
     /,
     out: Path = Path("runs/tree"),
@@ -59,13 +44,13 @@ def _run(
     from bbfit.pipeline import RunConfig, run
 
     config = RunConfig(species=species, grow=grow, views=views, fit=fit, budget=budget, export=export)
-    with _progress() as tell:
+    with progress() as tell:
         result = run(tree, out, config, on_progress=tell)
-    _show(result)
-    _show_missed(export)
+    show(result)
+    show_missed(export)
 
 
-def _grow(
+def grow_command(
     species: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SPECIES]")] = None,
     /,
     out: Path | None = None,
@@ -87,8 +72,8 @@ def _grow(
     if list:
         from bbfit.reporting.tables import species_table
 
-        _out.print(species_table([load_species(name, config.species_file) for name in known_species(config.species_file)]))
-        _out.print(f"figures in {config.species_file or figures_file()}", soft_wrap=True, highlight=False)
+        out_console.print(species_table([load_species(name, config.species_file) for name in known_species(config.species_file)]))
+        out_console.print(f"figures in {config.species_file or figures_file()}", soft_wrap=True, highlight=False)
         return
     from bbfit.trees.tree_file import write_tree
 
@@ -98,12 +83,12 @@ def _grow(
     check_model_path("tree", out)
     scene = grow(figures, seed=config.seed, detail=config.detail, leaves=config.leaves, max_vertices=config.max_vertices)
     paths = write_tree(scene, out)
-    _out.print(f"{figures.name}: {sum(len(mesh.vertices) for mesh in scene.geometry.values()):,} vertices")
+    out_console.print(f"{figures.name}: {sum(len(mesh.vertices) for mesh in scene.geometry.values()):,} vertices")
     for path in paths:
-        _out.print(f"{path}  {path.stat().st_size:,} bytes", soft_wrap=True)
+        out_console.print(f"{path}  {path.stat().st_size:,} bytes", soft_wrap=True)
 
 
-def _views(
+def views_command(
     tree: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TREE")],
     /,
     out: Path,
@@ -118,12 +103,12 @@ def _views(
     """
     from bbfit.blender.views_folder import render_views
 
-    with _progress() as tell:
+    with progress() as tell:
         render_views(tree, out, config, on_progress=lambda done, total: tell("views", done, total))
-    _out.print(f"{config.count} views in {out}")
+    out_console.print(f"{config.count} views in {out}")
 
 
-def _fit(
+def fit_command(
     views: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIEWS")],
     /,
     out: Path,
@@ -146,13 +131,13 @@ def _fit(
     from bbfit.pipeline import RunConfig, run
 
     check_folder("views", views)
-    with _progress() as tell:
+    with progress() as tell:
         result = run(views, out, RunConfig(tree=tree, fit=config, budget=budget, export=export), on_progress=tell)
-    _show(result)
-    _show_missed(export)
+    show(result)
+    show_missed(export)
 
 
-def _evaluate(
+def evaluate_command(
     cloud: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLOUD")],
     views: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIEWS")],
     /,
@@ -179,7 +164,7 @@ def _evaluate(
     billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
     out, earlier = out or cloud.with_name("metrics.json"), cloud.with_name("metrics.json")
     output_folder("out", out.parent)
-    with _progress() as tell:
+    with progress() as tell:
         shipped = as_shipped(billboards, export)
         report = evaluate(
             shipped,
@@ -192,11 +177,11 @@ def _evaluate(
         cards = shipped_cards(billboards, export)
         report = with_model(report, shipped, cards, dataset.test, on_size=lambda done, total: tell("sizes", done, total))
     report.save(out)
-    _out.print(report_table(report))
-    _out.print(f"measures in {out}", soft_wrap=True)
+    out_console.print(report_table(report))
+    out_console.print(f"measures in {out}", soft_wrap=True)
 
 
-def _export(
+def export_command(
     cloud: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLOUD")],
     /,
     out: Path,
@@ -213,11 +198,11 @@ def _export(
     from bbfit.geometry.cloud import BillboardCloud
 
     for path in export(BillboardCloud.load(cloud), out, config):
-        _out.print(f"{path}  {path.stat().st_size:,} bytes")
-    _show_missed(config)
+        out_console.print(f"{path}  {path.stat().st_size:,} bytes")
+    show_missed(config)
 
 
-def _lod(
+def lod_command(
     tree: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TREE")],
     /,
     out: Path,
@@ -244,164 +229,10 @@ def _lod(
     from bbfit.pipeline import RunConfig
     from bbfit.reporting.tables import lod_table
 
-    with _progress() as tell:
+    with progress() as tell:
         result = build_lod(tree, out, config, RunConfig(views=views, fit=fit, export=export), work=work, on_progress=tell)
-    _out.print(lod_table(result.levels))
-    _show_missed(export)
-    _out.print(f"levels of detail in {result.path}, {result.path.stat().st_size:,} bytes; measures in {result.folder}", soft_wrap=True)
-
-
-def _sweep(
-    out: Path,
-    species: tuple[str, ...] = (),
-    trees: tuple[Path, ...] = (),
-    folders: Annotated[tuple[Path, ...], tyro.conf.arg(name="views")] = (),
-    config: Annotated[SweepConfig, tyro.conf.arg(name="")] = SweepConfig(),  # noqa: B008
-    grow: Annotated[GrowConfig, tyro.conf.arg(name="")] = GrowConfig(detail=0.5),  # noqa: B008
-    views: ViewsConfig = ViewsConfig(),  # noqa: B008
-    fit: FitConfig = FitConfig(),  # noqa: B008
-    export: ExportConfig = ExportConfig(),  # noqa: B008
-) -> None:
-    """Fit a grid of configurations to many trees, on this machine or on a Ray cluster, and compare them: the thesis's 72 experiments if
-    nothing else is said.
-
-    Killed and started again, it goes on where it stopped; every run is made once.
-
-    Args:
-        out: Folder for trees, runs and the tables table.csv, table.md and table.png.
-        species: Species to grow; `bbfit grow --list` names them.
-        trees: Tree files to render.
-        folders: Folders of views.
-        config: What is varied, and what it runs on.
-        grow: How trees are grown.
-        views: How trees are rendered.
-        fit: What all runs have in common besides what the grid says.
-        export: How the models are written.
-    """
-    from bbfit.pipeline import RunConfig
-    from bbfit.reporting.tables import sweep_table
-    from bbfit.sweep.scheduling import run_sweep
-
-    stages = RunConfig(grow=grow, views=views, fit=fit, export=export)
-    with _progress() as tell:
-        result = run_sweep(out, config, stages, species=species, trees=trees, views=folders, on_progress=tell)
-    _out.print(sweep_table(result.rows))
-    failed = sum(row.reason is not None for row in result.rows)
-    if result.kept:
-        _out.print(f"{result.kept} results stood from an earlier start", style="dim")
-    if failed:
-        _out.print(f"{failed} runs failed; table.md says why, and --retry-failed tries them again", style="yellow")
-    _out.print(f"tables in {result.folder}: table.csv, table.md, table.png", soft_wrap=True)
-
-
-def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-    """The same command line, but parsing it only returns what to do."""
-
-    @functools.wraps(command)
-    def bind(*args: Any, **options: Any) -> Callable[[], None]:
-        return functools.partial(command, *args, **options)
-
-    return bind
-
-
-_COMMANDS: dict[str, Callable[..., Any]] = {
-    "run": _later(_run),
-    "grow": _later(_grow),
-    "views": _later(_views),
-    "fit": _later(_fit),
-    "evaluate": _later(_evaluate),
-    "export": _later(_export),
-    "lod": _later(_lod),
-    "sweep": _later(_sweep),
-}
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
-    if list(sys.argv[1:] if args is None else args) == ["--version"]:
-        _out.print(f"bbfit {version('bbfit')}", highlight=False)
-        return 0
-    try:
-        _parse(args)()
-    except BrokenPipeError:  # the reader of our output, such as head, has seen enough
-        sys.stdout = None
-        return 0
-    except (InputError, OSError) as error:
-        _err.print(f"bbfit: {error}", style="red", highlight=False, soft_wrap=True, markup=False)
-        return 2
-    except KeyboardInterrupt:
-        _err.print("bbfit: stopped; the same command goes on from here")
-        return 130
-    return 0
-
-
-def _parse(args: Sequence[str] | None) -> Callable[[], None]:
-    """What the arguments ask for; bad values raise :class:`InputError`, unknown options end the process with exit code 2."""
-    complaint = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(complaint):
-            return tyro.extras.subcommand_cli_from_dict(
-                _COMMANDS,
-                prog="bbfit",
-                description="Compress a 3D tree into a handful of textured planes that look like it from every side.",
-                args=args,
-            )
-    except SystemExit as ending:
-        error: BaseException | None = ending
-        while error is not None and not isinstance(error, InputError):
-            error = error.__cause__ or error.__context__
-        if error is not None:
-            raise error from None
-        sys.stderr.write(complaint.getvalue())
-        raise
-
-
-def _show(result: RunResult) -> None:
-    from bbfit.reporting.tables import report_table
-
-    _out.print(report_table(result.report))
-    if result.skipped:
-        _out.print(f"unchanged, not done again: {', '.join(result.skipped)}", style="dim")
-    if result.missed is not None:
-        _out.print(
-            f"no short fit within the budget reached {result.missed:g} dB on validation views; this is the best one, fitted for longer",
-            style="yellow",
-        )
-    _out.print(
-        f"results in {result.folder}: comparison.png, model.glb, model.obj, metrics.json, cloud.safetensors, loss.png", soft_wrap=True
+    out_console.print(lod_table(result.levels))
+    show_missed(export)
+    out_console.print(
+        f"levels of detail in {result.path}, {result.path.stat().st_size:,} bytes; measures in {result.folder}", soft_wrap=True
     )
-
-
-def _show_missed(config: ExportConfig) -> None:
-    if config.missed is not None:
-        _out.print(f"textures are PNG alone, without mip levels; for KTX2 {config.missed}", style="yellow", soft_wrap=True)
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Progress]:
-    """One bar a stage, with rate and time left, on standard error."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    with Progress(
-        TextColumn("{task.description:9}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]:>10}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-        console=_err,
-    ) as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def tell(stage: str, done: int, total: int, note: str = "") -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total, rate="", note="", completed=done - 1)
-            speed = bars.tasks[list(tasks).index(stage)].speed
-            bars.update(tasks[stage], completed=done, total=total, note=note, rate="" if speed is None else f"{speed:.1f}/s")
-
-        yield tell
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,48 @@
+"""What the commands share of the terminal: results on standard output, progress and complaints on standard error."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from bbfit.exporting.config import ExportConfig
+
+if TYPE_CHECKING:
+    from bbfit.pipeline import Progress, RunResult
+
+out_console = Console()
+"""Standard output."""
+err_console = Console(stderr=True)
+"""Standard error."""
+
+
+def show(result: RunResult) -> None:
+    """Print a run's score and where its results are."""
+    from bbfit.reporting.tables import report_table
+
+    out_console.print(report_table(result.report))
+    if result.skipped:
+        out_console.print(f"unchanged, not done again: {', '.join(result.skipped)}", style="dim")
+    if result.missed is not None:
+        out_console.print(
+            f"no short fit within the budget reached {result.missed:g} dB on validation views; this is the best one, fitted for longer",
+            style="yellow",
+        )
+    out_console.print(
+        f"results in {result.folder}: comparison.png, model.glb, model.obj, metrics.json, cloud.safetensors, loss.png", soft_wrap=True
+    )
+
+
+def show_missed(config: ExportConfig) -> None:
+    """Say if a texture format was left out for want of a package."""
+    if config.missed is not None:
+        out_console.print(f"textures are PNG alone, without mip levels; for KTX2 {config.missed}", style="yellow", soft_wrap=True)
+
+
+def progress() -> contextlib.AbstractContextManager[Progress]:
+    """One bar a stage on standard error."""
+    from bbfit.reporting.progress import progress_bars
+
+    return progress_bars(err_console)

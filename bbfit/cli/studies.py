@@ -1,0 +1,92 @@
+"""The commands that compare: many configurations on many trees, and many systems on one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from bbfit.blender.config import ViewsConfig
+from bbfit.cli.console import out_console, progress
+from bbfit.exporting.config import ExportConfig
+from bbfit.fitting.config import FitConfig
+from bbfit.rivals.config import CompareConfig
+from bbfit.sweep.config import SweepConfig
+from bbfit.trees.config import GrowConfig
+
+
+def sweep_command(
+    out: Path,
+    species: tuple[str, ...] = (),
+    trees: tuple[Path, ...] = (),
+    folders: Annotated[tuple[Path, ...], tyro.conf.arg(name="views")] = (),
+    config: Annotated[SweepConfig, tyro.conf.arg(name="")] = SweepConfig(),  # noqa: B008
+    grow: Annotated[GrowConfig, tyro.conf.arg(name="")] = GrowConfig(detail=0.5),  # noqa: B008
+    views: ViewsConfig = ViewsConfig(),  # noqa: B008
+    fit: FitConfig = FitConfig(),  # noqa: B008
+    export: ExportConfig = ExportConfig(),  # noqa: B008
+) -> None:
+    """Fit a grid of configurations to many trees, on this machine or on a Ray cluster, and compare them: the thesis's 72 experiments if
+    nothing else is said.
+
+    Killed and started again, it goes on where it stopped; every run is made once.
+
+    Args:
+        out: Folder for trees, runs and the tables table.csv, table.md and table.png.
+        species: Species to grow; `bbfit grow --list` names them.
+        trees: Tree files to render.
+        folders: Folders of views.
+        config: What is varied, and what it runs on.
+        grow: How trees are grown.
+        views: How trees are rendered.
+        fit: What all runs have in common besides what the grid says.
+        export: How the models are written.
+    """
+    from bbfit.pipeline import RunConfig
+    from bbfit.reporting.tables import sweep_table
+    from bbfit.sweep.scheduling import run_sweep
+
+    stages = RunConfig(grow=grow, views=views, fit=fit, export=export)
+    with progress() as tell:
+        result = run_sweep(out, config, stages, species=species, trees=trees, views=folders, on_progress=tell)
+    out_console.print(sweep_table(result.rows))
+    failed = sum(row.reason is not None for row in result.rows)
+    if result.kept:
+        out_console.print(f"{result.kept} results stood from an earlier start", style="dim")
+    if failed:
+        out_console.print(f"{failed} runs failed; table.md says why, and --retry-failed tries them again", style="yellow")
+    out_console.print(f"tables in {result.folder}: table.csv, table.md, table.png", soft_wrap=True)
+
+
+def compare_command(
+    tree: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TREE")],
+    /,
+    out: Path = Path("runs/compare"),
+    config: Annotated[CompareConfig, tyro.conf.arg(name="")] = CompareConfig(),  # noqa: B008
+    views: ViewsConfig = ViewsConfig(),  # noqa: B008
+    fit: FitConfig = FitConfig(),  # noqa: B008
+    export: ExportConfig = ExportConfig(),  # noqa: B008
+) -> None:
+    """Give a tree to bbfit and to what it is an alternative to, and score all on the same held-out views, with bytes, vertices, seconds.
+
+    Killed and started again, it goes on where it stopped.
+
+    Args:
+        tree: A tree whose triangles can be read (.glb .gltf .obj).
+        out: Folder for the results.
+        config: Which systems there are, and how large.
+        views: How the tree is rendered.
+        fit: How bbfit's billboards are fitted.
+        export: How they are written.
+    """
+    from bbfit.comparison import compare
+    from bbfit.pipeline import RunConfig
+    from bbfit.reporting.tables import compare_table
+
+    with progress() as tell:
+        result = compare(tree, out, config, RunConfig(views=views, fit=fit, export=export), on_progress=tell)
+    out_console.print(compare_table(result.rows))
+    out_console.print(
+        f"tables in {result.folder}: compare.md, compare.csv, compare.json; pictures: systems.png, quality.png", soft_wrap=True
+    )

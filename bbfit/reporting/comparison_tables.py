@@ -1,0 +1,166 @@
+"""Tables and pictures of systems that were given the same tree."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bbfit.evaluation.report import Measures, OverWhite, Rgba, ThesisScale
+from bbfit.evaluation.scoring import OriginalTree, view_angles
+from bbfit.files import write_bytes
+from bbfit.images import encode_png, over_colour, premultiply, read_rgba, to_bytes
+from bbfit.reporting.plots import FAINT, INK, PAPER, picture_font, spread_views
+from bbfit.reporting.sweep_tables import markdown
+from bbfit.views import ViewSet
+
+# Tiles of the picture: pixels a side, tiles a row, size of the writing.
+_TILE, _COLUMNS, _TEXT = 340, 5, 13
+
+
+@dataclass(frozen=True)
+class CompareRow:
+    """A system's result."""
+
+    system: str
+    """Its short name."""
+    title: str
+    """What it did."""
+    planes: int | None
+    """How many it uses; ``None`` for a mesh."""
+    vertices: int | None
+    """Of its model."""
+    bytes: int | None
+    """Of its model as GLB."""
+    seconds: float | None
+    """That making it took, without the views that fits are made to."""
+    measures: Measures | None
+    """Means over the held-out views; ``None`` where nothing was drawn."""
+    note: str
+    """What is to be known of it."""
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it as JSON holds it."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(content: dict[str, Any]) -> CompareRow:
+        """What :meth:`to_json` gave."""
+        found = content["measures"]
+        measures = None
+        if found is not None:
+            groups = OverWhite(**found["over_white"]), Rgba(**found["rgba"]), ThesisScale(**found["thesis_scale"])
+            measures = Measures(*groups, found["sharpness"], found["brightness"])
+        return CompareRow(**{**content, "measures": measures})
+
+
+def compare_csv(rows: Sequence[CompareRow]) -> bytes:
+    """A row a system with all measures and costs."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    names = ("psnr", "ssim", "flip", "rgba_rmse", "rgba_psnr", "iou", "sharpness", "brightness", "thesis_psnr")
+    writer.writerow(["system", "title", "planes", "vertices", "bytes", "seconds", *names, "note"])
+    for row in rows:
+        writer.writerow([row.system, row.title, row.planes, row.vertices, row.bytes, row.seconds, *_measures(row.measures), row.note])
+    return text.getvalue().encode()
+
+
+def _measures(measures: Measures | None) -> list[float | None]:
+    if measures is None:
+        return [None] * 9
+    white, rgba = measures.over_white, measures.rgba
+    own = [white.psnr, white.ssim, white.flip, rgba.rmse, rgba.psnr, rgba.iou]
+    return [*own, measures.sharpness, measures.brightness, measures.thesis_scale.psnr]
+
+
+def compare_markdown(rows: Sequence[CompareRow], original: OriginalTree) -> str:
+    """The same for people, the tree itself first."""
+    table = [["the tree", "", _count(original.vertices), _count(original.bytes), *[""] * 7]]
+    for row in rows:
+        seconds = "" if row.seconds is None else f"{row.seconds:,.1f}"
+        planes = "" if row.planes is None else str(row.planes)
+        table.append([row.title, planes, _count(row.vertices), _count(row.bytes), seconds, *_shown(row.measures)])
+    head = ["system", "planes", "vertices", "bytes", "seconds", "PSNR, dB", "SSIM", "FLIP", "silhouette IoU", "sharpness", "brightness"]
+    notes = "".join(f"- {row.title}: {row.note}\n" for row in rows if row.note)
+    return f"# Comparison\n\nThe same held-out views for all; plain means over them.\n\n{markdown(head, table)}\n{notes}"
+
+
+def _shown(measures: Measures | None) -> list[str]:
+    if measures is None:
+        return [""] * 6
+    white = measures.over_white
+    shares = ["" if value is None else f"{value:.2f}" for value in (measures.sharpness, measures.brightness)]
+    return [f"{white.psnr:.2f}", f"{white.ssim:.4f}", f"{white.flip:.4f}", f"{measures.rgba.iou:.3f}", *shares]
+
+
+def _count(value: int | None) -> str:
+    return "" if value is None else f"{value:,}"
+
+
+def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
+    """Write a PNG: PSNR over white and FLIP against bytes and against vertices, a point for each system that was drawn."""
+    from matplotlib.figure import Figure
+
+    drawn = [row for row in rows if row.measures is not None]
+    if not drawn:
+        return
+    figure = Figure(figsize=(13, 8.5), layout="constrained")
+    axes = figure.subplots(2, 2, sharex="col", sharey="row")
+    for line, name in enumerate(("PSNR over white, dB", "FLIP, less is better")):
+        for column, cost in enumerate(("bytes", "vertices")):
+            axis = axes[line][column]
+            for number, row in enumerate(drawn):
+                assert row.measures is not None
+                white, own = row.measures.over_white, row.system.startswith("bbfit")
+                x, y = getattr(row, cost), white.psnr if line == 0 else white.flip
+                axis.scatter(x, y, s=90 if own else 45, marker="*" if own else "o", color=f"C{number % 10}", zorder=3, label=row.title)
+                axis.annotate(row.system, (x, y), (4, 4), textcoords="offset points", fontsize=7, color="#70767e")
+            axis.set_xscale("log")
+            axis.grid(alpha=0.3)
+            if line == 1:
+                axis.set_xlabel(cost)
+        axes[line][0].set_ylabel(name)
+    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=110)
+    write_bytes(path, data.getvalue())
+
+
+def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) -> None:
+    """Write ``systems.png``: one held-out view over white, and how each system that was drawn shows it.
+
+    Parameters
+    ----------
+    folder : with a folder for each system, whose ``held_out`` holds its pictures by the views' names.
+    """
+    from PIL import Image, ImageDraw
+
+    index = spread_views(view_angles(views.cameras).numpy(), 1)[0]
+    drawn = [row for row in rows if row.measures is not None]
+    pictures = [("the tree", f"held-out view {views.names[index]}", views.targets([index])[0])]
+    for row in drawn:
+        assert row.measures is not None and row.vertices is not None and row.bytes is not None
+        straight = torch.from_numpy(read_rgba(folder / row.system / "held_out" / f"{views.names[index]}.png")).float() / 255
+        white = row.measures.over_white
+        caption = f"{white.psnr:.2f} dB  ·  FLIP {white.flip:.3f}  ·  {row.vertices:,} vertices  ·  {row.bytes / 1e6:.2g} MB"
+        pictures.append((row.title, caption, premultiply(straight)))
+    gap, line = 14, 3 * _TEXT + 8
+    rows_of_tiles = -(-len(pictures) // _COLUMNS)
+    columns = min(_COLUMNS, len(pictures))
+    sheet = Image.new("RGB", (gap + columns * (_TILE + gap), gap + rows_of_tiles * (_TILE + line + gap)), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    font, bold = picture_font("DejaVuSans.ttf", _TEXT - 2), picture_font("DejaVuSans-Bold.ttf", _TEXT)
+    for number, (title, caption, picture) in enumerate(pictures):
+        left, top = gap + number % _COLUMNS * (_TILE + gap), gap + number // _COLUMNS * (_TILE + line + gap)
+        image = Image.fromarray(to_bytes(over_colour(picture)))
+        scale = _TILE / max(image.size)
+        sheet.paste(image.resize((round(image.width * scale), round(image.height * scale)), Image.Resampling.LANCZOS), (left, top))
+        draw.text((left, top + _TILE + 4), title, INK, bold)
+        draw.text((left, top + _TILE + 8 + _TEXT), caption, FAINT, font)
+    write_bytes(folder / "systems.png", encode_png(np.asarray(sheet)))

@@ -1,0 +1,240 @@
+"""Rectangles with textures of what lies about them: parallel renders of slabs of a tree."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bbfit.blender.config import ViewsConfig
+from bbfit.blender.conversion import tree_as_glb
+from bbfit.blender.pictures import FILTER_REACH, render_pictures
+from bbfit.blender.sources import check_tree
+from bbfit.checks import check_range, check_shape, fail
+from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.camera import Camera, orthographic_intrinsics
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import bleed_colour, read_rgba
+
+# Endings of Y-up files whose triangles are read as they stand; others go through Blender.
+_MESH_SUFFIXES = (".glb", ".gltf", ".obj")
+# What of the light from all around the inside of a stem reflects at most. In uncut pictures of an acer and an aspen nothing is as dark,
+# in those of a willow one texel in ten thousand.
+_INSIDE = 0.03
+_TENSORS = ("centers", "rights", "ups", "half_extents", "depths")
+
+
+@dataclass(frozen=True)
+class BakeConfig:
+    """How fine the textures are and in what light they are rendered."""
+
+    texels_a_metre: float
+    """Texels along a metre of every rectangle."""
+    two_sided: bool = False
+    """Whether a rectangle has a back texture, rendered from behind; else it shows what is seen from the front from both sides."""
+    alpha: AlphaMode = field(default_factory=AlphaMode)
+    """What alpha means in the cloud."""
+    views: ViewsConfig = field(default_factory=ViewsConfig)
+    """Light, samples, denoising, device, workers and seed, which should be those of the views to compare with; the rest is not used."""
+
+    def __post_init__(self) -> None:
+        check_range("texels_a_metre", self.texels_a_metre, 0, math.inf, open_low=True)
+
+
+@dataclass(frozen=True)
+class Slabs:
+    """N rectangles, and how far from their planes the tree is shown on them."""
+
+    centers: Tensor
+    """Rectangle centres in metres, [N, 3] float64."""
+    rights: Tensor
+    """Unit vectors to the right, seen from the front, [N, 3]."""
+    ups: Tensor
+    """Unit vectors upwards, perpendicular to ``rights``, [N, 3]."""
+    half_extents: Tensor
+    """Half width and half height in metres, [N, 2]."""
+    depths: Tensor
+    """Least and greatest signed distance from the plane of what is shown, along the normal ``right x up``, in metres, [N, 2]."""
+
+    def __post_init__(self) -> None:
+        n = len(self.centers)
+        for name, width in zip(_TENSORS, (3, 3, 3, 2, 2), strict=True):
+            check_shape(name, tuple(getattr(self, name).shape), (n, width))
+        if not (self.depths[:, 0] < self.depths[:, 1]).all():
+            fail("depths", f"expected the least before the greatest, got {self.depths.tolist()}")
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    @staticmethod
+    def joined(parts: Sequence[Slabs]) -> Slabs:
+        """The slabs of several in one."""
+        return Slabs(*(torch.cat([getattr(part, name) for part in parts]) for name in _TENSORS))
+
+
+def bake(
+    tree: str | Path,
+    slabs: Slabs,
+    config: BakeConfig,
+    *,
+    fill_cuts: bool = False,
+    folder: str | Path | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> BillboardCloud:
+    """Render what lies within each slab onto its rectangle, in parallel projection along the normal.
+
+    Texture and picture have the same texels; rectangles are cut to whole texels, to what their textures show. What is cut away by a
+    slab still casts its shadow. Transparent texels take the colour of the nearest visible one, as straight alpha is filtered.
+
+    Parameters
+    ----------
+    tree : as for :func:`~bbfit.blender.views_folder.render_views`.
+    slabs : N rectangles. Their sides should leave nothing out that is to be seen; a margin for the renderer's filter is added.
+    fill_cuts : give texels that show the dark inside of a stem, cut open by the slab, the colour of the nearest lit texel. The inside is
+        told by reflecting less than 3% of ``config.views.ambient_strength``, in sunlight or not.
+    folder : where the pictures are kept, so that a broken off start can go on (:func:`~bbfit.blender.pictures.render_pictures`); nowhere
+        when left out.
+    on_progress : called with the number of finished pictures and of all pictures.
+
+    Returns
+    -------
+    :class:`BillboardCloud`, float32, in the order of the slabs without those that show nothing.
+
+    Raises
+    ------
+    MissingFileError, InputError
+        if the tree or the folder cannot be used, if a picture would have more than 16384 texels a side, or if there is no Blender.
+    BlenderError
+        if Blender crashes again and again.
+    """
+    if folder is None:
+        with tempfile.TemporaryDirectory(prefix="bbfit-") as scratch:
+            return bake(tree, slabs, config, fill_cuts=fill_cuts, folder=scratch, on_progress=on_progress)
+    if not len(slabs):
+        fail("slabs", "there is none to bake")
+    # Texels from a rectangle's centre to its sides; the centre lies on the corner of a texel.
+    reach = _whole_texels(slabs.half_extents * config.texels_a_metre) + int(FILTER_REACH)
+    size = 2 * int(reach.max())
+    cameras, clips = _facing(slabs, size, config.texels_a_metre)
+    if config.two_sided:
+        back, behind = _facing(_turned(slabs), size, config.texels_a_metre)
+        cameras = Camera(torch.cat([cameras.world_to_camera, back.world_to_camera]), cameras.intrinsics.repeat(2, 1, 1), size, size, True)
+        clips += behind
+    paths = render_pictures(tree, cameras, folder, config.views, clips=clips, on_progress=on_progress)
+    count = len(slabs)
+    parts: list[tuple[int, Tensor, Tensor]] = []
+    for n in range(count):
+        sides = [read_rgba(paths[n])]
+        if config.two_sided:
+            sides.append(read_rgba(paths[count + n])[:, ::-1])  # as seen from the front
+        part = _cropped(np.stack(sides), *reach[n].tolist())
+        if part is not None:
+            dark = _displayed(_INSIDE * config.views.ambient_strength) if fill_cuts else 0.0
+            parts.append((n, torch.stack([_bled(side, dark) for side in part[0]]), part[1]))
+    return _assembled(slabs, parts, config)
+
+
+def tree_triangles(tree: str | Path) -> NDArray[np.float64]:
+    """Corners of all triangles of a tree in the world of its views, [T, 3, 3] in metres.
+
+    Raises
+    ------
+    MissingFileError, InputError
+        if the file is missing, cannot be read or has no triangles, or if it takes Blender to read it and there is none.
+    BlenderError
+        if Blender crashes over it.
+    """
+    import trimesh
+
+    path = check_tree(tree)[0]
+    if path.suffix.lower() not in _MESH_SUFFIXES:
+        with tempfile.TemporaryDirectory(prefix="bbfit-") as scratch:
+            return tree_triangles(tree_as_glb(path, Path(scratch) / "tree.glb"))
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+    except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:
+        fail("tree", f"{path} cannot be read ({error})", "expected a mesh")
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not mesh.area > 0:
+        fail("tree", f"{path} has no triangles", "expected a mesh")
+    return np.asarray(mesh.triangles, np.float64)
+
+
+def _whole_texels(lengths: Tensor) -> Tensor:
+    """Rounded up, int64; what exceeds a whole number by rounding alone is not."""
+    return (lengths - 1e-6).ceil().clamp_min(1).long()
+
+
+def _turned(slabs: Slabs) -> Slabs:
+    """The same rectangles seen from behind."""
+    return Slabs(slabs.centers, -slabs.rights, slabs.ups, slabs.half_extents, -slabs.depths.flip(-1))
+
+
+def _facing(slabs: Slabs, size: int, texels_a_metre: float) -> tuple[Camera, list[tuple[float, float]]]:
+    """Parallel cameras in front of rectangles, with square pictures about their centres, and clip distances of the slabs."""
+    slabs = Slabs(*(getattr(slabs, name).double() for name in _TENSORS))
+    normals = torch.linalg.cross(slabs.rights, slabs.ups)
+    rotation = torch.stack([slabs.rights, -slabs.ups, -normals], -2)
+    distance = slabs.depths[:, 1] + size / texels_a_metre  # of the camera from the plane: far enough for a nearest distance above 0
+    transform = torch.eye(4, dtype=torch.float64).repeat(len(slabs), 1, 1)
+    transform[:, :3, :3] = rotation
+    transform[:, :3, 3:] = -(rotation @ (slabs.centers + distance[:, None] * normals)[..., None])
+    intrinsics = orthographic_intrinsics(size / texels_a_metre, size, size).repeat(len(slabs), 1, 1)
+    near, far = distance - slabs.depths[:, 1], distance - slabs.depths[:, 0]
+    return Camera(transform, intrinsics, size, size, True), list(zip(near.tolist(), far.tolist(), strict=True))
+
+
+def _cropped(sides: NDArray[np.uint8], across: int, along: int) -> tuple[Tensor, Tensor] | None:
+    """The visible part of pictures [S, size, size, 4], at most ``across`` and ``along`` texels from their middle, [S, h, w, 4].
+
+    And that part's first and last edge, left, right, top, bottom, in texels from the middle, [4]. None if nothing is visible.
+    """
+    middle = sides.shape[1] // 2
+    part = sides[:, middle - along : middle + along, middle - across : middle + across]
+    rows, columns = (np.nonzero((part[..., 3] > 0).any(axes))[0] for axes in ((0, 2), (0, 1)))
+    if not len(rows):
+        return None
+    left, right, top, bottom = columns[0], columns[-1] + 1, rows[0], rows[-1] + 1
+    texture = torch.from_numpy(np.ascontiguousarray(part[:, top:bottom, left:right]))
+    edges = torch.tensor([left - across, right - across, top - along, bottom - along], dtype=torch.float64)
+    return texture, edges
+
+
+def _displayed(linear: float) -> float:
+    """A linear value in [0, 1] as sRGB (IEC 61966-2-1), 0..255."""
+    return 255 * (12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def _bled(texture: Tensor, dark: float) -> Tensor:
+    """A texture [h, w, 4], uint8, whose transparent texels, and visible ones below ``dark``, have the colour of the nearest other one."""
+    lit = texture[..., :3].amax(-1) >= dark
+    if not (lit & (texture[..., 3] > 0)).any():
+        return bleed_colour(texture)
+    bled = bleed_colour(torch.where(lit[..., None], texture, 0))
+    return torch.cat([bled[..., :3], texture[..., 3:]], -1)
+
+
+def _assembled(slabs: Slabs, shown: list[tuple[int, Tensor, Tensor]], config: BakeConfig) -> BillboardCloud:
+    kept = [n for n, _, _ in shown]
+    rights, ups = slabs.rights[kept], slabs.ups[kept]
+    edges = torch.stack([edges for _, _, edges in shown]) if shown else torch.zeros(0, 4, dtype=torch.float64)
+    left, right, top, bottom = (edges / config.texels_a_metre).split(1, -1)
+    centers = slabs.centers[kept] + (left + right) / 2 * rights - (top + bottom) / 2 * ups
+    sizes = [list(texture.shape[1:3]) for _, texture, _ in shown]
+    texels = [texture.reshape(-1, 4) for _, texture, _ in shown]
+    return BillboardCloud(
+        centers.float(),
+        rights.float(),
+        ups.float(),
+        torch.cat([right - left, bottom - top], -1).float() / 2,
+        torch.tensor(sizes, dtype=torch.int64).reshape(-1, 2),
+        torch.full((len(shown),), config.two_sided),
+        torch.cat([*texels, torch.zeros(0, 4, dtype=torch.uint8)]).float() / 255,
+        config.alpha,
+    )

@@ -1,0 +1,201 @@
+"""Fewer triangles of the tree itself: collapsed edges (Garland and Heckbert 1997), and clustered vertices where those end.
+
+Quadric error metrics ("Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997) are what programs simplify meshes with; the
+implementation is that of the package fast-simplification. It collapses edges and so leaves every connected part with a few triangles, and
+a tree has tens of thousands of leaves. For less than that, vertices are merged on a grid (Rossignac and Borrel 1993, "Multi-resolution 3D
+approximations for rendering complex scenes"), which knows no parts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bbfit.blender.sources import check_tree
+from bbfit.checks import check_count, fail
+
+if TYPE_CHECKING:
+    import trimesh
+
+# Rounds of collapsing edges, each of the share that the last one left to do; steps of the search for a grid.
+_ROUNDS, _STEPS = 4, 24
+
+
+@dataclass(frozen=True)
+class DecimatedTree:
+    """A tree with fewer triangles, as a GLB file with the tree's materials."""
+
+    glb: bytes
+    """The file."""
+    vertices: int
+    """That it has."""
+    triangles: int
+    """That it has."""
+    clustered: bool
+    """Whether collapsing edges was not enough."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Triangles of one material."""
+
+    points: NDArray[np.float64]  # [P, 3] metres, the file's axes
+    faces: NDArray[np.int64]  # [F, 3]
+    uv: NDArray[np.float64] | None  # [P, 2]
+    material: Any
+
+
+def decimate(tree: str | Path, *, vertices: int | None = None, size: int | None = None) -> DecimatedTree:
+    """Reduce a tree to at most so many vertices, or bytes of its GLB.
+
+    Parts of different materials stay apart and share what is allowed by their triangles. Vertices that lie in the same place with the same
+    texture coordinates are welded first. Normals are left out: surfaces are flat.
+
+    Parameters
+    ----------
+    tree : .glb, .gltf or .obj.
+    vertices : at least 4.
+    size : bytes, textures and materials included.
+
+    Raises
+    ------
+    MissingFileError, InputError
+        if the file cannot be used, the package fast-simplification is missing, not exactly one limit is given, or it cannot be kept.
+    """
+    if (vertices is None) == (size is None):
+        fail("decimate", "expected either vertices or a size", "give one of them")
+    limit = vertices if size is None else size
+    assert limit is not None
+    check_count("vertices" if size is None else "size", limit, 4)
+    collapse = _collapser()
+    parts = _parts(check_tree(tree)[0])
+
+    def cost(parts: list[_Part]) -> int:
+        return sum(len(part.points) for part in parts) if size is None else len(_glb(parts))
+
+    now, clustered = cost(parts), False
+    for _ in range(_ROUNDS):
+        if now <= limit:
+            break
+        share = limit / now if size is None else max(0.0, (limit - _bare(parts)) / max(1, now - _bare(parts)))
+        fewer = [part for part in (collapse(part, max(1, int(len(part.faces) * share))) for part in parts) if len(part.faces)]
+        if not fewer or cost(fewer) > 0.98 * now:  # nothing is left, or nothing more can go
+            break
+        now, parts = cost(fewer), fewer
+    if now > limit:
+        parts, clustered = _clustered(parts, lambda parts: cost(parts) <= limit), True
+    return DecimatedTree(_glb(parts), sum(len(part.points) for part in parts), sum(len(part.faces) for part in parts), clustered)
+
+
+def _collapser() -> Callable[[_Part, int], _Part]:
+    """Collapses edges of a part until about so many triangles are left, or no edge can go."""
+    try:
+        import fast_simplification
+    except ImportError:
+        fail("decimate", "the package fast-simplification is not installed", 'pip install "bbfit[rivals]"')
+
+    def collapse(part: _Part, faces: int) -> _Part:
+        if faces >= len(part.faces):
+            return part
+        points = np.ascontiguousarray(part.points, np.float32)
+        triangles = np.ascontiguousarray(part.faces, np.int32)
+        _, _, collapses = fast_simplification.simplify(points, triangles, target_count=faces, return_collapses=True)
+        moved, left, became = fast_simplification.replay_simplification(points, triangles, collapses)
+        source, kept = np.zeros(len(moved), np.int64), np.nonzero(became >= 0)[0][::-1]
+        source[became[kept]] = kept  # the first vertex that became each
+        return _used(replace(part, points=moved.astype(np.float64), faces=left.astype(np.int64), uv=_taken(part.uv, source)))
+
+    return collapse
+
+
+def _parts(path: Path) -> list[_Part]:
+    """The file's triangles by material, placed and welded."""
+    import trimesh
+
+    try:
+        scene = trimesh.load_scene(path, process=False)
+    except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:
+        fail("tree", f"{path} cannot be read ({error})", "expected a mesh")
+    parts = []
+    for mesh in scene.dump():
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+            continue
+        mesh.merge_vertices(merge_norm=True)
+        uv = getattr(mesh.visual, "uv", None)
+        material = getattr(mesh.visual, "material", None)
+        part = _Part(np.asarray(mesh.vertices), np.asarray(mesh.faces), None if uv is None else np.asarray(uv), material)
+        parts.append(_used(part))
+    if not parts:
+        fail("tree", f"{path} has no triangles", "expected a mesh")
+    return parts
+
+
+def _clustered(parts: list[_Part], fits: Callable[[list[_Part]], bool]) -> list[_Part]:
+    """Parts whose vertices are merged on the finest grid that fits."""
+    points = np.concatenate([part.points for part in parts])
+    low, extent = points.min(0), float(np.ptp(points, axis=0).max())
+    fine, coarse = math.log(extent / 1e4), math.log(2 * extent)
+    best = None
+    for _ in range(_STEPS):
+        middle = (fine + coarse) / 2
+        merged = [part for part in (_merged(part, low, math.exp(middle)) for part in parts) if len(part.faces)]
+        if merged and fits(merged):
+            best, coarse = merged, middle
+        elif merged:
+            fine = middle
+        else:
+            coarse = middle
+    if best is None:
+        fail("decimate", "no triangles are left within the limit", "allow more")
+    return best
+
+
+def _merged(part: _Part, low: NDArray[np.float64], cell: float) -> _Part:
+    """A part with the vertices in each cell of a grid at their mean place, without what has become of no area or twofold."""
+    cells = np.floor((part.points - low) / cell).astype(np.int64)
+    _, first, became = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    became = became.reshape(-1)
+    counts = np.bincount(became)
+    means = np.stack([np.bincount(became, part.points[:, axis]) / counts for axis in range(3)], -1)
+    faces = became[part.faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+    _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return _used(replace(part, points=means, faces=faces[np.sort(kept)], uv=_taken(part.uv, first)))
+
+
+def _taken(uv: NDArray[np.float64] | None, source: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    return None if uv is None else uv[source]
+
+
+def _used(part: _Part) -> _Part:
+    """A part without the vertices that no triangle has."""
+    used, faces = np.unique(part.faces, return_inverse=True)
+    return replace(part, points=part.points[used], faces=faces.reshape(-1, 3), uv=_taken(part.uv, used))
+
+
+def _scene(parts: list[_Part]) -> trimesh.Scene:
+    import trimesh
+
+    meshes = []
+    for part in parts:
+        visual = trimesh.visual.TextureVisuals(uv=part.uv, material=part.material) if part.material is not None else None
+        meshes.append(trimesh.Trimesh(part.points, part.faces, visual=visual, process=False, validate=False))
+    return trimesh.Scene(meshes)
+
+
+def _glb(parts: list[_Part]) -> bytes:
+    data = _scene(parts).export(file_type="glb")
+    assert isinstance(data, bytes)
+    return data
+
+
+def _bare(parts: list[_Part]) -> int:
+    """Bytes of the file without its triangles: materials, textures and the frame."""
+    numbers = sum(part.points.size * 4 + part.faces.size * 4 + (0 if part.uv is None else part.uv.size * 4) for part in parts)
+    return len(_glb(parts)) - numbers

@@ -1,0 +1,113 @@
+"""Slicing and blending (Jakulin 2000, "Interactive Vegetation Rendering with Slicing and Blending", Eurographics short presentations).
+
+From the paper's abstract, all of it that was at hand: a slice is a planar layer with an alpha texture, a set of parallel slices is a
+slicing; a view from anywhere on a circle around the tree is drawn by blending between the nearest two slicings; six slicings of five
+slices each are enough.
+
+Ours: slices show the same texture from both sides, so that a direction and its opposite share a slicing and the six stand 30 degrees
+apart; slabs of equal thickness partition the tree, each slice lying in the middle of its slab; the two slicings are drawn on their own
+and the pictures mixed, with weights linear in the angle. The paper keeps trunk and limbs as a mesh and slices twigs and leaves only; here
+all of the tree is sliced, so that nothing but planes is left, and a stem that a slab cuts shows its inside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bbfit.blender.pictures import vertical_axis
+from bbfit.checks import check_count, check_shape, fail
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.rendering.dispatch import render
+from bbfit.rivals.baking import BakeConfig, Slabs, bake, tree_triangles
+from bbfit.rivals.crossed import upright_slabs
+
+
+@dataclass(frozen=True)
+class Slicings:
+    """D stacks of parallel slices, of which a view shows two at most."""
+
+    clouds: tuple[BillboardCloud, ...]
+    """The slices of each direction, D clouds."""
+    azimuths_degrees: tuple[float, ...]
+    """Direction of each slicing's normal in [0, 180), evenly spaced: 0 is +Z, 90 is +X."""
+    axis: Tensor
+    """Point of the tree from which the direction towards a camera is taken, [3]."""
+
+    def __post_init__(self) -> None:
+        check_shape("axis", tuple(self.axis.shape), (3,))
+        even = np.arange(len(self.clouds)) * 180.0 / max(1, len(self.clouds))
+        if not self.clouds or not np.allclose(self.azimuths_degrees, even):
+            fail("azimuths", f"expected {even.tolist()} for {len(self.clouds)} slicings, got {list(self.azimuths_degrees)}")
+
+    @property
+    def vertex_count(self) -> int:
+        """Vertices of all slicings together."""
+        return sum(cloud.vertex_count for cloud in self.clouds)
+
+    def weights(self, camera: Camera) -> list[tuple[int, float]]:
+        """The two slicings nearest to a single camera's direction, seen from above, and how much each counts; weights add up to 1.
+
+        A parallel camera's direction is its own, a pinhole's that of its centre. Of one straight above it is azimuth 0.
+        """
+        towards = -camera.forward if camera.orthographic else camera.position - self.axis.to(camera.position)
+        azimuth = float(torch.atan2(towards[0], towards[2])) * 180 / np.pi if float(towards[::2].norm()) > 1e-9 else 0.0
+        count = len(self.clouds)
+        place = (azimuth % 180) * count / 180
+        first = int(place)
+        return [(first % count, 1 - (place - first)), ((first + 1) % count, place - first)]
+
+    def draw(self, camera: Camera) -> Tensor:
+        """Draw the tree.
+
+        Returns
+        -------
+        Premultiplied RGBA, [V, H, W, 4] ([H, W, 4] for a single camera).
+        """
+        if camera.batched:
+            return torch.stack([self.draw(camera[index]) for index in range(len(camera))])
+        drawn = [weight * render(self.clouds[index], camera) for index, weight in self.weights(camera) if weight > 0]
+        return torch.stack(drawn).sum(0)
+
+
+def slicing(
+    tree: str | Path,
+    config: BakeConfig,
+    *,
+    directions: int = 6,
+    slices: int = 5,
+    folder: str | Path | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> Slicings:
+    """Slice a tree along evenly spaced directions.
+
+    Slices that show nothing are left out. With ``config.two_sided`` they have a texture of their own from behind, which is ours. What is
+    not said here is as for :func:`~bbfit.rivals.baking.bake`.
+
+    Parameters
+    ----------
+    directions : slicings, at least 1, 180 degrees over so many apart.
+    slices : slices of each, at least 1.
+    """
+    check_count("directions", directions)
+    check_count("slices", slices)
+    points = tree_triangles(tree).reshape(-1, 3)
+    axis = vertical_axis(points.min(0), points.max(0), config.views.axis)
+    azimuths = [k * 180.0 / directions for k in range(directions)]
+    slabs = Slabs.joined([upright_slabs(points, axis, azimuth, slices) for azimuth in azimuths])
+    cloud = bake(tree, slabs, config, fill_cuts=True, folder=folder, on_progress=on_progress)
+    return Slicings(_by_direction(cloud, azimuths), tuple(azimuths), axis)
+
+
+def _by_direction(cloud: BillboardCloud, azimuths: list[float]) -> tuple[BillboardCloud, ...]:
+    """The slices of each direction, told by their normals."""
+    angle = torch.tensor(azimuths, dtype=cloud.centers.dtype).deg2rad()
+    normals = torch.stack([angle.sin(), torch.zeros_like(angle), angle.cos()], -1)
+    nearest = (cloud.normals @ normals.mT).argmax(-1)
+    return tuple(cloud.take(torch.nonzero(nearest == k)[:, 0].tolist()) for k in range(len(azimuths)))
