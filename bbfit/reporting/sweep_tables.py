@@ -167,8 +167,7 @@ def table_markdown(rows: Sequence[SweepRow]) -> str:
         changes = effects(done)
         if changes:
             parts += [
-                "## What changes what\n\nMean difference between runs that differ in nothing else: PSNR over white in dB, then FLIP; in "
-                "parentheses the thesis's difference in PSNR.\n",
+                "## What changes what\n\nMean differences between runs that differ in nothing else.\n",
                 effect_table(changes),
             ]
         parts += ["## Vertices\n\nOf the model, and in per cent of the tree's; in parentheses the thesis's ratio.\n", vertex_table(done)]
@@ -206,27 +205,31 @@ def pivot(rows: Sequence[SweepRow], measures: Sequence[Measure]) -> str:
 
 @dataclass(frozen=True)
 class Effect:
-    """What a change of one label does to a tree's runs."""
+    """What a change of one label does to a tree's runs: mean differences of pairs of runs that differ in it alone."""
 
     change: str
     """From what to what."""
     tree: str
     """Whose runs."""
     pairs: int
-    """How many pairs of runs differ in this alone."""
-    psnr: float
-    """Mean difference in PSNR over white, in dB."""
-    flip: float
-    """Mean difference in FLIP."""
+    """How many pairs there are."""
+    thesis_psnr: float | None
+    """Difference in PSNR on the thesis scale, in dB."""
     published_psnr: float | None
-    """The same of the thesis's PSNR, where it has all of them."""
+    """The same of the thesis's figures."""
+    psnr: float | None
+    """Difference in PSNR over white, in dB."""
+    ssim: float | None
+    """Difference in SSIM."""
+    flip: float | None
+    """Difference in FLIP."""
 
 
 def effects(rows: Sequence[SweepRow]) -> list[Effect]:
     """Mean differences between runs that differ in one label alone: between neighbouring numbers of billboards, and from the first value
     of any other label to each of its others."""
     found = []
-    psnr, flip, thesis_psnr = HONEST[0], HONEST[2], THESIS_SCALE[2]
+    (psnr, ssim, flip), thesis_psnr = HONEST[:3], THESIS_SCALE[2]
     for name in label_names(rows):
         values = list(dict.fromkeys(row.labels[name] for row in rows if name in row.labels))
         if name == BILLBOARDS:
@@ -234,29 +237,25 @@ def effects(rows: Sequence[SweepRow]) -> list[Effect]:
         for old, new in itertools.pairwise(values) if name == BILLBOARDS else [(values[0], value) for value in values[1:]]:
             for tree in dict.fromkeys(row.tree for row in rows):
                 pairs = list(_pairs([row for row in rows if row.tree == tree], name, old, new))
-                if not pairs:
-                    continue
-                gains = [[_gain(measure.of, pair) for pair in pairs] for measure in (psnr, flip)]
-                theirs = [gain for pair in pairs if (gain := _gain(thesis_psnr.published, pair)) is not None]
-                means = [sum(known) / len(known) for gain in gains if (known := [one for one in gain if one is not None])]
-                published = sum(theirs) / len(pairs) if len(theirs) == len(pairs) else None
-                found.append(Effect(f"{name} {old} → {new}", tree, len(pairs), means[0], means[1], published))
+                if pairs:
+                    of = (thesis_psnr.of, thesis_psnr.published, psnr.of, ssim.of, flip.of)
+                    found.append(Effect(f"{name} {old} → {new}", tree, len(pairs), *(_mean_gain(one, pairs) for one in of)))
     return found
 
 
 def effect_table(found: Sequence[Effect]) -> str:
-    """Effects with a line for each change and a column for each tree."""
-    trees, changes = list(dict.fromkeys(one.tree for one in found)), list(dict.fromkeys(one.change for one in found))
-    by_place = {(one.change, one.tree): one for one in found}
+    """Effects, a line each."""
 
-    def cell(change: str, tree: str) -> str:
-        one = by_place.get((change, tree))
-        if one is None:
-            return ""
-        theirs = "" if one.published_psnr is None else f" ({one.published_psnr:+.2f})"
-        return f"{one.psnr:+.2f}{theirs}, {one.flip:+.4f}"
+    def shown(value: float | None, digits: int) -> str:
+        return "" if value is None else f"{value:+.{digits}f}"
 
-    return markdown(["change", *trees], [[change, *(cell(change, tree) for tree in trees)] for change in changes])
+    head = ["change", "tree", "pairs", "PSNR, thesis scale", "that of the thesis", "PSNR over white, dB", "SSIM", "FLIP"]
+    lines = []
+    for one in found:
+        decibels = (one.thesis_psnr, one.published_psnr, one.psnr)
+        numbers = [*(shown(value, 2) for value in decibels), shown(one.ssim, 4), shown(one.flip, 4)]
+        lines.append([one.change, one.tree, str(one.pairs), *numbers])
+    return markdown(head, lines)
 
 
 def vertex_table(rows: Sequence[SweepRow]) -> str:
@@ -328,6 +327,7 @@ def _pairs(rows: Sequence[SweepRow], name: str, old: str, new: str) -> Iterator[
             yield row, others[rest]
 
 
-def _gain(of: Callable[[SweepRow], float | None], pair: tuple[SweepRow, SweepRow]) -> float | None:
-    before, after = map(of, pair)
-    return None if before is None or after is None else after - before
+def _mean_gain(of: Callable[[SweepRow], float | None], pairs: Sequence[tuple[SweepRow, SweepRow]]) -> float | None:
+    """Mean difference in a measure; ``None`` if a run lacks it."""
+    gains = [after - before for one, other in pairs if (before := of(one)) is not None and (after := of(other)) is not None]
+    return sum(gains) / len(gains) if len(gains) == len(pairs) else None

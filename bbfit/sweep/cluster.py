@@ -6,6 +6,7 @@ its place by the machine that started the sweep. bbfit has to be installed on al
 
 from __future__ import annotations
 
+import re
 import tempfile
 from dataclasses import replace
 from functools import partial
@@ -21,6 +22,9 @@ Files = dict[str, bytes]
 """Contents of a folder's files by their paths in it, or of one file by its name."""
 # Started without them, Ray would ask for the home of its dashboard and print hints.
 _QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "include_dashboard": False}
+
+
+_COLOURS = re.compile("\x1b\\[[0-9;]*m")  # Ray's messages are made for terminals
 
 
 class RayWorkers:
@@ -84,7 +88,7 @@ class RayWorkers:
         try:
             outcome, files = self._ray.get(reference)
         except self._ray.exceptions.RayError as error:
-            told = " ".join(str(error).split())
+            told = " ".join(_COLOURS.sub("", str(error)).split())
             return task, Outcome(None, f"{type(error).__name__}: {told[:300]}", "a node of the cluster that is gone")
         place_files(files, task.folder)
         return task, outcome

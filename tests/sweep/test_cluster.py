@@ -24,8 +24,9 @@ pytestmark = [pytest.mark.filterwarnings("ignore::ResourceWarning"), pytest.mark
 
 
 @pytest.fixture
-def cluster() -> Iterator[Cluster]:
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
     """A head with one core; the tests add the node that they kill."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # so that nodes can import the work of these tests
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     yield made
     ray.shutdown()
