@@ -122,6 +122,7 @@ def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
                 axis.scatter(x, y, s=90 if own else 45, marker="*" if own else "o", color=f"C{number % 10}", zorder=3, label=row.title)
                 axis.annotate(row.system, (x, y), (4, 4), textcoords="offset points", fontsize=7, color="#70767e")
             axis.set_xscale("log")
+            axis.margins(x=0.15)  # for the names
             axis.grid(alpha=0.3)
             if line == 1:
                 axis.set_xlabel(cost)

@@ -79,17 +79,18 @@ def decimate(tree: str | Path, *, vertices: int | None = None, size: int | None 
     def cost(parts: list[_Part]) -> int:
         return sum(len(part.points) for part in parts) if size is None else len(_glb(parts))
 
-    now, clustered = cost(parts), False
+    whole, now, clustered = parts, cost(parts), False
     for _ in range(_ROUNDS):
         if now <= limit:
             break
         share = limit / now if size is None else max(0.0, (limit - _bare(parts)) / max(1, now - _bare(parts)))
         fewer = [part for part in (collapse(part, max(1, int(len(part.faces) * share))) for part in parts) if len(part.faces)]
-        if not fewer or cost(fewer) > 0.98 * now:  # nothing is left, or nothing more can go
+        if not fewer or cost(fewer) >= now:  # nothing is left, or nothing more can go
             break
         now, parts = cost(fewer), fewer
     if now > limit:
-        parts, clustered = _clustered(parts, lambda parts: cost(parts) <= limit), True
+        # From the start again: what is left has lost its trunk for the sake of leaves that could not go.
+        parts, clustered = _clustered(whole, lambda parts: cost(parts) <= limit), True
     return DecimatedTree(_glb(parts), sum(len(part.points) for part in parts), sum(len(part.faces) for part in parts), clustered)
 
 
@@ -107,8 +108,11 @@ def _collapser() -> Callable[[_Part, int], _Part]:
         triangles = np.ascontiguousarray(part.faces, np.int32)
         _, _, collapses = fast_simplification.simplify(points, triangles, target_count=faces, return_collapses=True)
         moved, left, became = fast_simplification.replay_simplification(points, triangles, collapses)
-        source, kept = np.zeros(len(moved), np.int64), np.nonzero(became >= 0)[0][::-1]
-        source[became[kept]] = kept  # the first vertex that became each
+        kept = np.nonzero(became >= 0)[0]
+        away = np.linalg.norm(points[kept] - moved[became[kept]], axis=1)
+        source = np.zeros(len(moved), np.int64)
+        far_first = kept[np.argsort(-away, kind="stable")]
+        source[became[far_first]] = far_first  # the last one written is the nearest of those that became a vertex
         return _used(replace(part, points=moved.astype(np.float64), faces=left.astype(np.int64), uv=_taken(part.uv, source)))
 
     return collapse

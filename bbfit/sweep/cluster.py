@@ -7,6 +7,7 @@ its place by the machine that started the sweep. bbfit has to be installed on al
 from __future__ import annotations
 
 import re
+import socket
 import tempfile
 from dataclasses import replace
 from functools import partial
@@ -44,7 +45,8 @@ class RayWorkers:
         self._started = False
 
     def __enter__(self) -> RayWorkers:
-        ray, address = self._ray, self._config.ray
+        ray, address = self._ray, self._config.ray or "local"
+        _check_answer(address)
         if not ray.is_initialized():
             try:
                 if address == "local":
@@ -98,6 +100,17 @@ class RayWorkers:
         if paths not in self._put:
             self._put[paths] = self._ray.put(read_files(*paths))
         return self._put[paths]
+
+
+def _check_answer(address: str) -> None:
+    """Refuse an address where nobody listens; Ray itself would try for minutes."""
+    host, _, port = address.rpartition(":")
+    if not (host and port.isdecimal()):
+        return  # auto, local, or a name that Ray knows
+    try:
+        socket.create_connection((host.rpartition("/")[2], int(port)), timeout=10).close()
+    except OSError as error:
+        fail("ray", f"no cluster answers at {address} ({error.strerror or error})", "start one with ray start, or say local")
 
 
 def read_files(*paths: Path) -> Files:

@@ -1,0 +1,103 @@
+"""bbfit beside its rivals on one small tree: who is compared, what is written, and that nothing is done twice."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from bbfit.blender.config import ViewsConfig
+from bbfit.checks import InputError
+from bbfit.comparison import CompareResult, compare
+from bbfit.evaluation.scoring import evaluate
+from bbfit.exporting.lod import glb_counts
+from bbfit.fitting.config import FitConfig
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.pipeline import RunConfig
+from bbfit.rivals.config import SYSTEMS, CompareConfig
+from bbfit.views import ViewDataset
+
+TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
+STAGES = RunConfig(
+    views=ViewsConfig(count=8, size=64, samples=2, denoise=False), fit=FitConfig(steps=40, candidates=2, revisions=0, searches=1)
+)
+SMALL = CompareConfig(billboards=3, many=5, crossed=2, directions=2, slices=2, mesh_vertices=80, mesh_vertices_many=120, mesh_steps=6)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> CompareResult:
+    return compare(TREE, tmp_path_factory.mktemp("compare") / "out", SMALL, STAGES)
+
+
+def test_every_system_is_scored_on_the_same_views(done: CompareResult) -> None:
+    assert tuple(row.system for row in done.rows) == SYSTEMS
+    names = ViewDataset.load(done.folder / "views").test.names
+    for row in done.rows:
+        assert row.vertices and row.bytes and row.seconds is not None
+        if row.system == "draco":
+            assert row.measures is None
+            continue
+        assert row.measures is not None and 5 < row.measures.over_white.psnr < 40
+        assert sorted(path.stem for path in (done.folder / row.system / "held_out").iterdir()) == sorted(names)
+
+
+def test_costs_are_those_of_the_models(done: CompareResult) -> None:
+    rows = {row.system: row for row in done.rows}
+    for row in done.rows:
+        if row.system != "draco":
+            model = (done.folder / row.system / "model.glb").read_bytes()
+            assert row.bytes == len(model) and row.vertices == glb_counts(model)[0], row.system
+    assert rows["bbfit"].vertices == 12 and rows["thesis"].vertices == 32 and rows["crossed"].vertices == 8
+    assert rows["slicing"].planes is not None and rows["slicing"].planes <= 4 and rows["cloud-many"].planes == 5
+    assert rows["decimated-vertices"].vertices is not None and rows["decimated-vertices"].vertices <= 12
+    assert rows["decimated-bytes"].bytes is not None and rows["decimated-bytes"].bytes <= (rows["bbfit"].bytes or 0)
+    assert rows["learned"].vertices is not None and rows["learned"].vertices <= 80
+
+
+def test_bbfits_row_is_its_run(done: CompareResult) -> None:
+    cloud = BillboardCloud.load(done.folder / "bbfit" / "run" / "cloud.safetensors")
+    report = evaluate(cloud, ViewDataset.load(done.folder / "views").test)
+    assert done.rows[0].measures == report.mean and cloud.alpha.kind == "mask"
+    assert BillboardCloud.load(done.folder / "bbfit-blend" / "run" / "cloud.safetensors").alpha.kind == "blend"
+
+
+def test_tables_and_pictures(done: CompareResult) -> None:
+    with (done.folder / "compare.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [line["system"] for line in table] == list(SYSTEMS)
+    assert [float(line["psnr"]) for line in table if line["psnr"]] == [row.measures.over_white.psnr for row in done.rows if row.measures]
+    text = (done.folder / "compare.md").read_text()
+    assert all(f"| {row.title} |" in text for row in done.rows) and "| the tree |" in text
+    assert len(json.loads((done.folder / "compare.json").read_text())) == len(SYSTEMS)
+    for name in ("systems.png", "quality.png"):
+        with Image.open(done.folder / name) as picture:
+            assert min(picture.size) > 400 and len(set(picture.convert("L").tobytes())) > 50
+
+
+def test_nothing_is_done_twice_and_a_missing_package_leaves_one_out(done: CompareResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    times = {path: path.stat().st_mtime_ns for path in done.folder.glob("*/result.json")}
+    told = list[str]()
+    again = compare(TREE, done.folder, SMALL, STAGES, on_progress=lambda stage, now, total, note="": told.append(stage))
+    assert again.rows == done.rows and set(told) == {"views", "systems"}
+    assert times == {path: path.stat().st_mtime_ns for path in done.folder.glob("*/result.json")}
+    (done.folder / "draco" / "result.json").unlink()
+    monkeypatch.setitem(sys.modules, "DracoPy", None)
+    (row,) = compare(TREE, done.folder, CompareConfig(**{**vars(SMALL), "systems": ("draco",)}), STAGES).rows
+    assert row.vertices is None and "DracoPy is not installed" in row.note
+
+
+def test_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="systems: expected one of bbfit, bbfit-blend"):
+        CompareConfig(systems=("octree",))
+    with pytest.raises(InputError, match="slices: expected at least 1"):
+        CompareConfig(slices=0)
+    with pytest.raises(InputError, match="billboards: the comparison says how many"):
+        compare(TREE, tmp_path, SMALL, RunConfig(fit=FitConfig(billboards=3)))
+    other = tmp_path / "tree.ply"
+    other.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n")
+    with pytest.raises(InputError, match=r"tree\.ply has triangles that only Blender can read"):
+        compare(other, tmp_path / "out", SMALL, STAGES)
