@@ -42,7 +42,7 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["grow"], ["views"], ["fit"], ["evaluate"], ["export"], ["lod"]])
+@pytest.mark.parametrize("command", [[], ["run"], ["grow"], ["views"], ["fit"], ["evaluate"], ["export"], ["lod"], ["sweep"], ["compare"]])
 def test_help_shows_defaults_and_needs_no_torch(command: list[str]) -> None:
     script = (
         "import sys; from bbfit.cli import main\n"
@@ -286,6 +286,54 @@ def test_a_tree_that_cannot_be_grown_is_one_line(
     (tmp_path / "bad.json").write_text(json.dumps({"pear": figures | {"nCurveRes": [0, 1, 1, 1]}}))
     assert says in refused([part.format(tmp=tmp_path) for part in arguments], capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["bad.json"]
+
+
+def test_sweep_shows_its_runs_and_what_failed(views_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = tmp_path / "bad.ply"
+    bad.write_bytes(b"no tree")
+    grid = tmp_path / "grid.yaml"
+    grid.write_text("axes: {seed: [0, 1]}")
+    options = [
+        "--grid",
+        str(grid),
+        "--steps",
+        "3",
+        "--workers",
+        "1",
+        "--fit.billboards",
+        "2",
+        "--fit.candidates",
+        "1",
+        "--fit.revisions",
+        "0",
+    ]
+    command = ["sweep", "--out", str(tmp_path / "out"), "--views", str(views_folder), "--trees", str(bad), *options]
+    for stood in (0, 2):
+        assert main(command) == 0
+        out = capsys.readouterr().out
+        assert f"tables in {tmp_path / 'out'}" in out.replace("\n", "") and "2 runs failed" in out and "failed: tree:" in out
+        assert ("results stood" in out) == bool(stood)
+    assert len((tmp_path / "out" / "table.csv").read_text().splitlines()) == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ([], "no trees"),
+        (["--grid", "none", "--species", "acer"], "neither built in nor"),
+        (["--species", "cactus"], "species: expected one of"),
+        (["--species", "acer", "--gpus", "1"], "gpus: it is Ray"),
+        (["--species", "acer", "--ray", "127.0.0.1:1"], "no cluster answers at 127.0.0.1:1"),
+    ],
+)
+def test_bad_sweeps_are_one_line(options: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    start = ["sweep", "--out", str(tmp_path / "out"), *([] if options else ["--grid", "default"])]
+    assert complaint in refused([*start, *options], capsys)
+
+
+def test_bad_comparisons_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "does not exist" in refused(["compare", str(tmp_path / "none.glb"), "--out", str(tmp_path)], capsys)
+    assert "systems: expected one of" in refused(["compare", "tree.glb", "--systems", "octree"], capsys)
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

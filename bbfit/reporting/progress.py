@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+# Seconds between two lines of a stage in a log.
+_EVERY = 60.0
+
 
 @contextlib.contextmanager
 def progress_bars(console: Console) -> Iterator[Callable[..., None]]:
-    """A bar for each stage, with rate and time left; yields what the work has to tell (:class:`bbfit.pipeline.Progress`)."""
+    """A bar for each stage, with rate and time left; yields what the work has to tell (:class:`bbfit.pipeline.Progress`).
+
+    What is no terminal, as a log, gets a line when a stage is finished and every minute on the way.
+    """
+    if not console.is_terminal:
+        yield _lines(console)
+        return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     with Progress(
@@ -34,3 +44,15 @@ def progress_bars(console: Console) -> Iterator[Callable[..., None]]:
             bars.update(tasks[stage], completed=done, total=total, note=note, rate="" if speed is None else f"{speed:.1f}/s")
 
         yield tell
+
+
+def _lines(console: Console) -> Callable[..., None]:
+    told: dict[str, float] = {}
+
+    def tell(stage: str, done: int, total: int, note: str = "") -> None:
+        now = time.monotonic()
+        if done == total or now - told.setdefault(stage, now) >= _EVERY:
+            told[stage] = now
+            console.print(f"{stage} {done}/{total} {note}".rstrip(), highlight=False, soft_wrap=True)
+
+    return tell
