@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from bbfit.blender.conversion import tree_as_glb
+from bbfit.blender.meshes import MESH_SUFFIXES
 from bbfit.blender.pictures import render_pictures
 from bbfit.blender.sources import check_tree, fingerprint
 from bbfit.blender.views_folder import render_views
@@ -25,7 +26,6 @@ from bbfit.exporting.model import as_shipped, shipped_cards
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_a_metre
-from bbfit.fitting.points import MESH_SUFFIXES
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, read_rgba, to_bytes, unpremultiply, write_png
 from bbfit.pipeline import Progress, RunConfig, original_tree, run

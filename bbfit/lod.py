@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from bbfit.blender.conversion import tree_as_glb
+from bbfit.blender.meshes import MESH_SUFFIXES
 from bbfit.blender.sources import check_tree, fingerprint
 from bbfit.blender.views_folder import render_views
 from bbfit.checks import check_folder, fail
@@ -19,7 +20,6 @@ from bbfit.exporting.lod import LodLevel, glb_counts, lod_glb, stands_alone
 from bbfit.exporting.model import shipped_cards
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_a_metre
-from bbfit.fitting.points import MESH_SUFFIXES
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.pipeline import Progress, RunConfig, RunResult, export_config, run
 from bbfit.reporting.plots import lod_picture

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Protocol
 
 from bbfit.blender.config import ViewsConfig
+from bbfit.blender.meshes import MESH_SUFFIXES
 from bbfit.budget.choice import Choice, Trial, choose, within_bytes
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, check_file, fail
@@ -28,7 +29,6 @@ from bbfit.exporting.model import as_shipped, shipped_cards, shows_from, write_m
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
-from bbfit.fitting.points import MESH_SUFFIXES
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.records import Record, hash_file, hash_inputs, plain
 from bbfit.rendering.dispatch import render

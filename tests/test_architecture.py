@@ -264,8 +264,11 @@ def test_every_dataclass_field_is_documented_below_it() -> None:
 
 
 def test_public_functions_take_at_most_seven_arguments() -> None:
+    """Save commands, whose arguments are the command line's options."""
     wide = []
     for path, tree in TREES.items():
+        if path == PACKAGE / "cli" / "commands.py" or path == PACKAGE / "cli" / "studies.py":
+            continue
         for name, node in public(tree.body):
             if not isinstance(node, ast.ClassDef):
                 arguments = {a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)} - {"self", "cls"}

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from bbfit.blender.sources import UP_AXIS, check_tree
+from bbfit.blender.meshes import tree_mesh
+from bbfit.blender.sources import UP_AXIS
 from bbfit.checks import fail
 from bbfit.fitting.initialize import pixels_a_metre
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, convergence_point
@@ -17,8 +18,6 @@ from bbfit.views import ViewSet
 
 COUNT = 20_000
 """Points that are drawn unless said otherwise."""
-MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
-"""Endings of tree files whose triangles can be read without Blender."""
 # Points of a mesh that must lie on the tree in a training view, on average, for the two to belong together.
 _AGREEMENT = 0.95
 # Random points that the hull is carved from at a time, and how often at most.
@@ -32,7 +31,7 @@ def mesh_points(path: str | Path, views: ViewSet, *, count: int = COUNT, seed: i
 
     Parameters
     ----------
-    path : a file with one of :data:`MESH_SUFFIXES`.
+    path : a file with one of :data:`~bbfit.blender.meshes.MESH_SUFFIXES`.
     views : views of the same tree, which the mesh is checked against.
 
     Raises
@@ -42,15 +41,8 @@ def mesh_points(path: str | Path, views: ViewSet, *, count: int = COUNT, seed: i
     """
     import trimesh
 
-    path = check_tree(path)[0]
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        fail("tree", f"{path} has triangles that only Blender can read", f"give one of {' '.join(MESH_SUFFIXES)}, or no tree")
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:
-        fail("tree", f"{path} cannot be read ({error})", "expected a mesh")
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not mesh.area > 0:
-        fail("tree", f"{path} has no triangles", "expected a mesh")
+    path = Path(path)
+    mesh = tree_mesh(path)
     sampled, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
     points = torch.tensor(sampled, dtype=torch.float64)
     if UP_AXIS[path.suffix.lower()] == "z":

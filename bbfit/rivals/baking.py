@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.conversion import tree_as_glb
+from bbfit.blender.meshes import tree_mesh
 from bbfit.blender.pictures import FILTER_REACH, render_pictures
 from bbfit.blender.sources import check_tree
 from bbfit.checks import check_range, check_shape, fail
@@ -151,19 +152,11 @@ def tree_triangles(tree: str | Path) -> NDArray[np.float64]:
     BlenderError
         if Blender crashes over it.
     """
-    import trimesh
-
     path = check_tree(tree)[0]
     if path.suffix.lower() not in _MESH_SUFFIXES:
         with tempfile.TemporaryDirectory(prefix="bbfit-") as scratch:
             return tree_triangles(tree_as_glb(path, Path(scratch) / "tree.glb"))
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:
-        fail("tree", f"{path} cannot be read ({error})", "expected a mesh")
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not mesh.area > 0:
-        fail("tree", f"{path} has no triangles", "expected a mesh")
-    return np.asarray(mesh.triangles, np.float64)
+    return np.asarray(tree_mesh(path).triangles, np.float64)
 
 
 def _whole_texels(lengths: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bbfit.blender.sources import check_tree
+from bbfit.blender.meshes import tree_scene
 from bbfit.checks import check_count, fail
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def decimate(tree: str | Path, *, vertices: int | None = None, size: int | None 
     assert limit is not None
     check_count("vertices" if size is None else "size", limit, 4)
     collapse = _collapser()
-    parts = _parts(check_tree(tree)[0])
+    parts = _parts(tree)
 
     def cost(parts: list[_Part]) -> int:
         return sum(len(part.points) for part in parts) if size is None else len(_glb(parts))
@@ -118,25 +118,18 @@ def _collapser() -> Callable[[_Part, int], _Part]:
     return collapse
 
 
-def _parts(path: Path) -> list[_Part]:
+def _parts(path: str | Path) -> list[_Part]:
     """The file's triangles by material, placed and welded."""
     import trimesh
 
-    try:
-        scene = trimesh.load_scene(path, process=False)
-    except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:
-        fail("tree", f"{path} cannot be read ({error})", "expected a mesh")
     parts = []
-    for mesh in scene.dump():
-        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-            continue
+    for mesh in tree_scene(path).dump():
+        assert isinstance(mesh, trimesh.Trimesh)
         mesh.merge_vertices(merge_norm=True)
         uv = getattr(mesh.visual, "uv", None)
         material = getattr(mesh.visual, "material", None)
         part = _Part(np.asarray(mesh.vertices), np.asarray(mesh.faces), None if uv is None else np.asarray(uv), material)
         parts.append(_used(part))
-    if not parts:
-        fail("tree", f"{path} has no triangles", "expected a mesh")
     return parts
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bbfit.blender.sources import check_tree
+from bbfit.blender.meshes import tree_scene
 from bbfit.checks import check_range, fail
 
 # What the frame of a glTF file takes: its JSON for a mesh with its material, and for the scene.
@@ -44,18 +44,9 @@ def draco_size(tree: str | Path, *, position_bits: int = 14) -> DracoSize:
         import DracoPy
     except ImportError:
         fail("draco", "the package DracoPy is not installed", 'pip install "bbfit[rivals]"')
-    import trimesh
-
-    path = check_tree(tree)[0]
-    try:
-        scene = trimesh.load_scene(path, process=False)
-    except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:
-        fail("tree", f"{path} cannot be read ({error})", "expected a mesh")
     total, vertices = _FRAME, 0
     textures: dict[int, int] = {}
-    for mesh in scene.geometry.values():
-        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-            continue
+    for mesh in tree_scene(tree).geometry.values():
         uv = getattr(mesh.visual, "uv", None)
         normals = mesh.vertex_normals if "vertex_normals" in mesh._cache else None
         data = DracoPy.encode(
@@ -75,6 +66,4 @@ def draco_size(tree: str | Path, *, position_bits: int = 14) -> DracoSize:
             packed = io.BytesIO()
             picture.save(packed, "PNG")
             textures[id(picture)] = len(packed.getvalue())
-    if vertices == 0:
-        fail("tree", f"{path} has no triangles", "expected a mesh")
     return DracoSize(total + sum(textures.values()), vertices)

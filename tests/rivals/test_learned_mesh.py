@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
 import subprocess
 import sys
@@ -22,7 +24,7 @@ from bbfit.images import to_bytes, unpremultiply, write_png
 from bbfit.layout import write_transforms
 from bbfit.rendering.dispatch import render
 from bbfit.rivals import mesh_rays, mesh_silhouettes
-from bbfit.rivals.learned_mesh import LearnedMesh, learn_mesh, refine_mesh
+from bbfit.rivals.learned_mesh import LearnedMesh, learn_mesh, mesh_glb, refine_mesh
 from bbfit.rivals.mesh_charts import unfold
 from bbfit.rivals.mesh_hull import hull_surface
 from bbfit.rivals.mesh_rays import RayCaster, pixel_rays
@@ -262,3 +264,22 @@ def test_nonsense_is_refused(argument: str, views_folder: Path) -> None:
     views = ViewDataset.load(views_folder).train
     with pytest.raises(InputError, match=argument):
         learn_mesh(views, **{argument: -1})
+
+
+def test_the_file_holds_the_mesh_unlit_blended_and_seen_from_both_sides() -> None:
+    """Texture coordinates count from the top-left corner, as glTF's do; what is clear has a colour to be filtered with."""
+    mesh = quad(painted_billboard())
+    glb = mesh_glb(mesh)
+    tree = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
+    (material,) = tree["materials"]
+    assert material["alphaMode"] == "BLEND" and material["doubleSided"] and material["extensions"] == {"KHR_materials_unlit": {}}
+    assert tree["extensionsUsed"] == ["KHR_materials_unlit"] and "NORMAL" not in tree["meshes"][0]["primitives"][0]["attributes"]
+    (made,) = trimesh.load_scene(io.BytesIO(glb), file_type="glb", process=False).geometry.values()
+    np.testing.assert_array_equal(made.faces, mesh.faces.numpy())
+    np.testing.assert_allclose(made.vertices, mesh.vertices.numpy(), atol=1e-6)
+    np.testing.assert_allclose(made.visual.uv * [1, -1] + [0, 1], mesh.uvs.numpy(), atol=1e-6)
+    picture = np.asarray(made.visual.material.baseColorTexture)
+    np.testing.assert_array_equal(picture[..., 3], mesh.texture[..., 3].numpy())
+    shown = mesh.texture[..., 3].numpy() > 0
+    np.testing.assert_array_equal(picture[shown], mesh.texture.numpy()[shown])
+    assert picture[~shown][:, :3].any(1).all()
