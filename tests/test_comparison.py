@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from khronos import WARNING, messages
 from PIL import Image
 
 from bbfit.blender.config import ViewsConfig
@@ -101,3 +102,9 @@ def test_bad_input(tmp_path: Path) -> None:
     other.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n")
     with pytest.raises(InputError, match=r"tree\.ply has triangles that only Blender can read"):
         compare(other, tmp_path / "out", SMALL, STAGES)
+
+
+def test_the_khronos_validator_finds_nothing_wrong_with_the_models(done: CompareResult) -> None:
+    """Decimated meshes keep no normals and may keep texture coordinates without a texture, which is information."""
+    models = [done.folder / system / "model.glb" for system in SYSTEMS if system != "draco"]
+    assert not [(message["code"], message["pointer"]) for message in messages(*models) if message["severity"] <= WARNING]

@@ -133,14 +133,7 @@ class BlenderPool:
 
     def load(self) -> dict[str, Any]:
         """Start a first process and return what it says of the tree: ``vertices``, ``faces``, ``blender``, ``payload``."""
-        self._start(measure=True)
-        worker, event = self._next()
-        if event["event"] == "exit":
-            raise BlenderError(
-                f"Blender: crashed while reading {self._job['tree']} ({worker.last_words()}); "
-                "open the file in Blender itself to see whether it is damaged"
-            )
-        return event
+        return self._first("reading", measure=True)
 
     def convert(self, triangles: int | None) -> Path:
         """Write the tree as a GLB file with at most about so many triangles; the file goes when the pool does.
@@ -154,14 +147,19 @@ class BlenderPool:
         """
         path = Path(self._scratch.name) / "tree.glb"
         self._job = self._job | {"convert": {"path": str(path), "triangles": triangles}}
-        self._start(measure=False)
+        self._first("converting", measure=False)
+        return path
+
+    def _first(self, doing: str, *, measure: bool) -> dict[str, Any]:
+        """Start a process and return its first answer."""
+        self._start(measure=measure)
         worker, event = self._next()
         if event["event"] == "exit":
             raise BlenderError(
-                f"Blender: crashed while converting {self._job['tree']} ({worker.last_words()}); "
+                f"Blender: crashed while {doing} {self._job['tree']} ({worker.last_words()}); "
                 "open the file in Blender itself to see whether it is damaged"
             )
-        return path
+        return event
 
     def render(self, frames: list[dict[str, Any]], workers: int, kept: int, on_done: Callable[[int], None]) -> None:
         """Render frames on the loaded process and ``workers - 1`` more.
