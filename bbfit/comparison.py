@@ -139,8 +139,9 @@ class _Comparison:
         self._systems: dict[str, tuple[str, Callable[[Path], _Made]]] = {
             "bbfit": (f"bbfit, {count} billboards, mask", self._bbfit),
             "bbfit-blend": (f"bbfit, {count} billboards, blend", partial(self._fitted, FitConfig(alpha="blend", billboards=count))),
+            "bbfit-many": (f"bbfit, {many} billboards, blend", partial(self._fitted, FitConfig(alpha="blend", billboards=many))),
             "thesis": (
-                "the thesis's method, 4 two-sided billboards, L2",
+                "the thesis, 4 double billboards, L2",
                 partial(self._fitted, FitConfig(preset="thesis", billboards=4, sides="pair")),
             ),
             "crossed": (f"{crossed} crossed planes, baked", partial(self._baked, partial(crossed_planes, count=crossed))),

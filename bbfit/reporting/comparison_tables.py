@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from bbfit.evaluation.report import Measures, OverWhite, Rgba, ThesisScale
 from bbfit.evaluation.scoring import OriginalTree, view_angles
@@ -134,7 +135,7 @@ def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
 
 
 def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) -> None:
-    """Write ``systems.png``: one held-out view over white, and how each system that was drawn shows it.
+    """Write ``systems.png``: the tree in one held-out view over white, and how each system that was drawn shows it.
 
     Parameters
     ----------
@@ -151,6 +152,7 @@ def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) ->
         white = row.measures.over_white
         caption = f"{white.psnr:.2f} dB  ·  FLIP {white.flip:.3f}  ·  {row.vertices:,} vertices  ·  {row.bytes / 1e6:.2g} MB"
         pictures.append((row.title, caption, premultiply(straight)))
+    part = _around(views.targets([index])[0][..., 3])
     gap, line = 14, 3 * _TEXT + 8
     rows_of_tiles = -(-len(pictures) // _COLUMNS)
     columns = min(_COLUMNS, len(pictures))
@@ -159,9 +161,19 @@ def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) ->
     font, bold = picture_font("DejaVuSans.ttf", _TEXT - 2), picture_font("DejaVuSans-Bold.ttf", _TEXT)
     for number, (title, caption, picture) in enumerate(pictures):
         left, top = gap + number % _COLUMNS * (_TILE + gap), gap + number // _COLUMNS * (_TILE + line + gap)
-        image = Image.fromarray(to_bytes(over_colour(picture)))
+        image = Image.fromarray(to_bytes(over_colour(picture))).crop(part)
         scale = _TILE / max(image.size)
         sheet.paste(image.resize((round(image.width * scale), round(image.height * scale)), Image.Resampling.LANCZOS), (left, top))
         draw.text((left, top + _TILE + 4), title, INK, bold)
         draw.text((left, top + _TILE + 8 + _TEXT), caption, FAINT, font)
     write_bytes(folder / "systems.png", encode_png(np.asarray(sheet)))
+
+
+def _around(alpha: Tensor) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of a square about what shows, [H, W], with a tenth of it to spare, within the picture if that is wide."""
+    rows, columns = (torch.nonzero(alpha.amax(axis) > 0)[:, 0] for axis in (1, 0))
+    middle = [(int(line[0]) + int(line[-1]) + 1) / 2 for line in (columns, rows)]
+    half = 0.6 * max(int(line[-1]) - int(line[0]) + 1 for line in (columns, rows))
+    half = min(half, min(alpha.shape) / 2)
+    left, top = (round(min(max(at - half, 0), side - 2 * half)) for at, side in zip(middle, alpha.shape[::-1], strict=True))
+    return left, top, left + round(2 * half), top + round(2 * half)

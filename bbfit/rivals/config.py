@@ -9,6 +9,7 @@ from bbfit.checks import check_choice, check_count
 SYSTEMS = (
     "bbfit",
     "bbfit-blend",
+    "bbfit-many",
     "thesis",
     "crossed",
     "slicing",
@@ -31,9 +32,9 @@ class CompareConfig:
     systems: tuple[str, ...] = ()
     """Which systems, by name; all if left out. Those that need a package which is not installed are said to be left out."""
     billboards: int = 8
-    """Planes of bbfit and of the smaller billboard cloud."""
+    """Planes of bbfit's smaller fits and of the smaller billboard cloud."""
     many: int = 32
-    """Planes of the larger billboard cloud."""
+    """Planes of a larger fit and of the larger billboard cloud."""
     crossed: int = 4
     """Crossed planes."""
     directions: int = 6
