@@ -13,24 +13,39 @@ import sweep_works
 from billboard_scene import crossing_billboards, write_views
 from ray.cluster_utils import Cluster
 
+from bbfit.blender.config import ViewsConfig
 from bbfit.checks import InputError
+from bbfit.fitting.config import FitConfig
+from bbfit.pipeline import RunConfig
 from bbfit.sweep.cluster import RayWorkers, place_files, read_files
 from bbfit.sweep.config import SweepConfig
-from bbfit.sweep.scheduling import run_sweep
+from bbfit.sweep.scheduling import SweepResult, run_sweep
 from bbfit.sweep.tasks import Task
+from bbfit.trees.config import GrowConfig
 
+TREE = Path(__file__).resolve().parents[2] / "data" / "tree.glb"
 # Ray leaves sockets to the garbage collector, and warns of its own coming changes.
 pytestmark = [pytest.mark.filterwarnings("ignore::ResourceWarning"), pytest.mark.filterwarnings("ignore::FutureWarning")]
 
 
+@pytest.fixture(scope="module")
+def head() -> Iterator[Cluster]:
+    """A node with one core."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent))  # so that nodes can import the work of these tests
+        made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+        yield made
+        ray.shutdown()
+        made.shutdown()
+
+
 @pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
-    """A head with one core; the tests add the node that they kill."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # so that nodes can import the work of these tests
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-    yield made
+def cluster(head: Cluster) -> Iterator[Cluster]:
+    """The head alone; the tests add the node that they kill."""
+    yield head
     ray.shutdown()
-    made.shutdown()
+    for node in list(head.worker_nodes):
+        head.remove_node(node)
 
 
 def test_a_node_that_is_killed_costs_only_what_it_was_running(cluster: Cluster, tmp_path: Path) -> None:
@@ -90,6 +105,26 @@ def test_a_sweep_on_a_cluster_is_the_sweep_on_one_machine(cluster: Cluster, tmp_
         made = tmp_path / "ray" / one.folder
         assert (made / "model.glb").read_bytes() == (tmp_path / "here" / other.folder / "model.glb").read_bytes()
         assert {path.name for path in made.iterdir()} == {path.name for path in (tmp_path / "here" / other.folder).iterdir()}
+
+
+def test_trees_are_rendered_on_the_cluster_and_their_views_come_back(cluster: Cluster, tmp_path: Path) -> None:
+    """A file and a species; started again, neither is rendered again."""
+    assert cluster.address
+    views = ViewsConfig(count=4, size=48, samples=1, denoise=False)
+    grown = GrowConfig(detail=0.1, leaves=0.02)
+    stages = RunConfig(grow=grown, views=views, fit=FitConfig(billboards=2, candidates=1, revisions=0))
+    config = SweepConfig(grid="default", steps=4, ray=cluster.address)
+
+    def sweep() -> SweepResult:
+        return run_sweep(tmp_path, config, stages, species=["acer"], trees=[TREE])
+
+    first = sweep()
+    assert [(row.tree, row.reason) for row in first.rows] == [("acer", None), ("tree", None)]
+    pictures = {path: path.stat().st_mtime_ns for path in (tmp_path / "trees").rglob("images/*.png")}
+    assert len(pictures) == 8 and (tmp_path / "trees" / "acer" / "tree.glb").is_file()
+    assert all((tmp_path / row.folder / "model.glb").is_file() for row in first.rows)
+    again = sweep()
+    assert again.kept == 2 and pictures == {path: path.stat().st_mtime_ns for path in (tmp_path / "trees").rglob("images/*.png")}
 
 
 def test_failures_on_a_cluster_are_recorded(cluster: Cluster, tmp_path: Path) -> None:
