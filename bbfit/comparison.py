@@ -16,6 +16,7 @@ from bbfit.blender.meshes import MESH_SUFFIXES
 from bbfit.blender.pictures import render_pictures
 from bbfit.blender.sources import check_tree, fingerprint
 from bbfit.blender.views_folder import render_views
+from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, fail
 from bbfit.evaluation.report import Measures, mean_measures
 from bbfit.evaluation.scoring import held_out, score_views
@@ -140,6 +141,7 @@ class _Comparison:
             "bbfit": (f"bbfit, {count} billboards, mask", self._bbfit),
             "bbfit-blend": (f"bbfit, {count} billboards, blend", partial(self._fitted, FitConfig(alpha="blend", billboards=count))),
             "bbfit-many": (f"bbfit, {many} billboards, blend", partial(self._fitted, FitConfig(alpha="blend", billboards=many))),
+            "bbfit-bytes": ("bbfit, blend, a budget of as many bytes as with mask", self._budgeted),
             "thesis": (
                 "the thesis, 4 double billboards, L2",
                 partial(self._fitted, FitConfig(preset="thesis", billboards=4, sides="pair")),
@@ -198,15 +200,22 @@ class _Comparison:
         asked = {entry.name: getattr(self._stages.fit, entry.name) for entry in fields(FitConfig)}
         default, own = asdict(FitConfig()), {name: value for name, value in asdict(fit).items() if value != asdict(FitConfig())[name]}
         fit = replace(fit, **{name: value for name, value in asked.items() if value != default[name] and name not in own})
+        return self._run(RunConfig(fit=fit, export=self._stages.export), folder)
+
+    def _budgeted(self, folder: Path) -> _Made:
+        """As many billboards as a budget of bytes pays for, by trials on validation views."""
+        fit = replace(self._stages.fit, alpha="blend")
+        return self._run(RunConfig(fit=fit, budget=BudgetConfig(bytes=self._bytes()), export=self._stages.export), folder)
+
+    def _run(self, stages: RunConfig, folder: Path) -> _Made:
         mesh = self._files[0] if self._files[0].suffix.lower() in MESH_SUFFIXES else None
-        stages = RunConfig(tree=mesh, fit=fit, export=self._stages.export)
 
         def told(stage: str, done: int, total: int, note: str = "") -> None:
             self._tell(f"{folder.name} {stage}", done, total, note)
 
-        result = run(self._folder / "views", folder / "run", stages, on_progress=told)
+        result = run(self._folder / "views", folder / "run", replace(stages, tree=mesh), on_progress=told)
         shipped = as_shipped(result.cloud, self._stages.export)
-        seconds = sum(result.report.seconds.get(stage, 0.0) for stage in ("fit", "export"))
+        seconds = sum(result.report.seconds.get(stage, 0.0) for stage in ("budget", "fit", "export"))
         model = (folder / "run" / "model.glb").read_bytes()
         return _Made(model, result.report.vertices.model or 0, seconds, lambda index: self._drawn(shipped, index), len(result.cloud))
 

@@ -10,6 +10,7 @@ SYSTEMS = (
     "bbfit",
     "bbfit-blend",
     "bbfit-many",
+    "bbfit-bytes",
     "thesis",
     "crossed",
     "slicing",
