@@ -89,7 +89,7 @@ def run_sweep(
         fail("budget", "a sweep tries what its grid says", "leave the budget out")
     grid = Grid.load(config.grid).narrowed(config)
     cells = grid.cells(stages.fit if config.steps is None else replace(stages.fit, steps=config.steps))
-    found = sources(species if species or trees or views else grid.trees, trees, views)
+    found = sources(species if species or trees or views else grid.trees, trees, views, stages.grow.species_file)
     sweep = _Sweep(output_folder("out", out), found, cells, config, stages)
     workers: Workers = LocalWorkers(config.workers, config.retries) if config.ray is None else RayWorkers(config)
     with workers:
@@ -97,15 +97,17 @@ def run_sweep(
     return sweep.result()
 
 
-def sources(species: Sequence[str], trees: Sequence[str | Path], views: Sequence[str | Path]) -> list[Source]:
-    """The trees of a sweep, each with a name of its own: the species, or that of the file or folder.
+def sources(
+    species: Sequence[str], trees: Sequence[str | Path], views: Sequence[str | Path], species_file: Path | None = None
+) -> list[Source]:
+    """The trees of a sweep, each with a name of its own: the species, of one's own file if there is one, or that of the file or folder.
 
     Raises
     ------
     MissingFileError, InputError
         if there are none, one does not exist, or two have the same name.
     """
-    found = [Source(load_species(name).name, species=name) for name in species]
+    found = [Source(load_species(name, species_file).name, species=name) for name in species]
     given = [(path, Source(path.stem, tree=check_file("tree", path))) for path in map(Path, trees)]
     for folder in views:
         path = check_folder("views", folder).resolve()
@@ -179,15 +181,18 @@ class _Sweep:
         except InputError as error:
             self._prepared(source, Outcome(None, str(error), ""), workers)
             return
-        made_of = fingerprint(list(files)) if grown is None else [asdict(grown), asdict(self._stages.grow)]
-        views = {**asdict(self._stages.views), "workers": None, "device": None}
+        growth, light = self._stages.grow, self._stages.views
+        made_of = fingerprint(list(files)) if grown is None else [asdict(grown), {**asdict(growth), "species_file": None}]
+        panorama = None if light.hdri is None else fingerprint([check_file("hdri", light.hdri)])
+        views = {**asdict(light), "workers": None, "device": None, "hdri": panorama}
         key = hash_inputs("grow", made_of, views)[:_DIGITS]
         earlier = self._results.get(key)
         if earlier and self._stands(earlier) and (earlier.reason or (self._folder_of(source) / "views" / TEST_FILE).is_file()):
             self._prepared(source, earlier, workers)
             return
         self._jobs[name] = _Job(key, plain({"tree": source.species or str(source.tree), "views": views}))
-        inputs = {"tree": files} if files else {}
+        named = {"tree": files, "species_file": grown and growth.species_file, "hdri": light.hdri}
+        inputs = {what: paths if isinstance(paths, tuple) else (paths,) for what, paths in named.items() if paths}
         workers.submit(Task(name, prepare_tree, inputs, self._folder_of(source), (self._stages, source.species), alone=True))
 
     def _prepared(self, source: Source, outcome: Outcome, workers: Workers) -> None:

@@ -80,6 +80,8 @@ class Workers(Protocol):
 def prepare_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig, species: str | None) -> Facts:
     """Grow a tree, or take the file ``tree``, and render its views into ``folder``.
 
+    ``species_file`` and ``hdri`` are inputs too if the stages name any.
+
     Raises
     ------
     InputError, OSError
@@ -87,7 +89,8 @@ def prepare_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig, sp
     """
     from bbfit.pipeline import prepare
 
-    stages = replace(stages, species=species, grow=RunConfig().grow if species is None else stages.grow)
+    grow = RunConfig().grow if species is None else replace(stages.grow, species_file=inputs.get("species_file"))
+    stages = replace(stages, species=species, grow=grow, views=replace(stages.views, hdri=inputs.get("hdri")))
     tree, views = prepare(inputs.get("tree"), folder, stages)
     return {"mesh": None if tree is None else tree.name, "views": len(views.train) + len(views.test)}
 

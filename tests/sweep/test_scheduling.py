@@ -21,6 +21,8 @@ from bbfit.pipeline import RunConfig, run
 from bbfit.reporting.sweep_tables import SweepRow
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.scheduling import SweepResult, run_sweep, sources
+from bbfit.trees.config import GrowConfig
+from bbfit.trees.species import figures_file
 
 TREE = Path(__file__).resolve().parents[2] / "data" / "tree.glb"
 QUICK = SweepConfig(steps=12, workers=2, loss=("l1", "l2"), billboards=(2, 3), variants=("base", "double"))
@@ -195,6 +197,19 @@ def test_trees_are_grown_and_rendered_once(tmp_path: Path) -> None:
     assert sweep().kept == 2
     now = {path: path.stat().st_mtime_ns for path in (tmp_path / "out" / "trees").rglob("*.png")}
     assert now.keys() == pictures.keys() and sum(now[path] != pictures[path] for path in now) == 1
+
+
+def test_species_of_ones_own_file_are_grown(tmp_path: Path) -> None:
+    """An acer by another name; its file may lie elsewhere at the next start."""
+    figures = json.loads(figures_file().read_text())["acer"]
+    views = ViewsConfig(count=4, size=48, samples=1, denoise=False)
+    for folder, kept in (("here", 0), ("there", 1)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "own.json").write_text(json.dumps({"sapling": figures}))
+        grown = GrowConfig(detail=0.1, leaves=0.02, species_file=tmp_path / folder / "own.json")
+        stages = RunConfig(grow=grown, views=views, fit=FitConfig(billboards=2, candidates=1, revisions=0))
+        result = run_sweep(tmp_path / "out", SweepConfig(grid="default", workers=1, steps=4), stages, species=["sapling"])
+        assert [(row.tree, row.reason) for row in result.rows] == [("sapling", None)] and result.kept == kept
 
 
 def test_trees_have_names_of_their_own(tmp_path: Path) -> None:
