@@ -141,7 +141,7 @@ class _Comparison:
             "bbfit": (f"bbfit, {count} billboards, mask", self._bbfit),
             "bbfit-blend": (f"bbfit, {count} billboards, blend", partial(self._fitted, FitConfig(alpha="blend", billboards=count))),
             "bbfit-many": (f"bbfit, {many} billboards, blend", partial(self._fitted, FitConfig(alpha="blend", billboards=many))),
-            "bbfit-bytes": ("bbfit, blend, a budget of as many bytes as with mask", self._budgeted),
+            "bbfit-bytes": ("bbfit, blend, in bbfit's bytes", self._budgeted),
             "thesis": (
                 "the thesis, 4 double billboards, L2",
                 partial(self._fitted, FitConfig(preset="thesis", billboards=4, sides="pair")),
@@ -167,7 +167,7 @@ class _Comparison:
         inputs = hash_inputs("fit", _VERSION, system, self._hash, plain(settings), plain(fit), plain(export), STAGE_VERSIONS["evaluate"])
         record = folder / "result.json"
         if record.is_file() and isinstance(earlier := read_json("result", record), dict) and earlier.get("inputs") == inputs:
-            return CompareRow.from_json(earlier["row"])
+            return replace(CompareRow.from_json(earlier["row"]), title=title)
         try:
             made = make(folder)
         except InputError as error:
