@@ -11,8 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from bbfit.blender.conversion import tree_as_glb
-from bbfit.blender.meshes import MESH_SUFFIXES
+from bbfit.blender.conversion import converted_once, tree_as_glb
 from bbfit.blender.pictures import render_pictures
 from bbfit.blender.sources import check_tree, fingerprint
 from bbfit.blender.views_folder import render_views
@@ -44,6 +43,8 @@ from bbfit.views import ViewDataset
 
 _VERSION = 1
 """Raised when a rival's results change for the same inputs."""
+# Files that all rivals read as they are: Y up, with materials.
+_READABLE = (".glb", ".gltf", ".obj")
 # Blender thins a tree to about as many triangles as it is told; a few tries find how many fit into so many bytes.
 _TRIES = 5
 
@@ -91,7 +92,7 @@ def compare(
 
     Parameters
     ----------
-    tree : .glb, .gltf or .obj, whose triangles rivals have to read.
+    tree : a tree's file of any kind; rivals that read triangles take a conversion by Blender of those that are not .glb, .gltf or .obj.
     out : folder for the results.
     config : which systems, and how large.
     stages : how views are rendered, and what bbfit's fits and exports have in common.
@@ -104,14 +105,15 @@ def compare(
     """
     config, stages = config or CompareConfig(), stages or RunConfig()
     files = check_tree(tree)
-    if files[0].suffix.lower() not in (".glb", ".gltf", ".obj"):
-        fail("tree", f"{files[0]} has triangles that only Blender can read", "convert it, as with bbfit lod, to .glb")
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "the comparison says how many", "leave out billboards and budgets of the fit")
     tell = on_progress or (lambda stage, done, total, note="": None)
     folder = output_folder("out", out)
     views = ViewDataset.load(render_views(tree, folder / "views", stages.views, on_progress=lambda done, total: tell("views", done, total)))
     chosen = [system for system in SYSTEMS if system in config.systems or not config.systems]
+    if files[0].suffix.lower() not in _READABLE:
+        converted_once(tree, folder / "tree.glb", on_begin=lambda: tell("tree", 0, 1))
+        files = [folder / "tree.glb"]
     comparison = _Comparison(files, views, folder, config, stages, tell)
     rows = []
     tell("systems", 0, len(chosen))
@@ -208,12 +210,10 @@ class _Comparison:
         return self._run(RunConfig(fit=fit, budget=BudgetConfig(bytes=self._bytes()), export=self._stages.export), folder)
 
     def _run(self, stages: RunConfig, folder: Path) -> _Made:
-        mesh = self._files[0] if self._files[0].suffix.lower() in MESH_SUFFIXES else None
-
         def told(stage: str, done: int, total: int, note: str = "") -> None:
             self._tell(f"{folder.name} {stage}", done, total, note)
 
-        result = run(self._folder / "views", folder / "run", replace(stages, tree=mesh), on_progress=told)
+        result = run(self._folder / "views", folder / "run", replace(stages, tree=self._files[0]), on_progress=told)
         shipped = as_shipped(result.cloud, self._stages.export)
         seconds = sum(result.report.seconds.get(stage, 0.0) for stage in ("budget", "fit", "export"))
         model = (folder / "run" / "model.glb").read_bytes()

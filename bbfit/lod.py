@@ -6,9 +6,9 @@ import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from bbfit.blender.conversion import tree_as_glb
+from bbfit.blender.conversion import converted_once
 from bbfit.blender.meshes import MESH_SUFFIXES
-from bbfit.blender.sources import check_tree, fingerprint
+from bbfit.blender.sources import check_tree
 from bbfit.blender.views_folder import render_views
 from bbfit.checks import check_folder, fail
 from bbfit.evaluation.metrics import silhouette_distance
@@ -18,7 +18,7 @@ from bbfit.exporting.config import LodConfig
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.lod import LodLevel, glb_counts, lod_glb, stands_alone
 from bbfit.exporting.model import shipped_cards
-from bbfit.files import output_folder, read_json, write_bytes, write_json
+from bbfit.files import output_folder, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_a_metre
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.pipeline import Progress, RunConfig, RunResult, export_config, run
@@ -135,12 +135,14 @@ def _original(files: list[Path], folder: Path, config: LodConfig, tell: Progress
     """The tree as a GLB that others can be joined to."""
     if config.triangles is None and stands_alone(files[0]):
         return files[0]
-    path, record = folder / "original.glb", folder / "original.json"
-    inputs = {"tree": fingerprint(files), "triangles": config.triangles}
-    if not (path.is_file() and record.is_file() and read_json("original", record) == inputs):
+    begun = list[bool]()
+
+    def on_begin() -> None:
+        begun.append(True)
         tell("original", 0, 1)
-        tree_as_glb(files[0], path, triangles=config.triangles)
-        write_json(record, inputs)
+
+    path = converted_once(files[0], folder / "original.glb", triangles=config.triangles, on_begin=on_begin)
+    if begun:
         tell("original", 1, 1)
     return path
 

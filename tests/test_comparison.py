@@ -5,9 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 from khronos import WARNING, messages
 from PIL import Image
 
@@ -97,10 +100,19 @@ def test_bad_input(tmp_path: Path) -> None:
         CompareConfig(slices=0)
     with pytest.raises(InputError, match="billboards: the comparison says how many"):
         compare(TREE, tmp_path, SMALL, RunConfig(fit=FitConfig(billboards=3)))
-    other = tmp_path / "tree.ply"
-    other.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n")
-    with pytest.raises(InputError, match=r"tree\.ply has triangles that only Blender can read"):
-        compare(other, tmp_path / "out", SMALL, STAGES)
+
+
+def test_trees_that_only_blender_reads_as_they_stand_are_converted(tmp_path: Path) -> None:
+    """A .ply, Z up: decimated it stands as it did."""
+    mesh = trimesh.load(TREE, force="mesh")
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / "tree.ply")
+    config = replace(SMALL, systems=("decimated-vertices", "draco"))
+    decimated, draco = compare(tmp_path / "tree.ply", tmp_path / "out", config, STAGES).rows
+    assert decimated.vertices is not None and decimated.vertices <= 12 and draco.vertices
+    low, high = trimesh.load(tmp_path / "out" / "decimated-vertices" / "model.glb").bounds
+    original = trimesh.load(TREE).bounds
+    assert (low >= original[0] - 1e-3).all() and (high <= original[1] + 1e-3).all()
 
 
 def test_the_khronos_validator_finds_nothing_wrong_with_the_models(done: CompareResult) -> None:

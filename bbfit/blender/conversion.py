@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from bbfit.blender.processes import BlenderPool, require_bpy
-from bbfit.blender.sources import check_tree
+from bbfit.blender.sources import check_tree, fingerprint
 from bbfit.checks import check_count, check_folder, fail
-from bbfit.files import write_pieces
+from bbfit.files import read_json, write_json, write_pieces
 
 _PIECE = 1 << 20
 
@@ -59,6 +59,21 @@ def tree_as_glb(tree: str | Path, out: str | Path, *, triangles: int | None = No
     require_bpy()
     with BlenderPool({"tree": str(files[0].resolve())}) as pool:
         write_pieces(out, _pieces(pool.convert(triangles)))
+    return out
+
+
+def converted_once(tree: str | Path, out: str | Path, *, triangles: int | None = None, on_begin: Callable[[], None] | None = None) -> Path:
+    """As :func:`tree_as_glb`, unless ``out`` was made of the same tree with as many triangles before, as a JSON file beside it tells.
+
+    ``on_begin`` is called if there is anything to do.
+    """
+    out = Path(out)
+    record, inputs = out.with_suffix(".json"), {"tree": fingerprint(check_tree(tree)), "triangles": triangles}
+    if not (out.is_file() and record.is_file() and read_json("record", record) == inputs):
+        if on_begin is not None:
+            on_begin()
+        tree_as_glb(tree, out, triangles=triangles)
+        write_json(record, inputs)
     return out
 
 

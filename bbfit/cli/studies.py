@@ -73,7 +73,7 @@ def compare_command(
     Killed and started again, it goes on where it stopped.
 
     Args:
-        tree: A tree whose triangles can be read (.glb .gltf .obj).
+        tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
         out: Folder for the results.
         config: Which systems there are, and how large.
         views: How the tree is rendered.

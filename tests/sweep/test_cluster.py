@@ -68,6 +68,7 @@ def test_a_node_that_is_killed_costs_only_what_it_was_running(cluster: Cluster, 
             submit(name, str(gate))
         while len(sweep_works.begun(marks)) < len(early) + 2:
             time.sleep(0.05)
+        assert len(workers._put) == 1, "what all tasks read is put into the object store once"
         cluster.remove_node(node, allow_graceful=False)
         gate.touch()
         outcomes |= {task.name: outcome for task, outcome in (workers.next() for _ in late)}
