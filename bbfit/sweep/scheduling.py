@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -13,7 +15,7 @@ from bbfit.checks import InputError, check_file, check_folder, fail
 from bbfit.files import output_folder, write_bytes
 from bbfit.layout import TEST_FILE
 from bbfit.pipeline import Progress, RunConfig
-from bbfit.records import STAGE_VERSIONS, hash_file, hash_inputs, plain
+from bbfit.records import STAGE_VERSIONS, hash_inputs, plain
 from bbfit.reporting.sweep_plots import sweep_plot
 from bbfit.reporting.sweep_tables import SweepRow, table_csv, table_markdown
 from bbfit.sweep.cluster import RayWorkers
@@ -27,6 +29,8 @@ from bbfit.views import ViewDataset
 
 # Characters of a hash that name results and folders: two of a million would be alike once in 10^12 sweeps.
 _DIGITS = 20
+# Seconds from one writing of the table to the next while runs are made.
+_EVERY = 10.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ def run_sweep(
     """Fit every configuration of a grid to every tree and compare them, on this machine or on a Ray cluster.
 
     Writes ``trees/NAME/`` (the grown tree and its views, rendered once), ``runs/KEY/`` (what :func:`bbfit.run` makes of them),
-    ``results/KEY.json``, ``table.csv`` (a row a run, anew after each), ``table.md`` and ``table.png``. A key is the hash of the resolved
+    ``results/KEY.json``, ``table.csv`` (a row a run, kept up to date), ``table.md`` and ``table.png``. A key is the hash of the resolved
     configuration, of the views and, where it has a say, of the mesh: a killed sweep goes on where it was, and sweeps of other grids into
     the same folder share the runs that they have in common. What fails is recorded with its reason, and the rest goes on.
 
@@ -132,6 +136,16 @@ class _Job:
     request: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class _Tree:
+    """A tree that can be fitted to."""
+
+    views: Path
+    fingerprint: str
+    mesh: tuple[Path, ...]
+    mesh_hash: str | None
+
+
 class _Sweep:
     def __init__(self, folder: Path, found: list[Source], cells: list[Cell], config: SweepConfig, stages: RunConfig) -> None:
         self._folder, self._sources, self._cells, self._config, self._stages = folder, found, cells, config, stages
@@ -140,6 +154,7 @@ class _Sweep:
         self._wanted_by = defaultdict[str, list[tuple[Source, int]]](list)  # by key: the trees and cells that wait for a run
         self._outcomes = dict[tuple[Source, int], tuple[str | None, Outcome]]()  # key and what came of it
         self._ready = self._kept = 0
+        self._written = -math.inf
 
     def carry_out(self, workers: Workers, tell: Progress) -> None:
         """Prepare all trees and make all runs that no result stands for."""
@@ -168,7 +183,9 @@ class _Sweep:
     def _tell(self, tell: Progress, note: str = "") -> None:
         tell("trees", self._ready, len(self._sources))
         tell("runs", len(self._outcomes), len(self._sources) * len(self._cells), note)
-        write_bytes(self._folder / "table.csv", table_csv(self._rows()))
+        if time.monotonic() - self._written >= _EVERY:
+            write_bytes(self._folder / "table.csv", table_csv(self._rows()))
+            self._written = time.monotonic()
 
     def _prepare(self, name: str, source: Source, workers: Workers) -> None:
         """See to it that a tree's views are rendered."""
@@ -212,17 +229,17 @@ class _Sweep:
         mesh = self._folder_of(source) / "tree.glb" if source.species else source.tree
         if not (outcome.facts or {}).get("mesh"):
             mesh = None
-        mesh_hash = None if mesh is None else hash_file(mesh)
-        for number, cell in enumerate(self._cells):
-            placed = cell.config.placement == "clusters"
-            self._run(source, number, folder, views, (mesh, mesh_hash) if placed else (None, None), workers)
+        files = () if mesh is None else tuple(check_tree(mesh))
+        tree = _Tree(folder, views, files, fingerprint(list(files)) if files else None)
+        for number in range(len(self._cells)):
+            self._run(source, number, tree, workers)
 
-    def _run(self, source: Source, number: int, folder: Path, views: str, mesh: tuple[Path | None, str | None], workers: Workers) -> None:
+    def _run(self, source: Source, number: int, tree: _Tree, workers: Workers) -> None:
         """See to it that a run is made, unless its result stands or it is being made already."""
         fit = self._cells[number].config
-        asked = plain(
-            {"fit": {**asdict(fit), "checkpoint_every": None}, "export": asdict(self._stages.export), "views": views, "mesh": mesh[1]}
-        )
+        placed = fit.placement == "clusters"  # else the mesh has no say
+        settings = {"fit": {**asdict(fit), "checkpoint_every": None}, "export": asdict(self._stages.export)}
+        asked = plain({**settings, "views": tree.fingerprint, "mesh": tree.mesh_hash if placed else None})
         key = hash_inputs("fit", asked, STAGE_VERSIONS["export"], STAGE_VERSIONS["evaluate"])[:_DIGITS]
         earlier = self._results.get(key)
         if earlier and self._stands(earlier):
@@ -232,7 +249,7 @@ class _Sweep:
         self._wanted_by[key].append((source, number))
         if len(self._wanted_by[key]) > 1:
             return
-        inputs = {"views": (folder,)} | ({} if mesh[0] is None else {"tree": (mesh[0],)})
+        inputs = {"views": (tree.views,)} | ({"tree": tree.mesh} if placed and tree.mesh else {})
         self._jobs[key] = _Job(key, asked)
         workers.submit(Task(key, fit_tree, inputs, self._folder / "runs" / key, (RunConfig(fit=fit, export=self._stages.export),)))
 
