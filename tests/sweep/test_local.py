@@ -34,7 +34,7 @@ def test_tasks_read_and_write_where_they_are_told_to(tmp_path: Path) -> None:
         tasks = [Task(name, sweep_works.copy, inputs, tmp_path / name, (str(tmp_path), name)) for name in ("x", "y", "z")]
         outcomes = carried_out(workers, tasks)
     for name in ("x", "y", "z"):
-        assert outcomes[name].facts == {"name": name, "files": 3} and outcomes[name].reason is None and outcomes[name].seconds > 0
+        assert outcomes[name].facts == {"name": name, "files": 3} and outcomes[name].reason is None
         assert (tmp_path / name / "sub" / "copy.txt").read_text() == "tree tree.txt 3\nviews a.txt 1\nviews b.txt 2"
 
 
