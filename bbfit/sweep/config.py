@@ -27,7 +27,7 @@ class SweepConfig:
     retry_failed: bool = False
     """Try again what failed in an earlier start; otherwise its failure stands."""
     workers: int | None = None
-    """Runs at a time on this machine, which share its cores; left open, one for every two cores. Ray decides by ``cpus`` itself."""
+    """Runs at a time on this machine, which share its cores; left open, one for each core. Ray decides by ``cpus`` itself."""
     ray: str | None = None
     """Address of a Ray cluster to run on (HOST:PORT, or auto for the one of this machine), or local to start Ray on this machine."""
     cpus: int = 1

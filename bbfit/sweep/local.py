@@ -18,11 +18,6 @@ from bbfit.sweep.tasks import Outcome, Task, attempt
 _SPAWN = multiprocessing.get_context("spawn")  # a forked torch or Blender would hang
 
 
-def default_workers() -> int:
-    """One process for every two cores."""
-    return max(1, (os.cpu_count() or 1) // 2)
-
-
 @dataclass
 class _Worker:
     process: BaseProcess
@@ -38,13 +33,13 @@ class _Waiting:
 
 
 class LocalWorkers:
-    """Up to ``count`` processes that share the cores; a task that is to run alone has them all.
+    """Up to ``count`` processes, by default one for each core, that share the cores; a task that is to run alone has them all.
 
     A process that dies is replaced, and its task tried again up to ``retries`` times.
     """
 
     def __init__(self, count: int | None = None, retries: int = 2) -> None:
-        self._count, self._retries = count or default_workers(), retries
+        self._count, self._retries = count or os.cpu_count() or 1, retries
         self._workers: list[_Worker] = []
         self._waiting = _Waiting()
 
