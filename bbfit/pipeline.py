@@ -91,6 +91,7 @@ def run(
     config: RunConfig | None = None,
     *,
     on_progress: Progress | None = None,
+    on_step: Callable[[Step], None] | None = None,
 ) -> RunResult:
     """Turn a tree, or views of one, into a measured billboard cloud with its model files.
 
@@ -103,6 +104,7 @@ def run(
     source : a tree's file, a folder of views, or ``None`` to grow a tree.
     out : the run's folder, made if need be.
     on_progress : told how far each stage is.
+    on_step : called after every step of the fit, as by :func:`~bbfit.fitting.loop.fit`.
 
     Raises
     ------
@@ -119,7 +121,7 @@ def run(
         choice = _choose(views, tree, record, config, exported, tell)
         asked, missed = choice.config, None if choice.met else config.budget.target_psnr
         record.head["config"]["fit"] = plain(asdict(asked))  # what is fitted where that was left to a budget
-    cloud = _fit(views, tree, record, asked, tell, (config.budget.most_bytes, exported))
+    cloud = _fit(views, tree, record, asked, (config.budget.most_bytes, exported), tell, on_step)
     cards = cache(lambda: shipped_cards(cloud, exported))
     _export(cards, record, exported, tell)
     report = _evaluate(as_shipped(cloud, exported), cards, views, record, tell)
@@ -280,7 +282,13 @@ def _choose(views: ViewDataset, tree: Path | None, record: Record, config: RunCo
 
 
 def _fit(
-    views: ViewDataset, tree: Path | None, record: Record, config: FitConfig, tell: Progress, limit: tuple[int | None, ExportConfig]
+    views: ViewDataset,
+    tree: Path | None,
+    record: Record,
+    config: FitConfig,
+    limit: tuple[int | None, ExportConfig],
+    tell: Progress,
+    watch: Callable[[Step], None] | None,
 ) -> BillboardCloud:
     """``limit`` is the most bytes that the model may have, and how it will be exported."""
     config, path = config.resolve(), record.folder / "cloud.safetensors"
@@ -293,6 +301,8 @@ def _fit(
 
     def on_step(step: Step) -> None:
         tell("fit", step.index, step.total, f"loss {step.loss:.5f}")
+        if watch is not None:
+            watch(step)
 
     checkpoint = record.folder / "fit.checkpoint"
     result = fit(views, config, tree=tree, checkpoint=checkpoint, on_step=on_step, on_place=lambda done, total: tell("place", done, total))

@@ -34,7 +34,7 @@ GROUPS = (
     ("budget",),
     ("reporting", "records"),
     ("pipeline",),
-    ("lod", "sweep", "comparison"),
+    ("lod", "sweep", "comparison", "viewing"),
     ("cli",),
     ("__main__",),
 )
@@ -51,12 +51,14 @@ ONLY_IN = {
     },
     "ray": {"sweep/cluster.py"},
     "yaml": {"sweep/grid.py"},
+    "jinja2": {"reporting/html.py"},
+    "viser": {"viewing/page.py"},
     "mitsuba": {"rivals/mesh_rays.py"},
     "drjit": {"rivals/mesh_rays.py"},
     "fast_simplification": {"rivals/decimation.py", "rivals/learned_mesh.py"},
     "DracoPy": {"rivals/draco.py"},
 }
-NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification")
+NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "viser", "jinja2")
 
 
 def relative(path: Path) -> str:
