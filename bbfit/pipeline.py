@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Protocol
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.meshes import MESH_SUFFIXES
+from bbfit.blender.meshes import MESH_SUFFIXES, tree_mesh
 from bbfit.budget.choice import Choice, Trial, choose, within_bytes
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, check_file, fail
@@ -24,14 +22,16 @@ from bbfit.evaluation.sizes import score_sizes
 from bbfit.exporting.cards import Cards
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.drawing import draw_cards
+from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import overdraw
 from bbfit.exporting.model import as_shipped, shipped_cards, shows_from, write_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.records import Record, hash_file, hash_inputs, plain
+from bbfit.records import Record, hash_file, hash_inputs, plain, record_head
 from bbfit.rendering.dispatch import render
+from bbfit.reporting.html import RunFacts, report_page
 from bbfit.reporting.plots import Cost, comparison_picture, loss_plot, pareto_plot
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.growth import grow
@@ -39,7 +39,9 @@ from bbfit.trees.species import Species, load_species
 from bbfit.trees.tree_file import write_tree
 from bbfit.views import ViewDataset, ViewSet
 
-_PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headless", "bpy", "trimesh", "xatlas", "scikit-image", "warp-lang")
+
+# The parts of a configuration that are options of stages.
+_STAGES = ("grow", "views", "fit", "budget", "export")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +98,8 @@ def run(
     """Turn a tree, or views of one, into a measured billboard cloud with its model files.
 
     Writes ``tree.glb`` (when none is given), ``views/`` (from a tree), ``cloud.safetensors``, ``model.glb``, ``model.obj/.mtl/.png``,
-    ``metrics.json``, ``comparison.png``, ``loss.png``, ``loss.csv`` and ``run.json`` (resolved configuration, versions, seeds, seconds).
+    ``metrics.json``, ``comparison.png``, ``report.html``, ``loss.png``, ``loss.csv`` and ``run.json`` (resolved configuration, versions,
+    seeds, seconds).
     A stage whose results stand unchanged and whose inputs are the same is skipped; a killed run goes on where it stopped.
 
     Parameters
@@ -124,7 +127,9 @@ def run(
     cloud = _fit(views, tree, record, asked, (config.budget.most_bytes, exported), tell, on_step)
     cards = cache(lambda: shipped_cards(cloud, exported))
     _export(cards, record, exported, tell)
-    report = _evaluate(as_shipped(cloud, exported), cards, views, record, tell)
+    shipped = as_shipped(cloud, exported)
+    report = _evaluate(shipped, cards, views, tree, record, tell)
+    _page(report, shipped, views, exported, record, tell)
     return RunResult(record.folder, cloud, report, tuple(record.skipped), missed)
 
 
@@ -177,10 +182,12 @@ def with_model(
     return replace(report, vertices=vertices, overdraw=overdraw(cards, shows_from(cards)), sizes=sizes)
 
 
-def original_tree(views: ViewDataset) -> OriginalTree:
-    """What is known of the tree that views were rendered from: its vertices and bytes, from the folder's ``views.json``."""
-    tree = views.request.get("tree")
-    counts = {name: tree.get(name) for name in ("vertices", "bytes")} if isinstance(tree, dict) else {}
+def original_tree(views: ViewDataset, tree: Path | None = None) -> OriginalTree:
+    """Vertices and bytes of the tree that views were rendered from: what the folder's ``views.json`` says, else what its mesh has."""
+    known = views.request.get("tree")
+    counts = {name: known.get(name) for name in ("vertices", "bytes")} if isinstance(known, dict) else {}
+    if not any(counts.values()) and tree is not None:
+        counts = {"vertices": len(tree_mesh(tree).vertices), "bytes": tree.stat().st_size}
     return OriginalTree(**{name: value for name, value in counts.items() if isinstance(value, int)})
 
 
@@ -203,13 +210,8 @@ def _record(folder: Path, source: Path | Species, config: RunConfig) -> Record:
         "budget": asdict(config.budget),
         "export": asdict(config.export),
     }
-    head = {
-        "source": source.name if isinstance(source, Species) else str(source.resolve()),
-        "config": plain(resolved),
-        "seeds": ({"grow": config.grow.seed} if grown else {}) | {"views": config.views.seed, "fit": config.fit.seed},
-        "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
-        "machine": platform.platform(),
-    }
+    seeds = ({"grow": config.grow.seed} if grown else {}) | {"views": config.views.seed, "fit": config.fit.seed}
+    head = record_head(source.name if isinstance(source, Species) else str(source.resolve()), resolved, seeds)
     return Record(folder, head)
 
 
@@ -326,20 +328,22 @@ def _export(cards: Callable[[], Cards], record: Record, config: ExportConfig, te
     record.done("export", inputs, [path.name for path in written], time.perf_counter() - begun)
 
 
-def _evaluate(cloud: BillboardCloud, cards: Callable[[], Cards], views: ViewDataset, record: Record, tell: Progress) -> Report:
+def _evaluate(
+    cloud: BillboardCloud, cards: Callable[[], Cards], views: ViewDataset, tree: Path | None, record: Record, tell: Progress
+) -> Report:
     """The score of the cloud in the alpha mode that its model has."""
     path = record.folder / "metrics.json"
     results = [hash_file(record.folder / name) for name in ("cloud.safetensors", "model.glb")]
-    inputs = hash_inputs("evaluate", results, asdict(cloud.alpha), views.fingerprint)
+    inputs = hash_inputs("evaluate", results, asdict(cloud.alpha), views.fingerprint, None if tree is None else hash_file(tree))
     if record.stands("evaluate", inputs):
         return Report.load(path)
     begun = time.perf_counter()
     report = evaluate(
         cloud,
         views.test,
-        original=original_tree(views),
+        original=original_tree(views, tree),
         model_bytes=(record.folder / "model.glb").stat().st_size,
-        seconds={name: seconds for name, seconds in record.seconds.items() if name != "evaluate"},
+        seconds={name: seconds for name, seconds in record.seconds.items() if name not in ("evaluate", "report")},
         on_view=lambda done, total: tell("evaluate", done, total),
     )
     report = with_model(report, cloud, cards(), views.test, on_size=lambda done, total: tell("sizes", done, total))
@@ -349,16 +353,38 @@ def _evaluate(cloud: BillboardCloud, cards: Callable[[], Cards], views: ViewData
     return report
 
 
+def _page(report: Report, cloud: BillboardCloud, views: ViewDataset, export: ExportConfig, record: Record, tell: Progress) -> None:
+    """``report.html``, made anew when what it shows has changed."""
+    path, head = record.folder / "report.html", record.head
+    pareto = record.folder / "pareto.png" if "budget" in record.stages and any(head["config"]["budget"].values()) else None
+    sources = [record.folder / name for name in ("cloud.safetensors", "metrics.json", "loss.csv")] + ([pareto] if pareto else [])
+    told = {name: head[name] for name in ("source", "config", "seeds")}
+    inputs = hash_inputs("report", [hash_file(source) for source in sources], told, views.fingerprint)
+    if record.stands("report", inputs):
+        return
+    begun = time.perf_counter()
+    tell("report", 0, 1)
+    # In pictures that browsers read, and in pieces that three.js sorts right.
+    shown = replace(export, textures="webp", fallback=False, mip_files=False, split=cloud.alpha.kind == "blend" or export.split)
+    usual = RunConfig(fit=FitConfig(preset=head["config"]["fit"]["preset"]))
+    facts = RunFacts(
+        source=Path(head["source"]).name,
+        asked={stage: options for stage in _STAGES if (options := head["config"][stage]) is not None},
+        usual=plain(asdict(replace(usual, fit=usual.fit.resolve()))),
+        seeds=head["seeds"],
+        versions=head["versions"],
+        losses=[float(row["loss"]) for row in csv.DictReader((record.folder / "loss.csv").read_text().splitlines())],
+        pareto=pareto.read_bytes() if pareto else None,
+    )
+    page = report_page(report, cloud, views.test, facts, glb_bytes(shipped_cards(cloud, shown), shown))
+    write_bytes(path, page.encode())
+    record.done("report", inputs, [path.name], time.perf_counter() - begun)
+    tell("report", 1, 1)
+
+
 def _loss_table(losses: list[float]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["step", "loss"])
     writer.writerows(enumerate(losses, 1))
     return text.getvalue().encode()
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None

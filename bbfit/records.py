@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import platform
+from collections.abc import Mapping
 from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +15,20 @@ from bbfit.files import read_json, write_json
 
 RECORD_FILE = "run.json"
 """The record's name in a run's folder."""
-STAGE_VERSIONS = {"grow": 1, "budget": 3, "fit": 8, "export": 3, "evaluate": 5}
+STAGE_VERSIONS = {"grow": 1, "budget": 3, "fit": 8, "export": 3, "evaluate": 6, "report": 1}
 """Raise a stage's number when its results change for the same inputs, so that old results are made anew."""
+_PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headless", "bpy", "trimesh", "xatlas", "scikit-image", "warp-lang")
+
+
+def record_head(source: str, config: Mapping[str, Any], seeds: Mapping[str, int]) -> dict[str, Any]:
+    """What is told of a run besides its stages: its source, its resolved configuration, its seeds, the versions and the machine."""
+    return {
+        "source": source,
+        "config": plain(config),
+        "seeds": dict(seeds),
+        "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
+        "machine": platform.platform(),
+    }
 
 
 class Record:
@@ -71,3 +86,10 @@ def hash_inputs(stage: str, *inputs: Any) -> str:
 def hash_file(path: Path) -> str | None:
     """SHA-256 of a file, ``None`` if there is none."""
     return sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

@@ -21,7 +21,7 @@ from bbfit.pipeline import RunConfig, RunResult, run
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
 CONFIG = RunConfig(fit=FitConfig(billboards=2, candidates=2, revisions=0, steps=20, checkpoint_every=5))
-FILES = ("cloud.safetensors", "comparison.png", "loss.csv", "loss.png", "metrics.json", "run.json")
+FILES = ("cloud.safetensors", "comparison.png", "loss.csv", "loss.png", "metrics.json", "report.html", "run.json")
 MODELS = ("model.glb", "model.mtl", "model.obj", "model.png")
 
 
@@ -57,13 +57,13 @@ def test_record_holds_the_resolved_configuration(done: RunResult) -> None:
     assert record["config"]["fit"]["learning_rate"] == 0.3 and record["config"]["fit"]["bounds"] == "silhouette"
     assert record["seeds"] == {"views": 0, "fit": 0}
     assert {"bbfit", "torch", "kornia", "python"} <= set(record["versions"])
-    assert set(record["stages"]) == {"fit", "export", "evaluate"}
+    assert set(record["stages"]) == {"fit", "export", "evaluate", "report"}
 
 
 def test_nothing_is_done_twice(views_folder: Path, done: RunResult) -> None:
     before, told = snapshot(done.folder), []
     again = run(views_folder, done.folder, CONFIG, on_progress=lambda *event: told.append(event))
-    assert again.skipped == ("fit", "export", "evaluate") and told == []
+    assert again.skipped == ("fit", "export", "evaluate", "report") and told == []
     assert again.report == done.report
     assert snapshot(done.folder) == before
 
@@ -161,7 +161,7 @@ def test_from_a_tree_to_a_model(tmp_path: Path) -> None:
     assert low[0] < 0 < high[0] and low[2] < 0 < high[2]
 
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*") if path.name not in ("run.json",)}
-    assert run(TREE, tmp_path, config).skipped == ("views", "fit", "export", "evaluate")
+    assert run(TREE, tmp_path, config).skipped == ("views", "fit", "export", "evaluate", "report")
     assert {path: path.stat().st_mtime_ns for path in before} == before
     with pytest.raises(InputError, match="size 48"):
         run(TREE, tmp_path, dataclasses.replace(config, views=dataclasses.replace(config.views, size=64)))

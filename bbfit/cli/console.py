@@ -31,7 +31,7 @@ def show(result: RunResult) -> None:
             style="yellow",
         )
     out_console.print(
-        f"results in {result.folder}: comparison.png, model.glb, model.obj, metrics.json, cloud.safetensors, loss.png", soft_wrap=True
+        f"results in {result.folder}: report.html shows all; model.glb, model.obj, metrics.json, cloud.safetensors", soft_wrap=True
     )
 
 

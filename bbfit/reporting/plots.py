@@ -24,6 +24,7 @@ from bbfit.images import encode_png, over_colour, to_bytes
 from bbfit.views import ViewSet
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
@@ -86,7 +87,7 @@ def comparison_picture(cloud: BillboardCloud, views: ViewSet, path: str | Path, 
         target, result = (over_colour(picture) for picture in held_out(cloud, views, index))
         pair = target.numpy(), result.numpy()
         error = metrics.flip_map(*pair)
-        for x, picture in zip(left, (to_bytes(target), to_bytes(result), _magma(error)), strict=True):
+        for x, picture in zip(left, (to_bytes(target), to_bytes(result), magma(error)), strict=True):
             x += (cell - width) // 2
             draw.rectangle((x - 1, top - 1, x + width, top + height), outline=_LINE)
             sheet.paste(Image.fromarray(picture), (x, top))
@@ -136,6 +137,26 @@ def loss_plot(losses: Sequence[float], path: str | Path, *, label: str = "loss")
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 5), dpi=120, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    draw_losses(axes, losses, label)
+    axes.grid(True, color="#e4e7ea", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    buffer = io.BytesIO()
+    canvas.print_png(buffer, metadata={"Software": None})
+    write_bytes(path, buffer.getvalue())
+
+
+def draw_losses(axes: Axes, losses: Sequence[float], label: str) -> None:
+    """Draw what :func:`loss_plot` shows.
+
+    Raises
+    ------
+    InputError
+        if there are no losses.
+    """
     from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, StrMethodFormatter
 
     values = np.asarray(losses, dtype=np.float64)
@@ -144,10 +165,6 @@ def loss_plot(losses: Sequence[float], path: str | Path, *, label: str = "loss")
     shown = np.where(np.isfinite(values) & (values > 0), values, np.nan)
     steps = np.arange(1, len(shown) + 1)
     window = max(len(shown) // 50, 1)
-
-    figure = Figure(figsize=(9, 5), dpi=120, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
     colour, raw = "#1f5f8b", "#a9c6da"
     axes.plot(steps, shown, color=raw if window > 1 else colour, linewidth=0.8, marker="o" if len(steps) == 1 else None, label="each step")
     if window > 1:
@@ -167,11 +184,6 @@ def loss_plot(losses: Sequence[float], path: str | Path, *, label: str = "loss")
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.set_xlabel("step")
     axes.set_ylabel(label)
-    axes.grid(True, color="#e4e7ea", linewidth=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
-    buffer = io.BytesIO()
-    canvas.print_png(buffer, metadata={"Software": None})
-    write_bytes(path, buffer.getvalue())
 
 
 def pareto_plot(choice: Choice, path: str | Path, *, cost: Cost = "vertices") -> None:
@@ -263,7 +275,7 @@ def running_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64
     return np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
 
 
-def _magma(error: NDArray[np.float64]) -> NDArray[np.uint8]:
+def magma(error: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Values in [0, 1] as magma's RGB bytes, [...] -> [..., 3]."""
     from matplotlib import colormaps
 
@@ -276,7 +288,7 @@ def _colour_bar(sheet: Any, draw: ImageDraw, font: FreeTypeFont, right: int, top
 
     length, thickness = 5 * text, text * 3 // 4
     end = right - int(font.getlength(" 1"))
-    bar = np.broadcast_to(_magma(np.linspace(0, 1, length)), (thickness, length, 3))
+    bar = np.broadcast_to(magma(np.linspace(0, 1, length)), (thickness, length, 3))
     sheet.paste(Image.fromarray(np.ascontiguousarray(bar)), (end - length, top + text // 4))
     draw.text((end, top), " 1", FAINT, font)
     draw.text((end - length, top), "0 ", FAINT, font, anchor="ra")

@@ -36,17 +36,17 @@ def test_the_tree_is_the_one_that_was_asked_for(grown: Path, tmp_path: Path) -> 
     record = json.loads((grown / "run.json").read_text())
     assert record["source"] == "acer" and record["config"]["species"]["curve_res"] == [6, 5, 3, 0]
     assert record["seeds"] == {"grow": 3, "views": 0, "fit": 0}
-    assert set(record["stages"]) == {"grow", "views", "fit", "export", "evaluate"}
+    assert set(record["stages"]) == {"grow", "views", "fit", "export", "evaluate", "report"}
     metrics = json.loads((grown / "metrics.json").read_text())
     assert metrics["vertices"]["original"] == sum(len(mesh.vertices) for mesh in scene.geometry.values())
     assert metrics["seconds"]["grow"] > 0
 
 
 def test_a_standing_run_is_left_alone_and_a_lost_tree_grown_again(grown: Path) -> None:
-    assert run(None, grown, CONFIG).skipped == ("grow", "views", "fit", "export", "evaluate")
+    assert run(None, grown, CONFIG).skipped == ("grow", "views", "fit", "export", "evaluate", "report")
     before = (grown / "tree.glb").read_bytes()
     (grown / "tree.glb").unlink()
-    assert run(None, grown, CONFIG).skipped == ("views", "fit", "export", "evaluate")
+    assert run(None, grown, CONFIG).skipped == ("views", "fit", "export", "evaluate", "report")
     assert (grown / "tree.glb").read_bytes() == before
 
 

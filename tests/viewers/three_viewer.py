@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,15 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import open_browser
 from numpy.typing import NDArray
-from playwright.sync_api import Browser, ConsoleMessage, Page, Route, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, Page, Route
 
 from bbfit.geometry.camera import Camera
 
 HERE = Path(__file__).parent
 NODE = HERE.parent / "node"
-BROWSERS = ("chromium", "google-chrome", "chromium-browser")
-FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox", "--disable-dev-shm-usage"]
 # No such host: every request is answered from the disk.
 ORIGIN = "https://viewer.invalid"
 TYPES = {".html": "text/html", ".js": "text/javascript", ".wasm": "application/wasm", ".glb": "model/gltf-binary"}
@@ -113,25 +111,11 @@ class ThreeViewer:
 
 @contextmanager
 def open_three() -> Iterator[ThreeViewer]:
-    """A browser for as many GLBs as wanted; the test fails where there is no browser or no three.js.
-
-    The browser is driven from a thread of its own, since playwright leaves an event loop running in the thread that it works in.
-    """
-    chromium = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if chromium is None:
-        pytest.fail(f"no browser is installed: install one of {', '.join(BROWSERS)} (apt-get install chromium)")
+    """A browser for as many GLBs as wanted; the test fails where there is no browser or no three.js."""
     if not (NODE / "node_modules" / "three").is_dir():
         pytest.fail(f"three.js is not installed: install Node.js and run `npm ci` in {NODE}")
-    with ThreadPoolExecutor(1) as thread:
-        driver = thread.submit(lambda: sync_playwright().start()).result()
-        try:
-            browser = thread.submit(lambda: driver.chromium.launch(executable_path=chromium, args=FLAGS)).result()
-            try:
-                yield ThreeViewer(browser, thread)
-            finally:
-                thread.submit(browser.close).result()
-        finally:
-            thread.submit(driver.stop).result()
+    with open_browser() as (browser, thread):
+        yield ThreeViewer(browser, thread)
 
 
 def projection_matrix(camera: Camera, near: float, far: float) -> NDArray[np.float64]:

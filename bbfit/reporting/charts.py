@@ -1,0 +1,217 @@
+"""Charts of a run as SVG, in colours that the page they stand on decides, so that they read in light and in dark."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bbfit.checks import fail
+from bbfit.evaluation.report import SizeScore, ViewScore
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.reporting.plots import draw_losses
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# What is drawn in these colours takes the page's custom property of that name.
+_THEME = {"#000001": "--ink", "#70767e": "--faint", "#e4e7ea": "--grid", "#1f5f8b": "--accent", "#a9c6da": "--soft", "#c8501e": "--worst"}
+_INK, _FAINT, _GRID, _ACCENT, _SOFT, _WORST = _THEME
+# Inches of 72 units of the SVG: the width of a phone, so that nothing shrinks there.
+_WIDTH = 5.4
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart and where things are on it."""
+
+    svg: str
+    """An ``<svg>`` element with custom properties in place of colours; all of its ids begin with the chart's name."""
+    marks: Mapping[str, float]
+    """Numbers that a script needs to move what is marked, in the SVG's units."""
+
+
+MEASURES = (("psnr", "PSNR, dB", max), ("ssim", "SSIM", max), ("flip", "FLIP", min))
+"""What views are compared by over white: the name, what it is called, and which of two values is the better."""
+
+
+# Middling hues that stand out from white and from black.
+_HUES = ("#3b82c4", "#d9702b", "#3f9e4d", "#c94f4f", "#8f6bc1", "#a06a4e", "#d066a8", "#7d8590", "#a3a21f", "#2aa6b5")
+
+
+def billboard_colour(index: int) -> str:
+    """The colour that a billboard has wherever it is drawn; after ten they come round."""
+    return _HUES[index % len(_HUES)]
+
+
+def worst_views(views: Sequence[ViewScore]) -> dict[str, int]:
+    """Which view is the worst by each of :data:`MEASURES`."""
+    worst = {}
+    for name, _, better in MEASURES:
+        values = [float(getattr(view.measures.over_white, name)) for view in views]
+        worst[name] = values.index(min(values) if better is max else max(values))
+    return worst
+
+
+def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
+    """PSNR, SSIM and FLIP over white of every view against the azimuth that it looks from, the worst of each marked.
+
+    A point's id is ``azimuth-MEASURE-NUMBER`` with the view's place in ``views``. Lines join views of one elevation; where there are many
+    elevations there are none. ``azimuth-cursor-MEASURE`` is a line at 0 degrees, and the mark ``degree`` how far right one degree is.
+    """
+    if not views:
+        fail("views", "there is none to draw")
+    figure = _figure(5.6)
+    worst = worst_views(views)
+    panels = figure.subplots(len(MEASURES), 1, sharex=True)
+    rings: dict[int, list[int]] = {}
+    for index in sorted(range(len(views)), key=lambda index: views[index].azimuth_degrees):
+        rings.setdefault(round(views[index].elevation_degrees), []).append(index)
+    for axes, (name, title, _) in zip(panels, MEASURES, strict=True):
+        values = [float(getattr(view.measures.over_white, name)) for view in views]
+        angles = [view.azimuth_degrees for view in views]
+        axes.axvline(0, color=_FAINT, linewidth=1, gid=f"cursor-{name}")
+        if len(rings) <= len(views) / 4:
+            for ring in rings.values():
+                # A turn is closed: the line goes on beyond both ends.
+                around = [*((angles[i] - 360, values[i]) for i in ring[-1:]), *((angles[i], values[i]) for i in ring)]
+                around += [(angles[i] + 360, values[i]) for i in ring[:1]]
+                axes.plot(*zip(*around, strict=True), color=_SOFT, linewidth=1.5)
+        for index, (angle, value) in enumerate(zip(angles, values, strict=True)):
+            bad = index == worst[name]
+            axes.plot([angle], [value], "o", markersize=7 if bad else 5, color=_WORST if bad else _ACCENT, gid=f"{name}-{index}")
+        low = worst[name]
+        axes.annotate(
+            f"worst: {values[low]:.{2 if name == 'psnr' else 3}f}",
+            (angles[low], values[low]),
+            (0, -9 if name != "flip" else 9),
+            textcoords="offset points",
+            ha="left" if angles[low] < 60 else "right" if angles[low] > 300 else "center",
+            va="top" if name != "flip" else "bottom",
+            color=_WORST,
+        )
+        axes.set_title(title, loc="left", fontsize=10, color=_INK, pad=9)
+        axes.margins(y=0.3)
+        _plain(axes)
+    panels[-1].set_xlim(-5, 365)
+    panels[-1].set_xticks(range(0, 361, 45), [f"{angle}°" for angle in range(0, 361, 45)])
+    panels[-1].set_xlabel("azimuth that the view looks from")
+    svg = _svg(figure, "azimuth")
+    zero, one = (panels[-1].transData.transform((degree, 0))[0] * 72 / figure.dpi for degree in (0, 1))
+    return Chart(svg, {"degree": float(one - zero)})
+
+
+def plan_chart(cloud: BillboardCloud) -> Chart:
+    """Where billboards stand, seen from above with azimuth 0 at the bottom: each one's rectangle, numbered from 1, in metres.
+
+    Lower edges are thick; upright billboards are lines. ``plan-eye`` is a camera at azimuth 0; the marks ``x`` and ``y`` are the centre
+    that it turns about.
+    """
+    from matplotlib.patches import Polygon
+
+    figure = _figure(_WIDTH)
+    axes = figure.subplots()
+    parts = (getattr(cloud, name).detach().cpu().double().numpy() for name in ("centers", "rights", "ups", "half_extents"))
+    centers, rights, ups, half = parts
+    right, up = rights * half[:, :1], ups * half[:, 1:]
+    corners = np.stack([centers - right - up, centers + right - up, centers + right + up, centers - right + up], 1)
+    middle = (corners.min((0, 1)) + corners.max((0, 1))) / 2 if len(cloud) else np.zeros(3)
+    reach = float(np.linalg.norm((corners - middle)[..., [0, 2]], axis=-1).max()) if len(cloud) else 1.0
+    for index, quad in enumerate(corners):
+        flat, colour = quad[:, [0, 2]], billboard_colour(index)
+        axes.add_patch(Polygon(flat, facecolor=colour, edgecolor=colour, linewidth=1, alpha=0.22))
+        lowest = np.argsort(quad[:, 1], kind="stable")[:2]
+        axes.plot(*flat[lowest].T, color=colour, linewidth=2.6, solid_capstyle="round")
+        # The number stands at the end of the lower edge that is farther out, where lines do not cross.
+        ends = flat[lowest] - middle[[0, 2]]
+        end = ends[np.linalg.norm(ends, axis=-1).argmax()]
+        x, z = middle[[0, 2]] + end * (1 + 0.09 * reach / max(float(np.linalg.norm(end)), 1e-9))
+        axes.text(x, z, str(index + 1), ha="center", va="center", fontsize=10, color=colour, fontweight="bold")
+    out = 1.32 * reach
+    eye = np.array([[0, 0.86], [-0.07, 1.0], [0.07, 1.0]]) * out
+    axes.add_patch(Polygon(eye + middle[[0, 2]], facecolor=_WORST, edgecolor="none", gid="eye"))
+    axes.set_xlim(middle[0] - out, middle[0] + out)
+    axes.set_ylim(middle[2] + out, middle[2] - out)  # +Z, where azimuth 0 looks from, is at the bottom
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, metres")
+    axes.set_ylabel("z, metres")
+    _plain(axes)
+    svg = _svg(figure, "plan")
+    x, y = axes.transData.transform(middle[[0, 2]]) * 72 / figure.dpi
+    return Chart(svg, {"x": float(x), "y": float(figure.get_figheight() * 72 - y)})
+
+
+def sizes_chart(sizes: Sequence[SizeScore]) -> Chart:
+    """PSNR and coverage of the exported model in pictures of the views' size, half of it and so on."""
+    figure = _figure(3.9)
+    panels = figure.subplots(2, 1, sharex=True)
+    ticks = [f"{size.width}" if number == 0 else f"1/{round(sizes[0].width / size.width)}" for number, size in enumerate(sizes)]
+    places = list(range(len(sizes)))
+    panels[0].plot(places, [size.psnr for size in sizes], "o-", color=_ACCENT)
+    panels[0].set_title("PSNR, dB", loc="left", fontsize=10, color=_INK, pad=9)
+    known = [(place, size.coverage) for place, size in zip(places, sizes, strict=True) if size.coverage is not None]
+    panels[1].axhline(1, color=_FAINT, linewidth=1, linestyle="--")
+    if known:
+        panels[1].plot(*zip(*known, strict=True), "o-", color=_ACCENT)
+    low, high = panels[1].get_ylim()
+    panels[1].set_ylim(min(low, 0.9), max(high, 1.1))
+    panels[1].set_title("covers, of what the tree covers", loc="left", fontsize=10, color=_INK, pad=9)
+    panels[1].set_xticks(places, ticks)
+    panels[1].set_xlabel("width of the pictures in pixels, and parts of it")
+    for axes in panels:
+        axes.margins(y=0.25)
+        _plain(axes)
+    return Chart(_svg(figure, "sizes"), {})
+
+
+def loss_chart(losses: Sequence[float]) -> Chart:
+    """The loss of each step (:func:`~bbfit.reporting.plots.draw_losses`)."""
+    figure = _figure(3.4)
+    axes = figure.subplots()
+    draw_losses(axes, losses, "loss")
+    _plain(axes)
+    return Chart(_svg(figure, "loss"), {})
+
+
+def _figure(height: float) -> Figure:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(_WIDTH, height), dpi=72, layout="constrained")
+
+
+def _plain(axes: Axes) -> None:
+    axes.grid(True, color=_GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(_GRID)
+    axes.tick_params(length=0, colors=_FAINT, labelsize=9)
+    for label in (axes.xaxis.label, axes.yaxis.label):
+        label.set(color=_FAINT, fontsize=9)
+    axes.set_facecolor("none")
+
+
+def _svg(figure: Figure, name: str) -> str:
+    """The figure as an element for a page: no colours of its own, text as text, ids that begin with ``name``."""
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    figure.patch.set_visible(False)
+    style: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": name, "font.family": "sans-serif"}
+    buffer = io.StringIO()
+    with rc_context(style):
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r' (width|height)="[\d.]+pt"', "", svg, count=2)
+    svg = re.sub(r'\bid="', f'id="{name}-', svg)
+    svg = re.sub(r'((?:xlink:)?href="#|url\(#)', rf"\g<1>{name}-", svg)
+    svg = svg.replace("fill: #000000", f"fill: {_INK}").replace("stroke: #000000", f"stroke: {_INK}")
+    for colour, variable in _THEME.items():
+        svg = svg.replace(colour, f"var({variable})")
+    return svg

@@ -1,0 +1,244 @@
+"""``report.html``: all there is to see of a run, in one file that needs no network."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bbfit.evaluation import metrics
+from bbfit.evaluation.report import Cost, Report, ViewScore
+from bbfit.evaluation.scoring import held_out
+from bbfit.evaluation.sizes import shrunk
+from bbfit.exporting.encoders import encode_webp
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import over_colour, to_bytes, unpremultiply
+from bbfit.model_files import generator, joined_glb, split_glb
+from bbfit.reporting.charts import MEASURES, azimuth_chart, billboard_colour, loss_chart, plan_chart, sizes_chart, worst_views
+from bbfit.reporting.plots import magma, spread_views
+from bbfit.views import ViewSet
+
+# Pictures of this many held-out views are in the page at most, besides the worst ones, and none is wider than so many pixels.
+_MOST_VIEWS, _WIDEST = 36, 512
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What is known of a run besides its result."""
+
+    source: str
+    """What it was made of: a file's or folder's name, or a species. May hold anything; the page escapes it."""
+    asked: Mapping[str, Mapping[str, Any]]
+    """Every option of each stage, resolved."""
+    usual: Mapping[str, Mapping[str, Any]]
+    """What the options are if nothing is said."""
+    seeds: Mapping[str, int]
+    """Seeds by what they are of."""
+    versions: Mapping[str, str | None]
+    """Versions of the programs that took part."""
+    losses: Sequence[float]
+    """Loss of every step of the fit."""
+    pareto: bytes | None = None
+    """The picture of a budget's trials (PNG), if there was one."""
+
+
+def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: RunFacts, glb: bytes) -> str:
+    """The page as text: everything that it shows is in it, and what users named is escaped.
+
+    Shown are the key figures beside the tree's, held-out views (target, result, FLIP map) with a slider, every measure by azimuth with the
+    worst views, the model in 3D by trimesh's viewer, which holds three.js, textures and a plan of the billboards, the quality from afar,
+    the loss, and what was asked.
+
+    Parameters
+    ----------
+    report : the scores of ``cloud`` on ``views``.
+    cloud : the billboards as they ship.
+    views : V held-out views; at most 36 of them and the worst ones are shown, no wider than 512 pixels.
+    glb : the model for the 3D view, with pictures that browsers read (PNG or WebP).
+
+    Raises
+    ------
+    InputError
+        if a view cannot be read, or there are none.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    worst = _worst(report.views)
+    angles = np.array([(view.azimuth_degrees, view.elevation_degrees) for view in report.views])
+    shown = sorted({*spread_views(angles, _MOST_VIEWS), *(entry["index"] for entry in worst)}, key=lambda index: (*angles[index], index))
+    azimuth, plan = azimuth_chart(report.views), plan_chart(cloud)
+    environment = Environment(
+        loader=PackageLoader("bbfit.reporting", "page"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"count": _count, "share": _share, "figure": _figure}
+    own = files("bbfit.reporting") / "page"
+    return environment.get_template("report.html").render(
+        title=f"{facts.source} as {len(cloud)} {'billboard' if len(cloud) == 1 else 'billboards'}",
+        generator=generator(),
+        style=Markup((own / "report.css").read_text(encoding="utf-8")),
+        script=Markup((own / "report.js").read_text(encoding="utf-8")),
+        report=report,
+        cloud=cloud,
+        views=[_view(cloud, views, report.views[index], index) for index in shown],
+        worst=worst,
+        first=shown.index(sorted(shown, key=lambda index: report.views[index].measures.over_white.flip)[len(shown) // 2]),  # a typical one
+        azimuth=Markup(azimuth.svg),
+        plan=Markup(plan.svg),
+        marks={**azimuth.marks, **plan.marks},
+        sizes=Markup(sizes_chart(report.sizes).svg) if report.sizes else None,
+        loss=Markup(loss_chart(facts.losses).svg),
+        billboards=_billboards(cloud),
+        model=viewer_page(glb),
+        costs=_costs(report),
+        facts=facts,
+        changed=_changed(facts),
+        pareto=None if facts.pareto is None else _data("image/png", facts.pareto),
+    )
+
+
+def viewer_page(glb: bytes) -> str:
+    """A page that shows a GLB, to be turned and zoomed: trimesh's viewer, made to keep upright and to show colours as they are.
+
+    Parameters
+    ----------
+    glb : a Y-up model without lights and cameras, whose pictures browsers read.
+    """
+    import trimesh
+    from trimesh.viewer.notebook import scene_to_html
+
+    page = scene_to_html(trimesh.Scene(trimesh.creation.box()))
+    head, mark, rest = page.partition('base64_data="')
+    _, end, tail = rest.partition('"')
+    assert mark and end, "trimesh's viewer has changed"
+    script = (files("bbfit.reporting") / "page" / "model.js").read_text(encoding="utf-8")
+    model = base64.b64encode(_with_camera(glb)).decode()
+    return f"{head}{mark}{model}{end}{tail.replace('</body>', f'<script>{script}</script></body>')}"
+
+
+def _with_camera(glb: bytes) -> bytes:
+    """The model with a camera that sees all of it from azimuth 0, a little from above."""
+    tree, views = split_glb(glb)
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for node in tree["nodes"]:
+        for primitive in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
+            accessor = tree["accessors"][primitive["attributes"]["POSITION"]]
+            moved = np.array(node.get("matrix", np.eye(4).ravel()), np.float64).reshape(4, 4)[3, :3] + node.get("translation", 0)
+            low, high = np.minimum(low, moved + accessor["min"]), np.maximum(high, moved + accessor["max"])
+    centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    field_of_view, tilt = np.radians(35), np.radians(8)
+    away = 0.75 * radius / np.sin(field_of_view / 2)  # what is at the corners of planes is seldom seen
+    pose = np.eye(4)
+    pose[1:3, 1:3] = [[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]]
+    pose[:3, 3] = centre + away * pose[:3, 2]
+    lens = {"yfov": float(field_of_view), "znear": radius / 100, "zfar": 20 * radius}
+    tree["cameras"] = [{"type": "perspective", "perspective": lens}]
+    tree["nodes"].append({"name": "camera", "camera": 0, "matrix": pose.T.ravel().tolist()})
+    tree["scenes"][tree.get("scene", 0)]["nodes"].append(len(tree["nodes"]) - 1)
+    return joined_glb(tree, views)
+
+
+def _view(cloud: BillboardCloud, views: ViewSet, score: ViewScore, index: int) -> dict[str, Any]:
+    """A held-out view for the strip: its pictures and figures."""
+    target, result = held_out(cloud, views, index)
+    error = metrics.flip_map(over_colour(target).numpy(), over_colour(result).numpy())
+    height, width = error.shape
+    size = (min(width, _WIDEST), max(1, height * min(width, _WIDEST) // width))
+    mapped = magma(shrunk(torch.from_numpy(error)[..., None], *size)[..., 0].numpy())
+    pictures = [to_bytes(unpremultiply(shrunk(picture, *size))) for picture in (target, result)]
+    opaque = np.full((*mapped.shape[:2], 1), 255, np.uint8)
+    white, rgba = score.measures.over_white, score.measures.rgba
+    return {
+        "index": index,
+        "name": score.name,
+        "azimuth": score.azimuth_degrees,
+        "elevation": score.elevation_degrees,
+        "psnr": white.psnr,
+        "ssim": white.ssim,
+        "flip": white.flip,
+        "iou": rgba.iou,
+        "width": size[0],
+        "height": size[1],
+        "pictures": [_webp(picture) for picture in (*pictures, np.concatenate([mapped, opaque], -1))],
+    }
+
+
+def _worst(views: Sequence[ViewScore]) -> list[dict[str, Any]]:
+    """The views to show as the worst, by each measure and the three of most FLIP: their figures, and by which they are the worst."""
+    worst = worst_views(views)
+    most = sorted(range(len(views)), key=lambda index: -views[index].measures.over_white.flip)[:3]
+    titles = {name: title.removesuffix(", dB") for name, title, _ in MEASURES}
+    return [
+        {
+            "index": index,
+            "by": [(titles[name], getattr(views[index].measures.over_white, name), worst[name] == index) for name in worst],
+        }
+        for index in dict.fromkeys([worst["flip"], *worst.values(), *most])
+    ]
+
+
+def _billboards(cloud: BillboardCloud) -> list[dict[str, Any]]:
+    """Each billboard's textures, sizes and how it stands."""
+    described = []
+    for number, textures in enumerate(cloud.textures()):
+        half, normal = cloud.half_extents[number].tolist(), cloud.normals[number].double()
+        described.append(
+            {
+                "number": number + 1,
+                "colour": billboard_colour(number),
+                "metres": [2 * side for side in half],
+                "texels": list(textures.shape[1:3])[::-1],
+                "leans": float(normal[1].abs().clamp(max=1).asin().rad2deg()),
+                "covers": float(textures[..., 3].ge(cloud.alpha.cutoff if cloud.alpha.kind == "mask" else 0.5).double().mean()),
+                "sides": [_webp(to_bytes(side)) for side in textures],
+            }
+        )
+    return described
+
+
+def _costs(report: Report) -> list[tuple[str, Cost]]:
+    return [("vertices", report.vertices), ("file, bytes", report.bytes)]
+
+
+def _changed(facts: RunFacts) -> list[tuple[str, Any]]:
+    """The options that are not as usual, by stage and name."""
+    return [
+        (f"{stage}.{name}", value)
+        for stage, options in facts.asked.items()
+        for name, value in options.items()
+        if value != facts.usual.get(stage, {}).get(name)
+    ]
+
+
+def _webp(image: NDArray[np.uint8]) -> str:
+    return _data("image/webp", encode_webp(image, lossless=False))
+
+
+def _data(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _count(value: int | None) -> str:
+    return "not known" if value is None else f"{value:,}"
+
+
+def _share(value: float | None) -> str:
+    """A share in per cent, with two digits that say something."""
+    if value is None:
+        return ""
+    return f"{100 * value:.2g} %" if value < 0.1 else f"{100 * value:.0f} %"
+
+
+def _figure(value: Any, digits: int = 3) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, float):
+        return f"{value:.{digits}f}"
+    return value if isinstance(value, str) else json.dumps(value, default=str)

@@ -1,0 +1,45 @@
+"use strict";
+{
+  const { views, marks } = JSON.parse(document.getElementById("data").textContent);
+  const slider = document.getElementById("view");
+  const images = [...document.querySelectorAll(".strip img")];
+  const eye = document.getElementById("plan-eye");
+  const cursors = ["psnr", "ssim", "flip"].map((name) => document.getElementById(`azimuth-cursor-${name}`));
+  const points = new Map(views.map((view) => [view.index, cursors.map((cursor) => document.getElementById(cursor.id.replace("cursor-", "") + `-${view.index}`))]));
+
+  function show(place) {
+    const view = views[place];
+    slider.value = place;
+    images.forEach((image, part) => { image.src = view.pictures[part]; });
+    const height = Math.abs(view.elevation) >= 0.5 ? `, elevation ${view.elevation.toFixed(0)}°` : "";
+    document.getElementById("caption").textContent =
+      `${view.name}: azimuth ${view.azimuth.toFixed(0)}°${height}; PSNR ${view.psnr.toFixed(2)} dB, SSIM ${view.ssim.toFixed(3)}, FLIP ${view.flip.toFixed(3)}, silhouette IoU ${view.iou.toFixed(3)}`;
+    cursors.forEach((cursor) => cursor.setAttribute("transform", `translate(${view.azimuth * marks.degree} 0)`));
+    eye.setAttribute("transform", `rotate(${-view.azimuth} ${marks.x} ${marks.y})`);
+    points.forEach((group, index) => group.forEach((point) => point.classList.toggle("now", index === view.index)));
+  }
+
+  const step = (by) => show((Number(slider.value) + by + views.length) % views.length);
+  slider.addEventListener("input", () => show(Number(slider.value)));
+  document.getElementById("before").addEventListener("click", () => step(-1));
+  document.getElementById("after").addEventListener("click", () => step(1));
+  const placeOf = (index) => views.findIndex((view) => view.index === index);
+  points.forEach((group, index) => group.forEach((point) => {
+    point.dataset.view = index;
+    point.addEventListener("click", () => show(placeOf(index)));
+  }));
+  document.querySelectorAll(".pictures").forEach((button) => {
+    const place = placeOf(Number(button.dataset.view));
+    button.querySelectorAll("img").forEach((image) => { image.src = views[place].pictures[image.dataset.part]; });
+    button.addEventListener("click", () => {
+      show(place);
+      document.getElementById("views").scrollIntoView();
+    });
+  });
+  show(Number(slider.value));
+
+  // The wheel and a finger scroll the page until the model is asked for, and again once it is out of sight.
+  const turn = document.getElementById("turn");
+  turn.addEventListener("click", () => { turn.hidden = true; });
+  new IntersectionObserver((seen) => { if (!seen[0].isIntersecting) turn.hidden = false; }).observe(turn.parentElement);
+}
