@@ -1,4 +1,4 @@
-"""The main job: grow -> views -> (budget ->) fit -> export -> evaluate, every stage done once and only again when its inputs change."""
+"""The main job: grow -> views -> (budget ->) fit -> export -> evaluate -> report, every stage done once and only again when its inputs change."""
 
 from __future__ import annotations
 
@@ -38,7 +38,6 @@ from bbfit.trees.growth import grow
 from bbfit.trees.species import Species, load_species
 from bbfit.trees.tree_file import write_tree
 from bbfit.views import ViewDataset, ViewSet
-
 
 # The parts of a configuration that are options of stages.
 _STAGES = ("grow", "views", "fit", "budget", "export")

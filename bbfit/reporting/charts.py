@@ -61,8 +61,9 @@ def worst_views(views: Sequence[ViewScore]) -> dict[str, int]:
 def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
     """PSNR, SSIM and FLIP over white of every view against the azimuth that it looks from, the worst of each marked.
 
-    A point's id is ``azimuth-MEASURE-NUMBER`` with the view's place in ``views``. Lines join views of one elevation; where there are many
-    elevations there are none. ``azimuth-cursor-MEASURE`` is a line at 0 degrees, and the mark ``degree`` how far right one degree is.
+    A point's id is ``azimuth-MEASURE-NUMBER`` with the view's place in ``views``. Lines join views of one elevation, which stands at their
+    end if there are several; where there are many there are no lines. ``azimuth-cursor-MEASURE`` is a line at 0 degrees, and the mark
+    ``degree`` how far right one degree is.
     """
     if not views:
         fail("views", "there is none to draw")
@@ -77,11 +78,14 @@ def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
         angles = [view.azimuth_degrees for view in views]
         axes.axvline(0, color=_FAINT, linewidth=1, gid=f"cursor-{name}")
         if len(rings) <= len(views) / 4:
-            for ring in rings.values():
+            for elevation, ring in rings.items():
                 # A turn is closed: the line goes on beyond both ends.
                 around = [*((angles[i] - 360, values[i]) for i in ring[-1:]), *((angles[i], values[i]) for i in ring)]
                 around += [(angles[i] + 360, values[i]) for i in ring[:1]]
                 axes.plot(*zip(*around, strict=True), color=_SOFT, linewidth=1.5)
+                if len(rings) > 1:
+                    end = float(np.interp(365, *np.array(around).T))
+                    axes.annotate(f"{elevation}°", (365, end), (3, 0), textcoords="offset points", va="center", color=_FAINT, fontsize=8)
         for index, (angle, value) in enumerate(zip(angles, values, strict=True)):
             bad = index == worst[name]
             axes.plot([angle], [value], "o", markersize=7 if bad else 5, color=_WORST if bad else _ACCENT, gid=f"{name}-{index}")

@@ -96,7 +96,7 @@ def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: Ru
         sizes=Markup(sizes_chart(report.sizes).svg) if report.sizes else None,
         loss=Markup(loss_chart(facts.losses).svg),
         billboards=_billboards(cloud),
-        model=viewer_page(glb),
+        model=viewer_page(glb, _seen(cloud)),
         costs=_costs(report),
         facts=facts,
         changed=_changed(facts),
@@ -104,12 +104,13 @@ def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: Ru
     )
 
 
-def viewer_page(glb: bytes) -> str:
+def viewer_page(glb: bytes, bounds: NDArray[np.float64]) -> str:
     """A page that shows a GLB, to be turned and zoomed: trimesh's viewer, made to keep upright and to show colours as they are.
 
     Parameters
     ----------
     glb : a Y-up model without lights and cameras, whose pictures browsers read.
+    bounds : lowest and highest corner of what is to be seen at first, in metres, [2, 3].
     """
     import trimesh
     from trimesh.viewer.notebook import scene_to_html
@@ -117,32 +118,39 @@ def viewer_page(glb: bytes) -> str:
     page = scene_to_html(trimesh.Scene(trimesh.creation.box()))
     head, mark, rest = page.partition('base64_data="')
     _, end, tail = rest.partition('"')
-    assert mark and end, "trimesh's viewer has changed"
+    assert mark and end and "</body>" in tail, "trimesh's viewer has changed"
     script = (files("bbfit.reporting") / "page" / "model.js").read_text(encoding="utf-8")
     model = base64.b64encode(_with_camera(glb)).decode()
-    return f"{head}{mark}{model}{end}{tail.replace('</body>', f'<script>{script}</script></body>')}"
+    script = f"<script>const bounds = {json.dumps(bounds.tolist())};\n{script}</script></body>"
+    return f"{head}{mark}{model}{end}{tail.replace('</body>', script)}"
 
 
 def _with_camera(glb: bytes) -> bytes:
-    """The model with a camera that sees all of it from azimuth 0, a little from above."""
+    """The model with a camera, which trimesh's viewer needs; the script places it."""
     tree, views = split_glb(glb)
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for node in tree["nodes"]:
-        for primitive in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
-            accessor = tree["accessors"][primitive["attributes"]["POSITION"]]
-            moved = np.array(node.get("matrix", np.eye(4).ravel()), np.float64).reshape(4, 4)[3, :3] + node.get("translation", 0)
-            low, high = np.minimum(low, moved + accessor["min"]), np.maximum(high, moved + accessor["max"])
-    centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
-    field_of_view, tilt = np.radians(35), np.radians(8)
-    away = 0.75 * radius / np.sin(field_of_view / 2)  # what is at the corners of planes is seldom seen
-    pose = np.eye(4)
-    pose[1:3, 1:3] = [[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]]
-    pose[:3, 3] = centre + away * pose[:3, 2]
-    lens = {"yfov": float(field_of_view), "znear": radius / 100, "zfar": 20 * radius}
-    tree["cameras"] = [{"type": "perspective", "perspective": lens}]
-    tree["nodes"].append({"name": "camera", "camera": 0, "matrix": pose.T.ravel().tolist()})
+    tree["cameras"] = [{"type": "perspective", "perspective": {"yfov": float(np.radians(35)), "znear": 1.0}}]
+    tree["nodes"].append({"name": "camera", "camera": 0, "translation": [0.0, 0.0, 1.0]})
     tree["scenes"][tree.get("scene", 0)]["nodes"].append(len(tree["nodes"]) - 1)
     return joined_glb(tree, views)
+
+
+def _seen(cloud: BillboardCloud) -> NDArray[np.float64]:
+    """Lowest and highest corner of where the billboards show something, but for one texel in two hundred on each side, [2, 3]."""
+    points = []
+    for number, textures in enumerate(cloud.textures()):
+        height, width = textures.shape[1:3]
+        row, column = textures[..., 3].amax(0).ge(_least_seen(cloud)).nonzero().unbind(-1)
+        across, upwards = 2 * (column + 0.5) / width - 1, 1 - 2 * (row + 0.5) / height
+        along = torch.stack([across, upwards], -1) * cloud.half_extents[number]
+        points.append(cloud.centers[number] + along @ torch.stack([cloud.rights[number], cloud.ups[number]]))
+    seen = torch.cat(points) if points and sum(map(len, points)) else torch.tensor([[-1.0] * 3, [1.0] * 3])
+    low, high = np.percentile(seen.double().numpy(), (0.5, 99.5), axis=0)
+    return np.stack([low, high])
+
+
+def _least_seen(cloud: BillboardCloud) -> float:
+    """The alpha that counts as opaque."""
+    return cloud.alpha.cutoff if cloud.alpha.kind == "mask" else 0.5
 
 
 def _view(cloud: BillboardCloud, views: ViewSet, score: ViewScore, index: int) -> dict[str, Any]:
@@ -196,7 +204,7 @@ def _billboards(cloud: BillboardCloud) -> list[dict[str, Any]]:
                 "metres": [2 * side for side in half],
                 "texels": list(textures.shape[1:3])[::-1],
                 "leans": float(normal[1].abs().clamp(max=1).asin().rad2deg()),
-                "covers": float(textures[..., 3].ge(cloud.alpha.cutoff if cloud.alpha.kind == "mask" else 0.5).double().mean()),
+                "covers": float(textures[..., 3].ge(_least_seen(cloud)).double().mean()),
                 "sides": [_webp(to_bytes(side)) for side in textures],
             }
         )
