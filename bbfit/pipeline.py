@@ -1,4 +1,4 @@
-"""The main job: grow -> views -> (budget ->) fit -> export -> evaluate -> report, every stage done once and only again when its inputs change."""
+"""The main job: grow -> views -> (budget ->) fit -> export -> evaluate -> report, each stage done again only when its inputs change."""
 
 from __future__ import annotations
 
