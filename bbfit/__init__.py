@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from bbfit.trees.growth import grow
     from bbfit.trees.species import Species, load_species
     from bbfit.trees.tree_file import write_tree
+    from bbfit.viewing.opening import view
     from bbfit.views import ViewDataset
 
 # Names are imported when they are first used, so that `bbfit --help` need not wait for torch.
@@ -65,6 +66,7 @@ _HOMES = {
     "render_views": "bbfit.blender.views_folder",
     "run": "bbfit.pipeline",
     "run_sweep": "bbfit.sweep.scheduling",
+    "view": "bbfit.viewing.opening",
     "write_tree": "bbfit.trees.tree_file",
 }
 
@@ -99,6 +101,7 @@ __all__ = [
     "render_views",
     "run",
     "run_sweep",
+    "view",
     "write_tree",
 ]
 

@@ -11,8 +11,7 @@ from bbfit.blender.meshes import MESH_SUFFIXES
 from bbfit.blender.sources import check_tree
 from bbfit.blender.views_folder import render_views
 from bbfit.checks import check_folder, fail
-from bbfit.evaluation.metrics import silhouette_distance
-from bbfit.evaluation.scoring import held_out
+from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.cards import Cards
 from bbfit.exporting.config import LodConfig
 from bbfit.exporting.gltf import glb_bytes
@@ -20,13 +19,9 @@ from bbfit.exporting.lod import LodLevel, glb_counts, lod_glb, stands_alone
 from bbfit.exporting.model import shipped_cards
 from bbfit.files import output_folder, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_a_metre
-from bbfit.geometry.cloud import BillboardCloud
 from bbfit.pipeline import Progress, RunConfig, RunResult, export_config, run
 from bbfit.reporting.plots import lod_picture
-from bbfit.views import ViewDataset, ViewSet
-
-# Between the training views errors are a little larger than in them: of an acer's four clouds by up to 11 % in the worst held-out view.
-_MARGIN = 1.15
+from bbfit.views import ViewDataset
 
 
 @dataclass(frozen=True)
@@ -153,11 +148,8 @@ def _places(views: ViewDataset, runs: list[RunResult], config: LodConfig) -> lis
     places = list[_Place]()
     for fitted in runs:
         error, unseen = (worst_silhouette(fitted.cloud, split) / view_scale for split in (views.train, views.test))
-        allowed = config.error_pixels / (_MARGIN * error) if error else math.inf
-        scale = min([view_scale, allowed, *(place.scale for place in places)])
-        area = float((4 * fitted.cloud.half_extents.prod(-1) * (1 + fitted.cloud.two_sided.long())).sum())
-        texels_a_metre = math.sqrt(len(fitted.cloud.texels) / area)
-        places.append(_Place(scale, error, unseen, max(0, math.floor(math.log2(texels_a_metre / scale)))))
+        scale = min([view_scale, scale_within(error, config.error_pixels), *(place.scale for place in places)])
+        places.append(_Place(scale, error, unseen, max(0, math.floor(math.log2(fitted.cloud.texel_density / scale)))))
     if not config.original:
         places[0] = replace(places[0], scale=math.inf, halvings=0)
     return places
@@ -193,9 +185,3 @@ def _levels(
             )
         )
     return tuple(levels)
-
-
-def worst_silhouette(cloud: BillboardCloud, views: ViewSet) -> float:
-    """The largest distance between a cloud's silhouette and that of a view, over all views, in pixels of the views."""
-    pairs = ([picture.numpy() for picture in held_out(cloud, views, index)] for index in range(len(views)))
-    return max(silhouette_distance(target, render) for target, render in pairs)

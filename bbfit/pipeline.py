@@ -128,7 +128,7 @@ def run(
     _export(cards, record, exported, tell)
     shipped = as_shipped(cloud, exported)
     report = _evaluate(shipped, cards, views, tree, record, tell)
-    _page(report, shipped, views, exported, record, tell)
+    _page(report, shipped, cards, views, exported, record, tell)
     return RunResult(record.folder, cloud, report, tuple(record.skipped), missed)
 
 
@@ -352,7 +352,15 @@ def _evaluate(
     return report
 
 
-def _page(report: Report, cloud: BillboardCloud, views: ViewDataset, export: ExportConfig, record: Record, tell: Progress) -> None:
+def _page(
+    report: Report,
+    cloud: BillboardCloud,
+    cards: Callable[[], Cards],
+    views: ViewDataset,
+    export: ExportConfig,
+    record: Record,
+    tell: Progress,
+) -> None:
     """``report.html``, made anew when what it shows has changed."""
     path, head = record.folder / "report.html", record.head
     pareto = record.folder / "pareto.png" if "budget" in record.stages and any(head["config"]["budget"].values()) else None
@@ -363,8 +371,6 @@ def _page(report: Report, cloud: BillboardCloud, views: ViewDataset, export: Exp
         return
     begun = time.perf_counter()
     tell("report", 0, 1)
-    # In pictures that browsers read, and in pieces that three.js sorts right.
-    shown = replace(export, textures="webp", fallback=False, mip_files=False, split=cloud.alpha.kind == "blend" or export.split)
     usual = RunConfig(fit=FitConfig(preset=head["config"]["fit"]["preset"]))
     facts = RunFacts(
         source=Path(head["source"]).name,
@@ -374,8 +380,10 @@ def _page(report: Report, cloud: BillboardCloud, views: ViewDataset, export: Exp
         versions=head["versions"],
         losses=[float(row["loss"]) for row in csv.DictReader((record.folder / "loss.csv").read_text().splitlines())],
         pareto=pareto.read_bytes() if pareto else None,
+        cut_up=bool(export.resolve().split),
     )
-    page = report_page(report, cloud, views.test, facts, glb_bytes(shipped_cards(cloud, shown), shown))
+    readable = replace(export, textures="webp", fallback=False, mip_files=False)  # by browsers
+    page = report_page(report, cloud, views.test, facts, glb_bytes(cards(), readable))
     write_bytes(path, page.encode())
     record.done("report", inputs, [path.name], time.perf_counter() - begun)
     tell("report", 1, 1)

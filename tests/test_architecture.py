@@ -52,7 +52,7 @@ ONLY_IN = {
     "ray": {"sweep/cluster.py"},
     "yaml": {"sweep/grid.py"},
     "jinja2": {"reporting/html.py"},
-    "viser": {"viewing/page.py"},
+    "viser": {"viewing/page.py", "viewing/panel.py", "viewing/planted.py", "viewing/visitor.py"},
     "mitsuba": {"rivals/mesh_rays.py"},
     "drjit": {"rivals/mesh_rays.py"},
     "fast_simplification": {"rivals/decimation.py", "rivals/learned_mesh.py"},

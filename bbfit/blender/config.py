@@ -17,17 +17,17 @@ class ViewsConfig:
     """How a tree is rendered."""
 
     count: int = 90
-    """Pictures in all, shared out over the rings as evenly as possible; a random quarter becomes the test views."""
+    """Pictures in all, shared out over the rings of cameras; a random quarter is held out for the score."""
     size: int = 384
     """Width and height of a picture in pixels."""
     elevations: tuple[float, ...] = (0.0,)
     """Height of each ring of cameras as an angle above the horizon, in degrees."""
     fov_degrees: float = 40.0
-    """Field of view; the cameras step back until the whole tree is in frame."""
+    """Field of view in degrees; the cameras step back until the whole tree is in the picture."""
     orthographic: bool = False
     """Parallel projection instead of a field of view."""
     samples: int = 16
-    """Light paths a pixel."""
+    """Light paths a pixel: more are slower and less noisy."""
     denoise: bool = True
     """Clean the pictures with Open Image Denoise; takes about half of the time, and lets a few samples look like hundreds."""
     sun_strength: float = 2.5
@@ -41,14 +41,14 @@ class ViewsConfig:
     hdri: Path | None = None
     """Panorama (.hdr or .exr) that lights the tree in place of even white; set the sun's strength to 0 when it has its own sun."""
     device: Device = "cpu"
-    """What Cycles computes on."""
+    """What Blender renders on."""
     workers: int = 1
     """Blender processes at a time; the processor's threads are shared out among them."""
     seed: int = 0
-    """Seeds the noise of the renders and the choice of test views."""
+    """Another seed gives other noise, and holds out other views."""
     axis: Axis = "auto"
-    """Vertical line that the cameras circle: through the file's origin, or through the centre of the tree's bounding box. Auto takes the
-    origin where it lies inside the bounding box seen from above, as where the trunk stands on it, else the centre."""
+    """Vertical line that the cameras circle: through the file's origin, or through the centre of the tree's bounding box.
+    Auto takes the origin where it lies inside the bounding box seen from above, as where the trunk stands on it, else the centre."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.elevations, tuple | list) or not self.elevations:

@@ -22,7 +22,7 @@ class BudgetConfig:
     bytes: int | str | None = None
     """Bytes of model.glb at most; 500k and 2M are understood."""
     target_psnr: float | None = None
-    """PSNR over white in dB that validation views are to reach, with as few billboards as will do."""
+    """PSNR over white in dB to reach on validation views, with as few billboards as will do."""
     auto: bool = False
     """Take as many billboards as pay: until twice as many gain less than 0.75 dB."""
 

@@ -16,7 +16,7 @@ from typing import Any
 import tyro
 
 from bbfit.checks import InputError
-from bbfit.cli import commands, studies
+from bbfit.cli import commands, studies, viewing
 from bbfit.cli.console import err_console, out_console
 
 
@@ -38,6 +38,7 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "evaluate": _later(commands.evaluate_command),
     "export": _later(commands.export_command),
     "lod": _later(commands.lod_command),
+    "view": _later(viewing.view_command),
     "sweep": _later(studies.sweep_command),
     "compare": _later(studies.compare_command),
 }

@@ -11,6 +11,7 @@ from bbfit.blender.config import ViewsConfig
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import fail
 from bbfit.cli.console import out_console, progress, show, show_missed
+from bbfit.cli.viewing import WatchConfig, watched
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.trees.config import GrowConfig
@@ -26,28 +27,34 @@ def run_command(
     fit: FitConfig = FitConfig(),  # noqa: B008
     budget: BudgetConfig = BudgetConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    page: Annotated[WatchConfig, tyro.conf.arg(name="")] = WatchConfig(),  # noqa: B008
 ) -> None:
-    """Do everything: grow a tree or take yours, render it, fit billboards to the views, write the models, score them on held-out views.
+    """Do everything: take a tree or grow one, render views of it, fit billboards to them, write the models and a report with the scores.
 
-    Killed and started again, it goes on where it stopped. What stands and has unchanged inputs is not done again.
+    Stopped and started again, it goes on where it was.
+
+    For example: bbfit run tree.glb --out runs/tree
 
     Args:
         tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend) or a folder of views; left out, one is grown.
         out: Folder for the results.
-        species: What to grow, a quaking aspen if left out; `bbfit grow --list` names them.
+        species: What to grow if there is no tree, a quaking aspen if left out; `bbfit grow --list` names the species.
         grow: How a tree is grown.
         views: How the tree is rendered.
-        fit: How the billboards are fitted.
-        budget: What the result may cost; chooses what the fit leaves open, with short fits first.
+        fit: How the billboards are fitted; what is left out, the preset decides.
+        budget: What the result may cost. Short fits choose how many billboards there are.
         export: How the models are written.
+        page: Looking on in a browser.
     """
     from bbfit.pipeline import RunConfig, run
 
     config = RunConfig(species=species, grow=grow, views=views, fit=fit, budget=budget, export=export)
-    with progress() as tell:
-        result = run(tree, out, config, on_progress=tell)
-    show(result)
-    show_missed(export)
+    with watched(page, out, tree, None, fit) as onlooker:
+        with onlooker.progress() as tell:
+            result = run(tree, out, config, on_progress=tell, on_step=onlooker.on_step)
+        show(result)
+        show_missed(export)
+        onlooker.finish()
 
 
 def grow_command(
@@ -58,6 +65,8 @@ def grow_command(
     config: Annotated[GrowConfig, tyro.conf.arg(name="")] = GrowConfig(),  # noqa: B008
 ) -> None:
     """Grow a tree of a species, after Weber and Penn 1995. The same seed gives the same file.
+
+    For example: bbfit grow acer --seed 7 --out acer.glb
 
     Args:
         species: What to grow; may be left out where --species-file holds one species only.
@@ -94,7 +103,11 @@ def views_command(
     out: Path,
     config: Annotated[ViewsConfig, tyro.conf.arg(name="")] = ViewsConfig(),  # noqa: B008
 ) -> None:
-    """Render views of a tree with Blender, in the NeRF-synthetic layout.
+    """Render views of a tree from all around with Blender, into a folder in the NeRF-synthetic layout.
+
+    Stopped and started again, it renders what is missing.
+
+    For example: bbfit views tree.glb --out views/tree
 
     Args:
         tree: The tree's file (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
@@ -116,25 +129,34 @@ def fit_command(
     config: Annotated[FitConfig, tyro.conf.arg(name="")] = FitConfig(),  # noqa: B008
     budget: Annotated[BudgetConfig, tyro.conf.arg(name="")] = BudgetConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    page: Annotated[WatchConfig, tyro.conf.arg(name="")] = WatchConfig(),  # noqa: B008
 ) -> None:
-    """Fit billboards to a folder of views, write the models and the score on held-out views.
+    """Fit billboards to a folder of views, write the models and a report with the scores. Needs no Blender.
+
+    Stopped and started again, it goes on where it was.
+
+    For example: bbfit fit views/tree --tree tree.glb --out runs/tree
 
     Args:
         views: Folder of views, bbfit's own or any in the NeRF-synthetic layout.
         out: Folder for the results.
         tree: The mesh that the views show (.glb .gltf .obj .ply .stl), to place billboards by; without it the views tell where the tree is.
-        config: How the billboards are fitted.
-        budget: What the result may cost; chooses what is left open, with short fits first.
+        config: How the billboards are fitted; what is left out, the preset decides.
+        budget: What the result may cost. Short fits choose how many billboards there are.
         export: How the models are written.
+        page: Looking on in a browser.
     """
     from bbfit.checks import check_folder
     from bbfit.pipeline import RunConfig, run
 
     check_folder("views", views)
-    with progress() as tell:
-        result = run(views, out, RunConfig(tree=tree, fit=config, budget=budget, export=export), on_progress=tell)
-    show(result)
-    show_missed(export)
+    stages = RunConfig(tree=tree, fit=config, budget=budget, export=export)
+    with watched(page, out, views, tree, config) as onlooker:
+        with onlooker.progress() as tell:
+            result = run(views, out, stages, on_progress=tell, on_step=onlooker.on_step)
+        show(result)
+        show_missed(export)
+        onlooker.finish()
 
 
 def evaluate_command(
@@ -144,10 +166,12 @@ def evaluate_command(
     out: Path | None = None,
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
-    """Score a billboard cloud on the held-out views of a folder.
+    """Score fitted billboards on the held-out views of a folder, which they were not fitted to.
+
+    For example: bbfit evaluate runs/tree/cloud.safetensors views/tree --out scores.json
 
     Args:
-        cloud: A .safetensors file written by bbfit fit.
+        cloud: The cloud.safetensors of a run's folder.
         views: Folder of views.
         out: File for the measures as JSON; left out, metrics.json beside the cloud, which replaces the one of its run.
         export: How the model was written, if not as the cloud was fitted: the score is of what the model shows.
@@ -187,10 +211,12 @@ def export_command(
     out: Path,
     config: Annotated[ExportConfig, tyro.conf.arg(name="")] = ExportConfig(),  # noqa: B008
 ) -> None:
-    """Write a billboard cloud as a model that other programs open.
+    """Write fitted billboards as a model for an engine or another program.
+
+    For example: bbfit export runs/tree/cloud.safetensors --out tree.glb --profile godot
 
     Args:
-        cloud: A .safetensors file written by bbfit fit.
+        cloud: The cloud.safetensors of a run's folder.
         out: The model's file, ending in .glb, or in .obj (its .mtl and .png come beside it).
         config: How the model is written.
     """
@@ -212,9 +238,11 @@ def lod_command(
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
-    """Make levels of detail: the tree and ever fewer billboards in one GLB, each shown from where its error does not show.
+    """Make levels of detail: the tree and ever fewer billboards in one GLB, with the distances from which each looks the same.
 
-    Killed and started again, it goes on where it stopped.
+    Stopped and started again, it goes on where it was.
+
+    For example: bbfit lod tree.glb --out lod.glb
 
     Args:
         tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
@@ -222,7 +250,7 @@ def lod_command(
         work: Folder for views, a run for each level, lod.json and lod.png; left out, it is called as the file is without its ending.
         config: Which levels there are.
         views: How the tree is rendered.
-        fit: How the billboards are fitted.
+        fit: How the billboards are fitted; what is left out, the preset decides.
         export: How they are written.
     """
     from bbfit.lod import build_lod

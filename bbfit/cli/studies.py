@@ -27,10 +27,12 @@ def sweep_command(
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
-    """Fit a grid of configurations to many trees, on this machine or on a Ray cluster, and compare them: the thesis's 72 experiments if
-    nothing else is said.
+    """Fit many configurations to many trees, on this machine or on a Ray cluster, and compare them in tables.
 
-    Killed and started again, it goes on where it stopped; every run is made once.
+    Without options these are the 72 experiments of the thesis that the method comes from. Stopped and started again, it goes on where it
+    was; every run is made once.
+
+    For example: bbfit sweep --out runs/sweep --species acer apple --grid default
 
     Args:
         out: Folder for trees, runs and the tables table.csv, table.md and table.png.
@@ -68,9 +70,11 @@ def compare_command(
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
-    """Give a tree to bbfit and to what it is an alternative to, and score all on the same held-out views, with bytes, vertices, seconds.
+    """Give a tree to bbfit and to other methods, and score all on the same held-out views, with bytes, vertices and seconds.
 
-    Killed and started again, it goes on where it stopped.
+    Stopped and started again, it goes on where it was.
+
+    For example: bbfit compare tree.glb --out runs/compare
 
     Args:
         tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).

@@ -32,34 +32,37 @@ class ExportConfig:
     """How a billboard cloud is written to a model file."""
 
     profile: Profile | None = None
-    """The program that the file is for, which decides over what is left open below; any program when left out."""
+    """The program that the file is for, which decides what is left out below. Left out: any program."""
     alpha: AlphaKind | None = None
-    """What alpha means: mask, drawn where alpha reaches the cutoff, needs no sorting; blend has smooth edges and is drawn back to front;
-    hash is drawn by chance. Left open, what the textures were fitted for, which they are best at."""
+    """What alpha means: mask is drawn where alpha reaches the cutoff, and needs no sorting; blend is smooth, and drawn back to front;
+    hash is drawn by chance.
+    Left out: what the textures were fitted for, which they are best at."""
     alpha_cutoff: float | None = None
-    """Least alpha that is drawn with mask, in (0, 1). Left open, what the textures were fitted for."""
+    """Least alpha that is drawn with mask, in (0, 1). Left out: what the textures were fitted for."""
     split: bool | None = None
-    """Cut billboards that cross, and give each piece a node, so that programs that sort nodes blend them in the right order from every
-    side. Costs vertices. Of no use with mask and hash, where it is ignored. Left open, only for a profile whose program sorts nodes."""
+    """With blend: cut billboards that cross, and give each piece a node, so that programs that sort nodes draw them in the right order.
+    Costs vertices; with mask and hash it is ignored.
+    Left out: only for a profile whose program sorts nodes."""
     hull: int | None = None
-    """Corners at most, 4 to 8, of a convex outline around what each billboard shows, in place of its rectangle: fewer empty pixels are
-    drawn. The rectangle when left out."""
+    """Corners at most, 4 to 8, of a convex outline in place of each rectangle, so that fewer empty pixels are drawn.
+    Left out: the rectangle."""
     textures: Textures | None = None
-    """Format of a GLB's texture beside PNG, which every program reads: webp is smaller; ktx2 stays compressed on the graphics card and
-    brings mip levels that keep their coverage (needs the extra ktx2); auto is ktx2 where that extra is installed, else PNG alone. Left
-    open, PNG: the textures as they were scored."""
+    """Format of a GLB's texture beside PNG, which every program reads: webp is smaller;
+    ktx2 stays compressed on the graphics card and brings mip levels that keep their coverage (needs the extra ktx2);
+    auto is ktx2 where that extra is installed, else PNG alone.
+    Left out: PNG, the textures as they were scored."""
     fallback: bool = True
     """Keep the PNG beside a texture in another format, for programs that cannot read it."""
     mip_files: bool = False
     """Write the mip levels as PNG files beside the model too, for programs that take them."""
     material: Material | None = None
     """unlit: colours as they are, with the light that the tree was rendered in. pbr: a rough dielectric that the program lights once more.
-    Left open, unlit."""
+    Left out: unlit."""
     padding: int = 8
     """Texels kept free around each texture in the atlas, at least 1; with 8 the mip levels 1 to 3 never mix two textures."""
     up: Up = "auto"
-    """Up axis of an OBJ file's coordinates. auto: that of the tree's own file where the views tell it (.ply, .stl and .blend are Z up),
-    else y. A GLB is Y up, as glTF demands."""
+    """Up axis of an OBJ file. auto: that of the tree's own file where the views tell it (.ply, .stl and .blend are Z up), else y.
+    A GLB is Y up, as glTF demands."""
 
     def __post_init__(self) -> None:
         check_choice("profile", self.profile, (None, *get_args(Profile)))
@@ -103,14 +106,14 @@ class LodConfig:
     """How a tree and billboard clouds of it become levels of detail in one file."""
 
     planes: tuple[int, ...] = (16, 8, 4, 2)
-    """Billboards of each level, falling."""
+    """How many billboards each level has, the finest first."""
     error_pixels: float = 1.0
-    """Most that a level's silhouette, gaps included, may be off on the screen where it takes over, in pixels: for 95 of 100 pixels of the
-    silhouette, in every training view."""
+    """How far a level's silhouette, gaps included, may be off where it takes over, in pixels of the screen.
+    That holds for 95 of 100 pixels of the silhouette, in every training view."""
     original: bool = True
     """Keep the tree itself as the finest level."""
     triangles: int | None = None
-    """Triangles that the tree is thinned out to at most, by Blender; all of them when left out."""
+    """Triangles that the tree itself is thinned out to, by Blender. Left out: all of them stay."""
     screen_width: int = 1920
     """Width in pixels of the screen that distances and screen coverages are given for."""
     screen_height: int = 1080

@@ -70,72 +70,75 @@ class FitConfig:
     """How to fit. A field left at None takes the preset's value."""
 
     preset: Preset = "default"
-    """thesis repeats the thesis's schedule: 10,000 steps of one random view, Adam at 0.01 growing by a tenth, no bounds, L2."""
+    """default is the best that bbfit knows; thesis is as the thesis did it: 10,000 steps of one random view, no bounds, L2."""
     alpha: AlphaKind | None = None
-    """What the textures are fitted for: to be cut off where alpha is less than the cutoff (mask), blended (blend), or drawn by chance with
-    alpha as the probability (hash). Preset: mask; thesis: blend."""
+    """How alpha will be drawn: cut off below the cutoff (mask), blended (blend), or by chance with alpha as the probability (hash).
+    Preset: mask; thesis: blend."""
     alpha_cutoff: float = 0.5
     """Least alpha that shows with mask, in (0, 1)."""
     billboards: int | None = None
-    """Number N of billboards. Preset: 8; thesis: 4."""
+    """How many billboards there are. Preset: 8; thesis: 4."""
     placement: Placement | None = None
-    """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters), found by a search
-    over clusterings of points on the mesh or, without one, in the visual hull of the views. Preset: clusters; thesis: even."""
+    """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
+    Clusters are found by a search over clusterings of points on the mesh or, without one, in the visual hull of the views.
+    Preset: clusters; thesis: even."""
     orientation: Orientation = "any"
-    """Whether clusters are upright planes, planes that may lean any way (free), or whatever does better (any)."""
+    """How clusters may stand: upright, leaning any way (free), or as does better (any)."""
     searches: int | None = None
-    """Independent searches, of which the best one counts. Left open, two from eight billboards on."""
+    """Searches for a placement, of which the best one counts. Left out: two from eight billboards on, else one."""
     candidates: int = 12
-    """Clusterings that a search compares."""
+    """Clusterings that a search compares; more take longer and may find a better one."""
     revisions: int | None = None
-    """Rounds in which the best placement found is revised, by moving, splitting and merging billboards. Left open, five for eight
-    billboards, at least one and at most six."""
+    """Rounds in which the best placement found is revised, by moving, splitting and merging billboards.
+    Left out: five for eight billboards, at least one and at most six."""
     placement_rate: float | None = None
-    """How fast billboards move with their textures at first: radians a step, and shares of the tree's radius. 0: they stay.
+    """How fast billboards move while they are fitted, at first: radians a step, and shares of the tree's radius. 0: they stay.
     Preset: 0.015; thesis: 0."""
     sides: Sides = "one"
-    """one texture for both sides; two, each seen from its own side; or the thesis's pair of rectangles a hair apart."""
+    """one texture seen from both sides; two, each seen from its own side; or the thesis's pair of rectangles a hair apart."""
     bounds: Bounds | None = None
-    """Evenly placed rectangles that cover the viewport (viewport), the silhouette in the facing view (thesis) or the silhouettes in all
-    training views (silhouette); clustered ones are bounded by what they carry. Preset: silhouette; thesis: viewport."""
+    """How large evenly placed billboards are: as the viewport, as the tree in the facing view (thesis), or as the tree in all (silhouette).
+    Clustered ones are as large as what they carry.
+    Preset: silhouette; thesis: viewport."""
     texel_density: float | None = None
-    """Texels per pixel, both ways, where the tree's axis is seen face on. Preset: 1 (mask) or 1.25; thesis: 1."""
+    """Texels per pixel of a view, both ways, where the tree's axis is seen face on. Preset: 1 (mask) or 1.25; thesis: 1."""
     loss: Loss | None = None
-    """Absolute (l1) or squared (l2) difference of premultiplied RGBA, summed over channels and averaged over pixels, or the squared
-    difference over random backgrounds in expectation (backgrounds). Preset: backgrounds; thesis: l2."""
+    """What is made small: absolute (l1) or squared (l2) differences of premultiplied RGBA, or squared ones over random backgrounds.
+    They are summed over channels and averaged over pixels; of backgrounds it is the expectation.
+    Preset: backgrounds; thesis: l2."""
     max_texels: int | None = None
-    """Texels at most, for which their density is lowered; any number when left open."""
+    """Texels of all billboards at most, for which their density is lowered. Left out: any number."""
     ssim_weight: float | None = None
-    """Weight of 1 - SSIM beside the loss. Preset: 0.01; thesis: 0."""
+    """Weight of 1 - SSIM, which keeps structure, beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: float | None = None
-    """Weight, at full resolution, of the squared difference in mean contrast of neighbouring pixels. Preset: 24 (mask)
-    or 14; thesis: 0."""
+    """Weight against blur: of the squared difference in mean contrast of neighbouring pixels, at full resolution.
+    Preset: 24 (mask) or 14; thesis: 0."""
     crispness_weight: float | None = None
-    """Weight, at full resolution, of alpha * (1 - alpha), summed over texels and divided by a view's pixels, which makes leaves opaque and
-    the air between them clear. Preset: 0.06 (mask), 0.004 (blend) or 0.03 (hash); thesis: 0."""
+    """Weight for opaque leaves and clear air: of alpha * (1 - alpha), summed over texels, over a view's pixels, at full resolution.
+    Preset: 0.06 (mask), 0.004 (blend) or 0.03 (hash); thesis: 0."""
     levels: int | None = None
-    """Resolutions of views and textures, coarse to fine, sides doubling from each to the next; the steps are shared out evenly.
+    """How many resolutions there are, from coarse to fine, sides doubling from each to the next; steps are shared out evenly.
     Preset: 4; thesis: 1."""
     steps: int | None = None
-    """Optimiser steps. Preset: 1200; thesis: 10000."""
+    """Steps of the optimiser. Preset: 1200; thesis: 10000."""
     views_per_step: int | None = None
-    """Training views in every step at full resolution; twice as many at each coarser level. Preset: 2; thesis: 1."""
+    """Views that a step looks at, at full resolution; twice as many at each coarser one. Preset: 2; thesis: 1."""
     learning_rate: float | None = None
-    """Adam's initial rate. Preset: 0.3; thesis: 0.01."""
+    """Step size of the optimiser, Adam, at first. Preset: 0.3; thesis: 0.01."""
     beta1: float | None = None
     """What is left of Adam's first moment, the mean gradient, after a step. Preset: 0.8; thesis: 0.9."""
     beta2: float | None = None
     """What is left of Adam's second moment, the mean squared gradient, after a step. Preset: 0.95; thesis: 0.999."""
     schedule: Schedule | None = None
-    """cosine decay to zero, or the thesis's growth by (1 + 0.1 / steps) a step. Preset: cosine; thesis: growth."""
+    """How the step size changes: to zero along a cosine, or by (1 + 0.1 / steps) a step (growth). Preset: cosine; thesis: growth."""
     seed: int = 0
-    """Seeds the start textures and the order of views."""
+    """Another seed gives another search, other start textures and another order of views."""
     backend: Backend = "auto"
-    """The renderer to fit through: fused kernels, or the reference, which is many times slower; auto takes the kernels."""
+    """What draws while fitting: the kernels (fused, auto), or the reference, which is many times slower."""
     device: str = "cpu"
     """Torch device to fit on, such as cpu or cuda."""
     checkpoint_every: int = 250
-    """Steps between two checkpoints; a killed fit goes on from the last."""
+    """Steps between two checkpoints; a fit that was stopped goes on from the last."""
 
     def __post_init__(self) -> None:
         check_choice("preset", self.preset, ("default", "thesis"))

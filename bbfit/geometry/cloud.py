@@ -79,6 +79,12 @@ class BillboardCloud:
         """Vertices of the exported mesh: four a quad, two quads for a two-sided billboard."""
         return 4 * (len(self) + int(self.two_sided.sum()))
 
+    @property
+    def texel_density(self) -> float:
+        """Texels a metre along a side, of all textures together; 0 without any."""
+        area = float((4 * self.half_extents.prod(-1) * (1 + self.two_sided.long())).sum())
+        return math.sqrt(len(self.texels) / area) if len(self) else 0.0
+
     def textures(self) -> list[Tensor]:
         """The textures as views into ``texels``, N tensors of [S, h, w, 4]; S = 1 or 2 (front, back)."""
         parts = self.texels.split(self._texel_counts)

@@ -13,6 +13,7 @@ import numpy as np
 from bbfit.checks import fail
 from bbfit.evaluation.report import SizeScore, ViewScore
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.extent import corners
 from bbfit.reporting.plots import draw_losses
 
 if TYPE_CHECKING:
@@ -120,13 +121,10 @@ def plan_chart(cloud: BillboardCloud) -> Chart:
 
     figure = _figure(_WIDTH)
     axes = figure.subplots()
-    parts = (getattr(cloud, name).detach().cpu().double().numpy() for name in ("centers", "rights", "ups", "half_extents"))
-    centers, rights, ups, half = parts
-    right, up = rights * half[:, :1], ups * half[:, 1:]
-    corners = np.stack([centers - right - up, centers + right - up, centers + right + up, centers - right + up], 1)
-    middle = (corners.min((0, 1)) + corners.max((0, 1))) / 2 if len(cloud) else np.zeros(3)
-    reach = float(np.linalg.norm((corners - middle)[..., [0, 2]], axis=-1).max()) if len(cloud) else 1.0
-    for index, quad in enumerate(corners):
+    quads = corners(cloud).cpu().numpy()
+    middle = (quads.min((0, 1)) + quads.max((0, 1))) / 2 if len(cloud) else np.zeros(3)
+    reach = float(np.linalg.norm((quads - middle)[..., [0, 2]], axis=-1).max()) if len(cloud) else 1.0
+    for index, quad in enumerate(quads):
         flat, colour = quad[:, [0, 2]], billboard_colour(index)
         axes.add_patch(Polygon(flat, facecolor=colour, edgecolor=colour, linewidth=1, alpha=0.22))
         lowest = np.argsort(quad[:, 1], kind="stable")[:2]

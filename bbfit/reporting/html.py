@@ -19,6 +19,7 @@ from bbfit.evaluation.scoring import held_out
 from bbfit.evaluation.sizes import shrunk
 from bbfit.exporting.encoders import encode_webp
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.extent import shown_bounds
 from bbfit.images import over_colour, to_bytes, unpremultiply
 from bbfit.model_files import generator, joined_glb, split_glb
 from bbfit.reporting.charts import MEASURES, azimuth_chart, billboard_colour, loss_chart, plan_chart, sizes_chart, worst_views
@@ -47,6 +48,8 @@ class RunFacts:
     """Loss of every step of the fit."""
     pareto: bytes | None = None
     """The picture of a budget's trials (PNG), if there was one."""
+    cut_up: bool = False
+    """Whether the model is cut up so that programs blend it in the right order."""
 
 
 def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: RunFacts, glb: bytes) -> str:
@@ -74,6 +77,7 @@ def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: Ru
     worst = _worst(report.views)
     angles = np.array([(view.azimuth_degrees, view.elevation_degrees) for view in report.views])
     shown = sorted({*spread_views(angles, _MOST_VIEWS), *(entry["index"] for entry in worst)}, key=lambda index: (*angles[index], index))
+    layered = report.alpha.kind != "mask" and not facts.cut_up
     azimuth, plan = azimuth_chart(report.views), plan_chart(cloud)
     environment = Environment(
         loader=PackageLoader("bbfit.reporting", "page"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -96,7 +100,8 @@ def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: Ru
         sizes=Markup(sizes_chart(report.sizes).svg) if report.sizes else None,
         loss=Markup(loss_chart(facts.losses).svg),
         billboards=_billboards(cloud),
-        model=viewer_page(glb, _seen(cloud)),
+        model=viewer_page(glb, shown_bounds(cloud, spared=0.005).numpy(), layered=layered),
+        layered=layered,
         costs=_costs(report),
         facts=facts,
         changed=_changed(facts),
@@ -104,13 +109,15 @@ def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: Ru
     )
 
 
-def viewer_page(glb: bytes, bounds: NDArray[np.float64]) -> str:
+def viewer_page(glb: bytes, bounds: NDArray[np.float64], *, layered: bool = False) -> str:
     """A page that shows a GLB, to be turned and zoomed: trimesh's viewer, made to keep upright and to show colours as they are.
 
     Parameters
     ----------
     glb : a Y-up model without lights and cameras, whose pictures browsers read.
     bounds : lowest and highest corner of what is to be seen at first, in metres, [2, 3].
+    layered : whether what is blended is drawn twice, as it is right but for what is less than half opaque, whatever its order: at first
+        where alpha is at least a half, which then hides what is behind it, and then all that is not hidden.
     """
     import trimesh
     from trimesh.viewer.notebook import scene_to_html
@@ -121,7 +128,8 @@ def viewer_page(glb: bytes, bounds: NDArray[np.float64]) -> str:
     assert mark and end and "</body>" in tail, "trimesh's viewer has changed"
     script = (files("bbfit.reporting") / "page" / "model.js").read_text(encoding="utf-8")
     model = base64.b64encode(_with_camera(glb)).decode()
-    script = f"<script>const bounds = {json.dumps(bounds.tolist())};\n{script}</script></body>"
+    given = f"const bounds = {json.dumps(bounds.tolist())}, layered = {json.dumps(layered)};"
+    script = f"<script>{given}\n{script}</script></body>"
     return f"{head}{mark}{model}{end}{tail.replace('</body>', script)}"
 
 
@@ -132,20 +140,6 @@ def _with_camera(glb: bytes) -> bytes:
     tree["nodes"].append({"name": "camera", "camera": 0, "translation": [0.0, 0.0, 1.0]})
     tree["scenes"][tree.get("scene", 0)]["nodes"].append(len(tree["nodes"]) - 1)
     return joined_glb(tree, views)
-
-
-def _seen(cloud: BillboardCloud) -> NDArray[np.float64]:
-    """Lowest and highest corner of where the billboards show something, but for one texel in two hundred on each side, [2, 3]."""
-    points = []
-    for number, textures in enumerate(cloud.textures()):
-        height, width = textures.shape[1:3]
-        row, column = textures[..., 3].amax(0).ge(_least_seen(cloud)).nonzero().unbind(-1)
-        across, upwards = 2 * (column + 0.5) / width - 1, 1 - 2 * (row + 0.5) / height
-        along = torch.stack([across, upwards], -1) * cloud.half_extents[number]
-        points.append(cloud.centers[number] + along @ torch.stack([cloud.rights[number], cloud.ups[number]]))
-    seen = torch.cat(points) if points and sum(map(len, points)) else torch.tensor([[-1.0] * 3, [1.0] * 3])
-    low, high = np.percentile(seen.double().numpy(), (0.5, 99.5), axis=0)
-    return np.stack([low, high])
 
 
 def _least_seen(cloud: BillboardCloud) -> float:

@@ -14,8 +14,8 @@ class SweepConfig:
     """What a sweep varies and what it runs on."""
 
     grid: str = "thesis"
-    """A YAML file, or a built-in grid: thesis (24 configurations a tree: 2, 3 and 4 billboards, L1 and L2, base, bounded, double, double
-    bounded) or default (one run a tree by the default preset)."""
+    """A YAML file, or a built-in grid: default is one run a tree by the default preset;
+    thesis is 24: 2, 3 and 4 billboards, L1 and L2, base, bounded, double and double bounded."""
     billboards: tuple[int, ...] = ()
     """Numbers of billboards, in place of the grid's."""
     loss: tuple[Loss, ...] = ()
@@ -27,13 +27,13 @@ class SweepConfig:
     retry_failed: bool = False
     """Try again what failed in an earlier start; otherwise its failure stands."""
     workers: int | None = None
-    """Runs at a time on this machine, which share its cores; left open, one for each core. Ray decides by ``cpus`` itself."""
+    """Runs at a time on this machine, which share its cores; left out, one for each core. Ray decides by cpus itself."""
     ray: str | None = None
     """Address of a Ray cluster to run on (HOST:PORT, or auto for the one of this machine), or local to start Ray on this machine."""
     cpus: int = 1
     """Cores that Ray keeps for a run."""
     gpus: float = 0.0
-    """GPUs that Ray keeps for a run; say also on what to fit, as in ``--fit.device cuda``."""
+    """GPUs that Ray keeps for a run; say also on what to fit, as in --fit.device cuda."""
     memory: int | str | None = None
     """Bytes of memory that Ray keeps for a run; 4000M is understood."""
     retries: int = 2

@@ -16,11 +16,11 @@ class GrowConfig:
     """How a tree is grown."""
 
     seed: int = 0
-    """Another seed, another tree of the kind."""
+    """Another seed gives another tree of the same species."""
     detail: float = 1.0
-    """Factor on the rings along stems and on the corners of each ring, in [0.1, 10]; the bark's vertices go by its square."""
+    """How fine the bark is, in [0.1, 10]: factor on the rings along stems and on each ring's corners; vertices go by its square."""
     leaves: float = 1.0
-    """Share of the leaves that grow, in [0, 1]; those are larger, so that the area of all stays."""
+    """Share of the leaves that grow, in [0, 1]; fewer are larger, so that their area stays."""
     max_vertices: int = VERTEX_LIMIT
     """Refuse to grow a tree of more vertices than this."""
     species_file: Path | None = None

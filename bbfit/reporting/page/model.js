@@ -15,9 +15,20 @@ const frame = () => {
   Object.assign(camera, { near: away / 100, far: 30 * away });
   camera.updateProjectionMatrix();
 };
+const layer = () => {
+  const meshes = [];
+  scene.traverse((item) => { if (item.isMesh && item.material.transparent) meshes.push(item); });
+  for (const mesh of meshes) {
+    const core = mesh.clone();
+    core.material = mesh.material.clone();
+    Object.assign(core.material, { transparent: false, alphaTest: 0.5, depthWrite: true });
+    mesh.material.depthWrite = false;
+    mesh.parent.add(core);
+  }
+};
 // In place of the viewer's own: the trunk stays upright.
 render = () => {
-  if (!framed && camera.aspect) { framed = true; frame(); }
+  if (!framed && camera.aspect) { framed = true; frame(); if (layered) layer(); }
   const eye = camera.position.clone().sub(controls.target);
   const seen = new THREE.Spherical().setFromVector3(eye);
   seen.phi = Math.min(Math.max(seen.phi, 0.05), Math.PI - 0.05);

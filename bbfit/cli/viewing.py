@@ -1,0 +1,129 @@
+"""The commands' pages: one that shows results, and one that shows a fit while it goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from bbfit.checks import fail
+from bbfit.cli.console import err_console, out_console, progress
+from bbfit.fitting.config import FitConfig
+
+if TYPE_CHECKING:
+    from bbfit.fitting.loop import Step
+    from bbfit.pipeline import Progress
+    from bbfit.viewing.watching import Watch
+
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+
+
+@dataclass(frozen=True)
+class WatchConfig:
+    """Looking on in a browser."""
+
+    watch: Flag = False
+    """Show the fit on a page while it goes on. In a terminal the page stays until Ctrl-C, elsewhere it ends with the run."""
+    host: str = "127.0.0.1"
+    """Address that the page listens on: this machine alone; whoever reaches it sees the page."""
+    port: int = 8080
+    """Port of the page; the next free one if it is taken."""
+    open: Flag = False
+    """Open the page in this machine's browser."""
+
+
+def view_command(
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
+    /,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    open: Flag = False,
+    original_bytes: int = 64 << 20,
+) -> None:
+    """Look at results in the browser: the original and the billboards side by side, levels of detail, fields of up to 10,000 trees.
+
+    The page is there until Ctrl-C. It needs no network.
+
+    Args:
+        run: Folder of bbfit run, bbfit fit or bbfit lod.
+        host: Address to listen on: this machine alone; whoever reaches it sees the page.
+        port: Port to listen on; the next free one if it is taken.
+        open: Open the page in this machine's browser.
+        original_bytes: Size of the original up to which it is sent to the browser.
+    """
+    from bbfit.viewing.opening import view
+
+    if original_bytes < 0:
+        fail("original_bytes", f"expected at least 0, got {original_bytes}")
+    with view(run, host=host, port=port, original_bytes=original_bytes) as page:
+        _announce(page.url, open=open)
+        if page.notes:
+            out_console.print("\n".join(page.notes), style="yellow", soft_wrap=True, highlight=False)
+        _stay()
+
+
+class Onlooker:
+    """Shows a run in the terminal and, if there is one, on a page."""
+
+    def __init__(self, watch: Watch | None = None, url: str = "") -> None:
+        self._watch, self._url = watch, url
+
+    @property
+    def on_step(self) -> Callable[[Step], None] | None:
+        """To be called after each step of the fit."""
+        return None if self._watch is None else self._watch.on_step
+
+    @contextlib.contextmanager
+    def progress(self) -> Iterator[Progress]:
+        """As :func:`bbfit.cli.console.progress`, on the page too."""
+        with progress() as tell:
+
+            def both(stage: str, done: int, total: int, note: str = "") -> None:
+                tell(stage, done, total, note)
+                if self._watch is not None:
+                    self._watch.on_progress(stage, done, total, note)
+
+            yield both
+
+    def finish(self) -> None:
+        """Show the finished run; in a terminal, until Ctrl-C."""
+        if self._watch is None:
+            return
+        self._watch.finish()
+        if err_console.is_terminal:
+            out_console.print(f"the page stays at {self._url} until Ctrl-C", soft_wrap=True)
+            _stay()
+
+
+@contextlib.contextmanager
+def watched(config: WatchConfig, out: Path, source: Path | None, tree: Path | None, fit: FitConfig) -> Iterator[Onlooker]:
+    """What shows a run of ``source`` in the folder ``out``; with ``--watch`` there is a page meanwhile."""
+    if not config.watch:
+        yield Onlooker()
+        return
+    from bbfit.viewing.page import Page
+    from bbfit.viewing.watching import Watch
+
+    alpha = fit.resolve().alpha
+    assert alpha is not None
+    with Page(host=config.host, port=config.port) as page, contextlib.closing(Watch(page, out, source, tree, alpha)) as watch:
+        _announce(page.url, open=config.open)
+        yield Onlooker(watch, page.url)
+
+
+def _announce(url: str, *, open: bool) -> None:
+    out_console.print(f"look at {url}", soft_wrap=True)
+    if open and not webbrowser.open(url):
+        err_console.print("no browser could be opened", style="yellow")
+
+
+def _stay() -> None:
+    """Wait for Ctrl-C, which here is no failure."""
+    with contextlib.suppress(KeyboardInterrupt):
+        threading.Event().wait()
