@@ -7,7 +7,7 @@ window.bbfit ??= (() => {
   const KEPT = 60; // intervals and durations that medians are taken of
   let renderer = null, scene = null, overlay = null;
   let drawn = 0, drewBefore = false, before = 0, measureUntil = 0, written = 0;
-  let calls = 0, triangles = 0, sent = "";
+  let calls = 0, triangles = 0, sent = "", folded = false;
   const intervals = [], durations = [];
 
   const viser = () => window.__viserMutable;
@@ -74,7 +74,6 @@ window.bbfit ??= (() => {
     viser().requestRender();
   }
 
-
   function block() {
     const made = document.createElement("div");
     made.style.cssText = `position:absolute;margin:10px;padding:6px 10px;border-radius:6px;background:${WHITE};color:#1d2733;`
@@ -96,6 +95,15 @@ window.bbfit ??= (() => {
     overlay.frame = document.createElement("div");
     overlay.frame.id = "bbfit-frame";
     overlay.frame.style.cssText = "font-variant-numeric:tabular-nums;color:#52606d;font-size:12px";
+  }
+
+  // On a phone viser's controls lie over the lower pane: they begin folded, and a tap on their head unfolds them.
+  function fold() {
+    for (const panel of document.querySelectorAll(".mantine-Paper-root")) {
+      const { position, bottom } = getComputedStyle(panel), head = panel.querySelector('div[style*="cursor: pointer"]');
+      if (position === "fixed" && bottom === "0px" && head) { head.click(); return true; }
+    }
+    return false;
   }
 
   function write() {
@@ -149,6 +157,7 @@ window.bbfit ??= (() => {
     if (now < measureUntil) found.requestRender();
     if (!renderer) return;
     if (!overlay?.isConnected) attach(found.canvas);
+    if (!folded && state.left.length) folded = window.innerWidth > 576 || fold();
     const { width, height } = renderer.domElement;
     if (sent !== `${width} ${height}`) { // viser tells the server of a new size before the canvas has it
       sent = `${width} ${height}`;

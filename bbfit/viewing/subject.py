@@ -55,9 +55,9 @@ class Subject:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Width, whichever way the tree is turned, and height in metres."""
+        """Width, the larger one of that along x and that along z, and height in metres."""
         low, high = self.bounds
-        return float(math.hypot(high[0] - low[0], high[2] - low[2])), float(high[1] - low[1])
+        return float(max(high[0] - low[0], high[2] - low[2])), float(high[1] - low[1])
 
     @property
     def middle(self) -> NDArray[np.float64]:

@@ -1,0 +1,348 @@
+"""Every command and every program in README.md and in docs/ is run, in the order of its page, in a folder where the files that it names
+exist as small stand-ins.
+
+``bbfit`` commands are run as they stand, with options added at their end that make pictures, fits and trees small; of an option given
+twice the last one counts. Python programs and scripts are run as they stand, with the functions of bbfit made to work small.
+``scripts/demo`` is run with its installation left out, which is that of ``scripts/test``, the script that runs these tests. ``pip``
+resolves what it is asked for and installs nothing. A command of a kind that is not known here is a failure.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import markdown
+import pytest
+from documented import DOCS, PAGES, ROOT, SITE, blocks, prose
+
+import bbfit
+from bbfit.cli import _COMMANDS, main
+
+TREES = ("tree.glb", "acer.glb", "library/one.glb")
+VIEWS = ("tree", "acer", "quaking_aspen", "weeping_willow")
+SMALL_TREE = {"detail": 0.1, "leaves": 0.02}
+SMALL_VIEWS = {"size": 32, "count": 8, "samples": 1}
+SMALL_FIT = {"steps": 4, "searches": 1, "candidates": 1, "revisions": 0}
+BUDGETS = {"--vertices", "--texels", "--bytes", "--target-psnr", "--auto", "--budget.vertices"}
+"""Options that decide how many billboards there are."""
+# Blocks that are no commands: output and formulas, and what belongs into a page of an engine.
+NOT_RUN = {"text": PAGES, "js": [DOCS / "engines.md"]}
+# Ray leaves sockets to the garbage collector, and warns of its own coming changes.
+pytestmark = [pytest.mark.filterwarnings("ignore::ResourceWarning"), pytest.mark.filterwarnings("ignore::FutureWarning")]
+
+
+def each(pages: list[Path]) -> pytest.MarkDecorator:
+    """A test for each page."""
+    return pytest.mark.parametrize("page", pages, ids=lambda page: page.relative_to(ROOT).as_posix())
+
+
+def with_code(language: str) -> pytest.MarkDecorator:
+    """A test for each page that has code in a language."""
+    return each([page for page in PAGES if any(block.language == language for block in blocks(page))])
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a page's commands are run."""
+
+    folder: Path
+    """The working directory, with the stand-ins."""
+    scratch: Path
+    """For what no command should see."""
+
+
+def options(values: dict[str, Any], stage: str = "") -> list[str]:
+    """Options of the command line, of a stage where that is named."""
+    return [word for name, value in values.items() for word in (f"--{stage}{name}", str(value))]
+
+
+@pytest.fixture(scope="module")
+def stand_ins(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with small trees, views and a run of the names that the pages use. Do not change it."""
+    folder = tmp_path_factory.mktemp("stand-ins")
+    for name in TREES:
+        (folder / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / "data/tree.glb", folder / name)
+    with contextlib.chdir(folder):
+        assert main(["views", "tree.glb", "--out", "views/tree", *options(SMALL_VIEWS)]) == 0
+        for name in VIEWS[1:]:
+            shutil.copytree("views/tree", f"views/{name}")
+        assert main(["fit", "views/tree", "--tree", "tree.glb", "--out", "runs/tree", *options(SMALL_FIT), "--billboards", "2"]) == 0
+    return folder
+
+
+@pytest.fixture
+def place(stand_ins: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
+    """A copy of the stand-ins, in which the test works."""
+    folder = Path(shutil.copytree(stand_ins, tmp_path / "place"))
+    (tmp_path / "scratch").mkdir()
+    monkeypatch.setattr("bbfit.budget.choice.COUNTS", (1, 2))
+    with contextlib.chdir(folder):
+        yield Place(folder, tmp_path / "scratch")
+
+
+def small(words: list[str]) -> list[str]:
+    """The options that make a ``bbfit`` command small."""
+    command, given = words[0], set(words)
+    with_tree = len(words) > 1 and not words[1].startswith("-")
+    stages = [*options(SMALL_VIEWS, "views."), *options(SMALL_FIT, "fit.")]
+    if command == "grow":
+        return [] if "--list" in given else options(SMALL_TREE)
+    if command == "views":
+        return options(SMALL_VIEWS)
+    page = ["--port", "0"] if "--watch" in given else []
+    few = {} if given & (BUDGETS | {"--billboards", "--fit.billboards"}) else {"billboards": 2}
+    if command == "fit":
+        return [*options(SMALL_FIT | few), *page]
+    if command == "run":
+        return [*stages, *options(few, "fit."), *([] if with_tree else options(SMALL_TREE)), *page]
+    if command == "lod":
+        return [*stages, "--planes", "2", "1"]
+    if command == "sweep":
+        one = (
+            ["--fit.billboards", "2"]
+            if "--grid" in given
+            else ["--species", "acer", "--billboards", "2", "--loss", "l2", "--variants", "base"]
+        )
+        grown = [] if "--trees" in given else options(SMALL_TREE)
+        machine = ["--ray", "local"] if "--ray" in given else ["--workers", "1"]
+        return [*stages, *one, *grown, *machine, "--steps", "4"]
+    if command == "compare":  # tests/test_comparison.py has the others
+        some = [] if "--systems" in given else ["--systems", "bbfit", "crossed", "draco"]
+        return [*stages, *some, "--billboards", "2", "--many", "3"]
+    assert command in ("evaluate", "export"), f"how is bbfit {command} made small?"
+    return []
+
+
+def expanded(words: list[str]) -> list[str]:
+    """The words with patterns of file names replaced by the files, as a shell does."""
+    return [name for word in words for name in (sorted(map(str, Path().glob(word))) if "*" in word else [word])]
+
+
+def run_bbfit(words: list[str], place: Place) -> None:
+    """In this process; ``view``, which ends only when it is stopped, and what starts Ray in their own."""
+    if words[0] == "view":
+        return look(words)
+    arguments = expanded([*words, *small(words)])
+    if "--ray" in words:
+        subprocess.run([sys.executable, "-m", "bbfit.cli", *arguments], check=True)
+    else:
+        assert main(arguments) == 0
+    if "--out" in words:
+        assert (out := Path(words[words.index("--out") + 1])).exists()
+        assert words[0] not in ("run", "fit") or (out / "model.glb").is_file()
+
+
+def look(words: list[str]) -> None:
+    """Start ``bbfit view``, load its page, stop it from the keyboard."""
+    command = [sys.executable, "-m", "bbfit.cli", *words, "--port", "0"]
+    at_once = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=at_once) as process:
+        try:
+            assert process.stdout is not None
+            said = ""
+            while not (address := re.search(r"http://127\.0\.0\.1:\d+", said)):
+                line = process.stdout.readline()
+                assert line, f"bbfit view ended: {said}"
+                said += line
+            with urllib.request.urlopen(address[0], timeout=30) as answer:
+                assert b"<html" in answer.read().lower()
+            process.send_signal(signal.SIGINT)
+            rest = process.communicate(timeout=60)[0]
+            assert process.returncode == 0, rest
+        finally:
+            process.kill()
+
+
+def run_pip(words: list[str], place: Place) -> None:
+    """Resolve what is asked for from what is installed here, by the pins, and install nothing: that the package can be built, has the
+    extras, and that pins and requirements agree."""
+    assert words[0] == "install"
+    folder = place.scratch / str(len(list(place.scratch.iterdir())))
+    folder.mkdir()
+    for name in ("setup.cfg", "pyproject.toml", "constraints.txt", "README.md", "LICENSE", "bbfit", "data"):
+        source = ROOT / name
+        shutil.copytree(source, folder / name) if source.is_dir() else shutil.copy(source, folder)
+    command = [sys.executable, "-m", "pip", "install", "--dry-run", "--no-index", "--no-build-isolation", *words[1:]]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "does not provide the extra" not in result.stderr and "Would install bbfit" in result.stdout
+
+
+def run_demo(words: list[str], place: Place) -> None:
+    """The script itself, with a ``.venv`` whose Python installs nothing and whose ``bbfit`` works small."""
+    assert not words
+    shutil.copytree(ROOT / "scripts", place.folder / "scripts")
+    programs = place.folder / ".venv/bin"
+    programs.mkdir(parents=True)
+    python = f'#!/bin/sh\nif [ "$2" = pip ]; then echo "$@" > "{place.scratch}/pip"; exit; fi\nexec "{sys.executable}" "$@"\n'
+    bbfit_program = f'#!/bin/sh\nexec "{sys.executable}" -m bbfit.cli "$@" {" ".join(small(["run"]))}\n'
+    for name, text in {"python": python, "bbfit": bbfit_program}.items():
+        (programs / name).write_text(text)
+        (programs / name).chmod(0o755)
+    said = subprocess.run(["scripts/demo"], cwd=place.folder, check=True, capture_output=True, text=True).stdout
+    assert "Results are in" in said and (place.folder / "runs/demo/comparison.png").is_file()
+    # The installation is the line of scripts/environment.sh by which scripts/test makes the environment of these tests.
+    assert (place.scratch / "pip").read_text().split()[-3:] == ["constraints.txt", "--editable", ".[blender]"]
+
+
+def run_tests(words: list[str], place: Place) -> None:
+    """These tests are what the script runs: continuous integration calls nothing else."""
+    assert not words and re.search(r"^exec bash .*/scripts/test\b", (ROOT / ".ci/run").read_text(), re.MULTILINE)
+    assert re.search(r"^exec .venv/bin/python -m pytest\b", (ROOT / "scripts/test").read_text(), re.MULTILINE)
+
+
+def run_python(words: list[str], place: Place) -> None:
+    """A script of the repository."""
+    path, arguments = ROOT / words[0], words[1:]
+    specification = importlib.util.spec_from_file_location(f"script_{path.stem}", path)
+    assert specification and specification.loader
+    script = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(script)
+    pictures = path.name == "make_pictures.py"
+    if path.name == "benchmark.py" and "placement" not in arguments:
+        arguments = [*arguments, "--quick", "--only", "grow"]
+    with pytest.MonkeyPatch.context() as patch:
+        work_small(patch, 64 if pictures else 32)  # margins of 40 pixels are cut off from the pictures
+        patch.setattr(sys, "argv", [str(path), *arguments])
+        if not pictures:
+            script.main()
+            return
+        patch.setattr(script, "DOCS", place.folder)
+        for name in arguments:
+            getattr(script, name)()
+            assert (place.folder / f"{name}.png").stat().st_size > 0
+
+
+def run_mkdocs(words: list[str], place: Place) -> None:
+    """The command by which tests/test_docs.py builds the site."""
+    assert words == SITE
+
+
+DONE: dict[tuple[str, ...], Path] = {}
+"""Commands that were run before, on another page, and where: with the same stand-ins they would do the same."""
+RUNNERS: dict[str, Callable[[list[str], Place], None]] = {
+    "bbfit": run_bbfit,
+    "pip": run_pip,
+    "scripts/demo": run_demo,
+    "scripts/test": run_tests,
+    "python": run_python,
+    "mkdocs": run_mkdocs,
+}
+
+
+def work_small(patch: pytest.MonkeyPatch, size: int = SMALL_VIEWS["size"]) -> None:
+    """Make the functions that ``bbfit`` offers grow, render and fit little, whatever they are asked for."""
+    views = lambda config: replace(config or bbfit.ViewsConfig(), **SMALL_VIEWS | {"size": size})  # noqa: E731
+    fit = lambda config: replace(config or bbfit.FitConfig(), **SMALL_FIT)  # noqa: E731
+    stages = lambda config: replace(  # noqa: E731
+        config or bbfit.RunConfig(), views=views(config and config.views), fit=fit(config and config.fit)
+    )
+    grown = replace(stages(None), grow=bbfit.GrowConfig(**SMALL_TREE))
+    real = {name: getattr(bbfit, name) for name in ("grow", "render_views", "fit", "choose", "run", "run_sweep", "compare", "build_lod")}
+    few = bbfit.CompareConfig(systems=("bbfit", "draco"), billboards=2)
+    works: dict[str, Callable[..., Any]] = {
+        "grow": lambda species, **given: real["grow"](species, **given | SMALL_TREE),
+        "render_views": lambda tree, out, config=None: real["render_views"](tree, out, views(config)),
+        "fit": lambda data, config=None, **given: real["fit"](data, fit(config), **given),
+        "choose": lambda data, config, budget: real["choose"](data, fit(config), budget),
+        "run": lambda source, out, config=None: real["run"](source, out, stages(config)),
+        "run_sweep": lambda out, config, **given: real["run_sweep"](
+            out, replace(config, billboards=(2,), loss=("l2",), variants=("base",), steps=4, workers=1), grown, **given
+        ),
+        "compare": lambda tree, out: real["compare"](tree, out, few, stages(None)),
+        "build_lod": lambda tree, out, config: real["build_lod"](tree, out, replace(config, planes=(2, 1)), stages(None)),
+    }
+    for name, work in works.items():
+        patch.setattr(bbfit, name, work)
+
+
+@with_code("sh")
+def test_commands_run(page: Path, place: Place) -> None:
+    for block in blocks(page):
+        for words in block.commands if block.language == "sh" else []:
+            assert words[0] in RUNNERS, f"{block}: nobody knows how to run {' '.join(words)}"
+            earlier = DONE.get(tuple(words))
+            if earlier is None:
+                RUNNERS[words[0]](words[1:], place)
+                DONE[tuple(words)] = place.folder
+            elif "--out" in words:  # for the commands that follow
+                out = words[words.index("--out") + 1]
+                copy = shutil.copytree if (earlier / out).is_dir() else shutil.copy
+                if not Path(out).exists():
+                    copy(earlier / out, out)
+
+
+@with_code("python")
+def test_programs_run(page: Path, place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of a page's programs, one after another in one namespace."""
+    shutil.rmtree("views/acer")  # which programs render themselves
+    work_small(monkeypatch)
+    names: dict[str, Any] = {}
+    for block in blocks(page):
+        if block.language == "python":
+            exec(compile(block.text, str(block), "exec"), names)
+
+
+@each(PAGES)
+def test_all_code_is_in_blocks_of_a_kind_that_is_run(page: Path) -> None:
+    """No command hides in an indented block, or in one of another language."""
+    for block in blocks(page):
+        assert block.language in ("sh", "python") or page in NOT_RUN.get(block.language, []), f"{block}: {block.language!r}"
+    html = markdown.markdown(page.read_text(encoding="utf-8"), extensions=["fenced_code", "tables"])
+    assert html.count("<pre>") == len(blocks(page))
+
+
+def said_by(*words: str) -> str:
+    """What a command prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as said, pytest.raises(SystemExit) as ending:
+        main(words)
+    assert ending.value.code in (0, None)
+    return said.getvalue()
+
+
+@pytest.fixture(scope="module")
+def offered() -> set[str]:
+    """Every option of every command."""
+    return {option for command in _COMMANDS for option in re.findall(r"--[a-z][\w.-]*", said_by(command, "--help"))}
+
+
+@each(PAGES)
+def test_options_and_commands_that_are_mentioned_exist(page: Path, offered: set[str]) -> None:
+    text = prose(page)
+    other = {"--help", "--out", "--quick", "--fit...", "--strict"}
+    mentioned = {option.rstrip(".") for option in re.findall(r"(?<![\w-])--[a-z][\w.-]*", text)}
+    assert mentioned - other - offered <= {"--fit", "--views", "--export"}
+    assert {name for name in re.findall(r"`bbfit ([a-z]+)", text)} <= set(_COMMANDS)
+
+
+def test_the_last_of_an_option_given_twice_counts(stand_ins: Path, tmp_path: Path) -> None:
+    """What makes small appendages count."""
+    command = ["fit", str(stand_ins / "views/tree"), "--out", str(tmp_path), "--billboards", "5", "--steps", "3"]
+    assert main([*command, *options(SMALL_FIT), "--billboards", "1", "--placement", "even"]) == 0
+    assert len(bbfit.BillboardCloud.load(tmp_path / "cloud.safetensors")) == 1
+    assert len((tmp_path / "loss.csv").read_text().splitlines()) == 1 + SMALL_FIT["steps"]
+
+
+def test_the_table_of_a_run_s_files_is_complete(place: Place) -> None:
+    """Of a run that grows its tree within a budget; README.md and docs/commands.md have the same files."""
+    assert main(["run", "--out", "all", *small(["run", "--budget.vertices"]), "--budget.vertices", "4"]) == 0
+    made = {f"{path.name}/" if path.is_dir() else path.name for path in Path("all").iterdir()}
+    for page in (ROOT / "README.md", DOCS / "commands.md"):
+        table = page.read_text(encoding="utf-8").split("| file | what |")[1].split("\n\n")[0]
+        told = {name for row in table.splitlines()[2:] for name in re.findall(r"`([^`]+)`", row.split("|")[1])}
+        told |= {f"model{name}" for name in told if name.startswith(".")}
+        assert {name for name in told if not name.startswith(".")} == made
