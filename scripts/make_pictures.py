@@ -1,11 +1,12 @@
-"""Make the pictures in docs/: python scripts/make_pictures.py [species] [acer] (needs Blender)
+"""Make the pictures in docs/: python scripts/make_pictures.py [species] [acer] [pages] (needs Blender; pages Chromium and playwright too)
 
 species.png has one view of every species that bbfit grows; acer.png held-out views of an acer, what the thesis preset makes of them, and
-what the default preset does with as many vertices.
+what the default preset does with as many vertices; report.png and view.png the report of a run and its page in ``bbfit view``.
 """
 
 from __future__ import annotations
 
+import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -76,6 +77,32 @@ def species() -> None:
     figure.savefig(DOCS / "species.png", dpi=100)
 
 
+def pages() -> None:
+    """Draw report.png and view.png: an acer's report and page as a browser shows them."""
+    with tempfile.TemporaryDirectory() as folder:
+        views = bbfit.ViewsConfig(count=60, size=512)
+        config = bbfit.RunConfig(species="acer", grow=bbfit.GrowConfig(seed=2, detail=0.5), views=views, fit=bbfit.FitConfig(billboards=16))
+        draw_pages(bbfit.run(None, Path(folder) / "acer", config).folder)
+
+
+def draw_pages(run: Path) -> None:
+    """Draw report.png and view.png of a run."""
+    from playwright.sync_api import sync_playwright
+
+    flags = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+    with sync_playwright() as driver, bbfit.view(run, port=0) as page:
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=flags)
+        tab = browser.new_page(viewport={"width": 1180, "height": 1330})
+        tab.goto((run / "report.html").resolve().as_uri())
+        tab.screenshot(path=DOCS / "report.png")
+        tab.close()
+        tab = browser.new_page(viewport={"width": 1180, "height": 640})
+        tab.goto(page.url)
+        tab.wait_for_timeout(30_000)  # until what was measured first is shown, and the browser's remark on its software renderer is gone
+        tab.screenshot(path=DOCS / "view.png")
+        browser.close()
+
+
 if __name__ == "__main__":
-    for name in sys.argv[1:] or ["species", "acer"]:
-        {"species": species, "acer": acer}[name]()
+    for name in sys.argv[1:] or ["species", "acer", "pages"]:
+        {"species": species, "acer": acer, "pages": pages}[name]()

@@ -50,6 +50,8 @@ def view_command(
 
     The page is there until Ctrl-C. It needs no network.
 
+    For example: bbfit view runs/tree
+
     Args:
         run: Folder of bbfit run, bbfit fit or bbfit lod.
         host: Address to listen on: this machine alone; whoever reaches it sees the page.

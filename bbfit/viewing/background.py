@@ -38,7 +38,7 @@ class Background:
             self._threads.add(thread)
             thread.start()
 
-    def close(self, seconds: float = 10.0) -> None:
+    def close(self, seconds: float = 60.0) -> None:
         """Begin nothing more, and wait for what is being done, but not longer than some seconds."""
         self._closed.set()
         until = time.monotonic() + seconds

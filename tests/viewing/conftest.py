@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from page_browser import Tab, open_browser, wait_for
+from page_browser import Tab, open_tabs, wait_for
 
 from bbfit.fitting.config import FitConfig
 from bbfit.pipeline import RunConfig, run
@@ -27,7 +27,7 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def browse() -> Iterator[Callable[[str], Tab]]:
     """Opens tabs."""
-    with open_browser() as begin:
+    with open_tabs() as begin:
         yield begin
 
 

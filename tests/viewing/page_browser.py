@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -12,12 +11,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pytest
+from browser import open_browser
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Page
 
-BROWSERS = ("chromium", "google-chrome", "chromium-browser")
-FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox", "--disable-dev-shm-usage"]
 WIDTH, HEIGHT = 900, 360
 # The darkest channel of a pixel of the tree is darker than this, those of the ground's lines are lighter.
 DARK = 140
@@ -78,27 +76,16 @@ class Tab:
 
 
 @contextmanager
-def open_browser() -> Iterator[Callable[[str], Tab]]:
+def open_tabs() -> Iterator[Callable[[str], Tab]]:
     """A browser; what is yielded opens a tab on an address. The test fails where there is no browser."""
-    chromium = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if chromium is None:
-        pytest.fail(f"no browser is installed: install one of {', '.join(BROWSERS)} (apt-get install chromium)")
-    with ThreadPoolExecutor(1) as thread:
-        driver = thread.submit(lambda: sync_playwright().start()).result()
-        try:
-            browser: Browser = thread.submit(lambda: driver.chromium.launch(executable_path=chromium, args=FLAGS)).result()
+    with open_browser() as (browser, thread):
 
-            def begin(url: str) -> Tab:
-                tab = Tab(thread, browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}))
-                tab.open(url)
-                return tab
+        def begin(url: str) -> Tab:
+            tab = Tab(thread, browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}))
+            tab.open(url)
+            return tab
 
-            try:
-                yield lambda url: thread.submit(begin, url).result()
-            finally:
-                thread.submit(browser.close).result()
-        finally:
-            thread.submit(driver.stop).result()
+        yield lambda url: thread.submit(begin, url).result()
 
 
 def wait_for(what: Callable[[], T], seconds: float = 60.0) -> T:

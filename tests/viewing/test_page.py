@@ -40,13 +40,21 @@ def box(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.array(ends)
 
 
+def foot(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Lowest row, and mean column of the lowest eighth, which is trunk alone."""
+    low, high = box(mask)[:2]
+    trunk = mask[high - (high - low) // 8 : high + 1]
+    return np.array([high, np.nonzero(trunk)[1].mean()])
+
+
 def test_both_trees_stand_in_the_same_place_of_their_panes(seen: Seen) -> None:
     """From one camera: what is seen of them coincides, and they have about the same colour."""
     left, right = halves(seen[2].still())
     ours, theirs = coloured(right), coloured(left)
     assert theirs.mean() > 0.02
-    # Measured: a pane is 287 pixels wide, the boxes differ by at most 2 pixels, the silhouettes' IoU is 0.53, the colours differ by 10.
-    assert abs(box(ours) - box(theirs)).max() <= 6
+    # Measured: a pane is 288 pixels wide, the trunks' feet are within a pixel of each other, the silhouettes' IoU is 0.53, the colours
+    # differ by 10. Crowns of four planes do not reach as far as the tree's everywhere.
+    np.testing.assert_allclose(foot(ours), foot(theirs), atol=2)
     assert (ours & theirs).sum() / (ours | theirs).sum() > 0.4
     assert abs(left[theirs].mean(0) - right[ours].mean(0)).max() < 20
 
