@@ -92,13 +92,14 @@ def draw_pages(run: Path) -> None:
     flags = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
     with sync_playwright() as driver, bbfit.view(run, port=0) as page:
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=flags)
-        tab = browser.new_page(viewport={"width": 1180, "height": 1330})
+        tab = browser.new_page(viewport={"width": 1180, "height": 1315})
         tab.goto((run / "report.html").resolve().as_uri())
         tab.screenshot(path=DOCS / "report.png")
         tab.close()
         tab = browser.new_page(viewport={"width": 1180, "height": 640})
         tab.goto(page.url)
-        tab.wait_for_timeout(30_000)  # until what was measured first is shown, and the browser's remark on its software renderer is gone
+        tab.locator(".mantine-Notification-closeButton").click(timeout=60_000)  # viser's remark on a browser without a graphics card
+        tab.wait_for_timeout(20_000)  # until what is measured is there
         tab.screenshot(path=DOCS / "view.png")
         browser.close()
 
