@@ -10,7 +10,7 @@ from bbfit.blender.conversion import converted_once
 from bbfit.blender.meshes import MESH_SUFFIXES
 from bbfit.blender.sources import check_tree
 from bbfit.blender.views_folder import render_views
-from bbfit.checks import check_folder, fail
+from bbfit.checks import fail
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.cards import Cards
 from bbfit.exporting.config import LodConfig
@@ -72,7 +72,7 @@ def build_lod(
     out = Path(out)
     if out.suffix.lower() != ".glb":
         fail("out", f"{out} ends in {out.suffix or 'nothing'}", "levels of detail stand in one .glb file")
-    check_folder("out's folder", out.parent)
+    output_folder("out's folder", out.parent)
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "the levels have their own numbers of them", "leave out billboards and budgets, and say planes")
     files = check_tree(tree)

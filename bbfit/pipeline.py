@@ -13,6 +13,7 @@ from typing import Protocol
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.meshes import MESH_SUFFIXES, tree_mesh
+from bbfit.blender.sources import check_tree
 from bbfit.budget.choice import Choice, Trial, choose, within_bytes
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, check_file, fail
@@ -157,11 +158,14 @@ def _prepare(source: str | Path | None, out: str | Path, config: RunConfig, tell
     source = Path(source)
     if config.species is not None or config.grow != RunConfig().grow:
         fail("run", f"{source} is given, so that no tree is grown", "leave out the species and the options of growing one")
-    if not source.is_dir():
-        check_file("tree", source)
+    # What cannot be used is refused before a folder is made for it.
+    given = ViewDataset.load(source, seed=config.fit.seed) if source.is_dir() else None
+    mesh = source if given is None else tree
+    if mesh is not None:
+        check_tree(mesh)
     record = _record(output_folder("out", out), source, config)
-    if source.is_dir():
-        return record, tree, ViewDataset.load(source, seed=config.fit.seed)
+    if given is not None:
+        return record, tree, given
     views = _render(source, record, config.views, tell)
     readable = source.suffix.lower() in MESH_SUFFIXES  # else only Blender can read it; the views tell enough
     return record, source if readable else None, views
@@ -219,7 +223,7 @@ def _grow(species: Species, record: Record, config: GrowConfig, tell: Progress) 
     inputs = hash_inputs("grow", asdict(species), config.seed, config.detail, config.leaves)
     if not record.stands("grow", inputs):
         earlier = record.stages.get("grow")
-        if earlier is not None and earlier["inputs"] != inputs and (record.folder / "views").exists():
+        if (record.folder / "views").exists() and (earlier["inputs"] != inputs if earlier else not path.exists()):
             fail("out", f"{record.folder} holds the views of another tree", "choose another folder for this one")
         tell("grow", 0, 1)
         begun = time.perf_counter()

@@ -27,6 +27,7 @@ from typing import Any
 import markdown
 import pytest
 from documented import DOCS, PAGES, ROOT, SITE, blocks, prose
+from interrupting import heed_ctrl_c
 
 import bbfit
 from bbfit.cli import _COMMANDS, main
@@ -150,7 +151,9 @@ def look(words: list[str]) -> None:
     """Start ``bbfit view``, load its page, stop it from the keyboard."""
     command = [sys.executable, "-m", "bbfit.cli", *words, "--port", "0"]
     at_once = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=at_once) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=at_once, preexec_fn=heed_ctrl_c
+    ) as process:
         try:
             assert process.stdout is not None
             said = ""

@@ -52,7 +52,7 @@ def run_command(
     with watched(page, out, tree, None, fit) as onlooker:
         with onlooker.progress() as tell:
             result = run(tree, out, config, on_progress=tell, on_step=onlooker.on_step)
-        show(result)
+        show(result, thesis=fit.preset == "thesis")
         show_missed(export)
         onlooker.finish()
 
@@ -149,12 +149,14 @@ def fit_command(
     from bbfit.checks import check_folder
     from bbfit.pipeline import RunConfig, run
 
+    if views.is_file():
+        fail("views", f"{views} is a file", "give a folder of views; bbfit run takes a tree")
     check_folder("views", views)
     stages = RunConfig(tree=tree, fit=config, budget=budget, export=export)
     with watched(page, out, views, tree, config) as onlooker:
         with onlooker.progress() as tell:
             result = run(views, out, stages, on_progress=tell, on_step=onlooker.on_step)
-        show(result)
+        show(result, thesis=config.preset == "thesis")
         show_missed(export)
         onlooker.finish()
 
@@ -201,7 +203,7 @@ def evaluate_command(
         cards = shipped_cards(billboards, export)
         report = with_model(report, shipped, cards, dataset.test, on_size=lambda done, total: tell("sizes", done, total))
     report.save(out)
-    out_console.print(report_table(report))
+    out_console.print(report_table(report, thesis=False))
     out_console.print(f"measures in {out}", soft_wrap=True)
 
 

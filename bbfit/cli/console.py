@@ -18,11 +18,11 @@ err_console = Console(stderr=True)
 """Standard error."""
 
 
-def show(result: RunResult) -> None:
-    """Print a run's score and where its results are."""
+def show(result: RunResult, *, thesis: bool) -> None:
+    """Print a run's score, on the thesis's scale too if asked for, and where its results are."""
     from bbfit.reporting.tables import report_table
 
-    out_console.print(report_table(result.report))
+    out_console.print(report_table(result.report, thesis=thesis))
     if result.skipped:
         out_console.print(f"unchanged, not done again: {', '.join(result.skipped)}", style="dim")
     if result.missed is not None:

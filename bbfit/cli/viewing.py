@@ -31,7 +31,7 @@ class WatchConfig:
     watch: Flag = False
     """Show the fit on a page while it goes on. In a terminal the page stays until Ctrl-C, elsewhere it ends with the run."""
     host: str = "127.0.0.1"
-    """Address that the page listens on: this machine alone; whoever reaches it sees the page."""
+    """Address that the page listens on: 127.0.0.1 is seen by this machine alone, 0.0.0.0 by everybody on the network."""
     port: int = 8080
     """Port of the page; the next free one if it is taken."""
     open: Flag = False
@@ -46,7 +46,7 @@ def view_command(
     open: Flag = False,
     original_bytes: int = 64 << 20,
 ) -> None:
-    """Look at results in the browser: the original and the billboards side by side, levels of detail, fields of up to 10,000 trees.
+    """Look at results in the browser: the original and the billboards side by side, levels of detail, and fields of trees.
 
     The page is there until Ctrl-C. It needs no network.
 
@@ -54,7 +54,7 @@ def view_command(
 
     Args:
         run: Folder of bbfit run, bbfit fit or bbfit lod.
-        host: Address to listen on: this machine alone; whoever reaches it sees the page.
+        host: Address to listen on: 127.0.0.1 is seen by this machine alone, 0.0.0.0 by everybody on the network.
         port: Port to listen on; the next free one if it is taken.
         open: Open the page in this machine's browser.
         original_bytes: Size of the original up to which it is sent to the browser.
@@ -64,7 +64,7 @@ def view_command(
     if original_bytes < 0:
         fail("original_bytes", f"expected at least 0, got {original_bytes}")
     with view(run, host=host, port=port, original_bytes=original_bytes) as page:
-        _announce(page.url, open=open)
+        _announce(page.url, port, open=open)
         if page.notes:
             out_console.print("\n".join(page.notes), style="yellow", soft_wrap=True, highlight=False)
         _stay()
@@ -115,12 +115,13 @@ def watched(config: WatchConfig, out: Path, source: Path | None, tree: Path | No
     alpha = fit.resolve().alpha
     assert alpha is not None
     with Page(host=config.host, port=config.port) as page, contextlib.closing(Watch(page, out, source, tree, alpha)) as watch:
-        _announce(page.url, open=config.open)
+        _announce(page.url, config.port, open=config.open)
         yield Onlooker(watch, page.url)
 
 
-def _announce(url: str, *, open: bool) -> None:
-    out_console.print(f"look at {url}", soft_wrap=True)
+def _announce(url: str, port: int, *, open: bool) -> None:
+    taken = f"port {port} is taken; " if port and not url.endswith(f":{port}") else ""
+    out_console.print(f"{taken}look at {url} (Ctrl-C ends it)", soft_wrap=True)
     if open and not webbrowser.open(url):
         err_console.print("no browser could be opened", style="yellow")
 

@@ -32,7 +32,7 @@ class ExportConfig:
     """How a billboard cloud is written to a model file."""
 
     profile: Profile | None = None
-    """The program that the file is for, which decides what is left out below. Left out: any program."""
+    """The program that the file is for: sets the options below that are not given. Left out: any program."""
     alpha: AlphaKind | None = None
     """What alpha means: mask is drawn where alpha reaches the cutoff, and needs no sorting; blend is smooth, and drawn back to front;
     hash is drawn by chance.
@@ -47,7 +47,7 @@ class ExportConfig:
     """Corners at most, 4 to 8, of a convex outline in place of each rectangle, so that fewer empty pixels are drawn.
     Left out: the rectangle."""
     textures: Textures | None = None
-    """Format of a GLB's texture beside PNG, which every program reads: webp is smaller;
+    """Format of a GLB's texture beside PNG, which every program reads: webp is smaller, once --no-fallback leaves the PNG out;
     ktx2 stays compressed on the graphics card and brings mip levels that keep their coverage (needs the extra ktx2);
     auto is ktx2 where that extra is installed, else PNG alone.
     Left out: PNG, the textures as they were scored."""

@@ -144,7 +144,11 @@ class BillboardCloud:
         """
         from safetensors import SafetensorError, safe_open
 
+        if (inside := Path(path) / "cloud.safetensors").is_file():
+            fail("cloud", f"{path} is a folder", f"give the file {inside}")
         path = check_file("cloud", path)
+        if path.suffix.lower() in (".glb", ".gltf", ".obj"):
+            fail("cloud", f"{path} is a model", "give the cloud.safetensors of its run")
         try:
             with safe_open(path, framework="pt") as file:
                 form = (file.metadata() or {}).get("format", "")

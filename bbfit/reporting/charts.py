@@ -94,9 +94,9 @@ def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
         axes.annotate(
             f"worst: {values[low]:.{2 if name == 'psnr' else 3}f}",
             (angles[low], values[low]),
-            (0, -9 if name != "flip" else 9),
+            (-6 if angles[low] > 270 else 6, -6 if name != "flip" else 6),
             textcoords="offset points",
-            ha="left" if angles[low] < 60 else "right" if angles[low] > 300 else "center",
+            ha="right" if angles[low] > 270 else "left",  # beside the line that marks the view
             va="top" if name != "flip" else "bottom",
             color=_WORST,
         )
@@ -162,7 +162,7 @@ def sizes_chart(sizes: Sequence[SizeScore]) -> Chart:
         panels[1].plot(*zip(*known, strict=True), "o-", color=_ACCENT)
     low, high = panels[1].get_ylim()
     panels[1].set_ylim(min(low, 0.9), max(high, 1.1))
-    panels[1].set_title("covers, of what the tree covers", loc="left", fontsize=10, color=_INK, pad=9)
+    panels[1].set_title("coverage, 1 is as much as the tree's", loc="left", fontsize=10, color=_INK, pad=9)
     panels[1].set_xticks(places, ticks)
     panels[1].set_xlabel("width of the pictures in pixels, and parts of it")
     for axes in panels:

@@ -33,10 +33,11 @@ def species_table(species: Sequence[Species]) -> Table:
     return table
 
 
-def report_table(report: Report, title: str = "Held-out views") -> Table:
+def report_table(report: Report, title: str = "Held-out views", *, thesis: bool = True) -> Table:
     """A ``rich`` table of the mean measures and the costs, at most 100 columns wide.
 
-    An arrow tells which way is better. The thesis scale stands beside the honest ones, for comparison with the thesis's figures only.
+    An arrow tells which way is better. With ``thesis`` the thesis scale stands beside the honest ones, for comparison with the thesis's
+    figures only.
     """
     from rich import box
     from rich.table import Table
@@ -49,13 +50,17 @@ def report_table(report: Report, title: str = "Held-out views") -> Table:
     table.add_column("better", justify="center", style="dim")
     for name in ("over white", "premultiplied RGBA"):
         table.add_column(name, justify="right")
-    table.add_column("thesis scale", justify="right", style="dim")
+    table.add_column("thesis scale" if thesis else "", justify="right", style="dim")
 
-    white, rgba, thesis = mean.over_white, mean.rgba, mean.thesis_scale
-    table.add_row("PSNR, dB", _UP, f"{white.psnr:.2f}", f"{rgba.psnr:.2f}", f"{thesis.psnr:.3f}")
-    table.add_row("RMSE", _DOWN, "", f"{rgba.rmse:.4f}", f"{thesis.rmse:.2e}")
-    table.add_row("SSIM", _UP, f"{white.ssim:.4f}", "", f"{thesis.ssim:.7f}")
-    table.add_row("SRE, dB", _UP, "", "", f"{thesis.sre:.3f}")
+    def cell(text: str) -> str:
+        return text if thesis else ""
+
+    white, rgba, scale = mean.over_white, mean.rgba, mean.thesis_scale
+    table.add_row("PSNR, dB", _UP, f"{white.psnr:.2f}", f"{rgba.psnr:.2f}", cell(f"{scale.psnr:.3f}"))
+    table.add_row("RMSE", _DOWN, "", f"{rgba.rmse:.4f}", cell(f"{scale.rmse:.2e}"))
+    table.add_row("SSIM", _UP, f"{white.ssim:.4f}", "", cell(f"{scale.ssim:.7f}"))
+    if thesis:
+        table.add_row("SRE, dB", _UP, "", "", f"{scale.sre:.3f}")
     table.add_row("FLIP", _DOWN, f"{white.flip:.4f}", "", "")
     table.add_row("silhouette IoU", _UP, "", f"{rgba.iou:.4f}", "")
     table.add_row("sharpness", _ONE, _share(mean.sharpness), "", "")
@@ -64,9 +69,9 @@ def report_table(report: Report, title: str = "Held-out views") -> Table:
     if 1 < len(report.rings) <= _MOST_RINGS:
         table.add_section()
         for ring in report.rings:
-            white, rgba, thesis = ring.measures.over_white, ring.measures.rgba, ring.measures.thesis_scale
+            white, rgba, scale = ring.measures.over_white, ring.measures.rgba, ring.measures.thesis_scale
             name = f"PSNR, dB, at {ring.elevation_degrees:.0f}°"
-            table.add_row(name, _UP, f"{white.psnr:.2f}", f"{rgba.psnr:.2f}", f"{thesis.psnr:.3f}")
+            table.add_row(name, _UP, f"{white.psnr:.2f}", f"{rgba.psnr:.2f}", cell(f"{scale.psnr:.3f}"))
 
     if report.sizes:
         table.add_section()
@@ -79,7 +84,7 @@ def report_table(report: Report, title: str = "Held-out views") -> Table:
     for name, cost in (("vertices", report.vertices), ("file, bytes", report.bytes)):
         table.add_row(name, _DOWN, _count(cost.model), _count(cost.original), _percent(cost))
     if report.overdraw is not None:
-        table.add_row("drawn in vain", _DOWN, f"{100 * report.overdraw:.3g} %", "", "")
+        table.add_row("empty area drawn", _DOWN, f"{100 * report.overdraw:.3g} %", "", "")
     if report.seconds:
         table.caption = "seconds: " + "  ·  ".join(f"{stage} {seconds:,.1f}" for stage, seconds in report.seconds.items())
         table.caption_justify = "left"

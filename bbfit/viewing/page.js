@@ -1,6 +1,7 @@
 // What runs in the page besides viser's own client: it draws the scene once for each pane, with colours as they are in the models,
 // writes the labels over it, and measures how long a frame takes. The server sends the state with `window.bbfit.set`.
 window.bbfit ??= (() => {
+  document.title = "bbfit";
   const state = { mode: "split", near: false, left: [], right: [], status: "" };
   const LEFT = "/original", RIGHT = "/billboards", FIELD = "/field";
   const WHITE = "rgba(255, 255, 255, 0.8)";

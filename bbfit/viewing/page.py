@@ -59,6 +59,7 @@ class Page:
         self._server.gui.main_panel.dock_right()
         scene = self._server.scene
         scene.set_up_direction("+y")
+        scene.world_axes.visible = False
         scene.configure_default_lights(enabled=False)
         scene.configure_environment_map(hdri=None)
         for root in ROOTS.values():

@@ -44,6 +44,7 @@ class Panel:
         self._distance, self._on_distance, self._slid = 1.0, on_distance, 0.0
         self.reach = reach = Reach(0.5 * height, 200 * height)
         # viser's values can be set, though its types do not say so.
+        self.status = gui.add_markdown("")
         self.notes = gui.add_markdown("")
         self.show: Any = gui.add_dropdown("show", (BOTH, ORIGINAL, BILLBOARDS, FIELD), hint="one camera looks at both trees")
         self.outlines: Any = gui.add_checkbox("plane outlines", False)
@@ -111,7 +112,7 @@ class Panel:
             if distance is None:
                 where = "not known: " + ("the fit is not done" if subject.live else "being measured" if subject.views else "no views")
             else:
-                where = f"from {metres(distance)}" if distance else "from 0 m"
+                where = f"may be shown from {metres(distance)} on" if distance else "from 0 m on"
             lines.append(f"- {'**' if index == chosen else ''}{level.name}{'**' if index == chosen else ''}: {where}")
         self.readout.content = "\n".join([lines[0], "", *lines[1:]])
 

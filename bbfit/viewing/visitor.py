@@ -59,6 +59,8 @@ class Visitor:
         self.panel: Panel
         """Its controls, there once something is shown."""
         client.camera.on_update(lambda _: self.follow())
+        self._waiting: viser.GuiMarkdownHandle | None = client.gui.add_markdown("Waiting for the first billboards …")
+        send(client, {"mode": "billboards", "right": ["waiting for the first billboards"]}, 0)
 
     def show(self, subject: Subject, models: Models) -> None:
         """Show another subject, or another state of the same."""
@@ -69,8 +71,11 @@ class Visitor:
             start = self._subject is None
             self._subject, self._models = subject, models
             if start:
+                if self._waiting is not None:
+                    self._waiting.remove()
                 self.panel = Panel(self.client.gui, subject.size[1], on_change=self.apply, on_distance=self.go, on_plant=self.sow)
             self.panel.fit(subject, first=first)
+            self.panel.status.content = self._status
             if start:
                 self.look_at_tree()
             self.apply()
@@ -79,8 +84,13 @@ class Visitor:
         """Say something about work in progress, as of the fit."""
         with self._lock:
             self._status = status
-            if not self._gone:
-                self._send(self.client, {"status": status}, 0)
+            if self._gone:
+                return
+            self._send(self.client, {"status": status}, 0)
+            if self._subject is not None:
+                self.panel.status.content = status
+            elif self._waiting is not None:
+                self._waiting.content = f"Waiting for the first billboards. {status}"
 
     def leave(self) -> None:
         """Do nothing more: the browser is gone."""

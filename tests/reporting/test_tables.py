@@ -37,6 +37,15 @@ def test_every_figure_is_there_and_nothing_is_cut(width: int) -> None:
     assert rows["brightness"].rstrip().endswith("-") and "None" not in text
 
 
+def test_the_thesis_scale_may_be_left_out() -> None:
+    console = Console(width=100)
+    with console.capture() as capture:
+        console.print(report_table(REPORT, thesis=False))
+    text = capture.get()
+    assert "21.23" in text and "0.000304 %" in text
+    assert not [gone for gone in ("thesis", "92.605", "2.24e-05", "0.9999966", "SRE") if gone in text]
+
+
 def test_one_view() -> None:
     assert report_table(Report(REPORT.views[:1])).title == "Held-out views: one view"
 

@@ -10,6 +10,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+from interrupting import heed_ctrl_c
 
 from bbfit.cli import main
 
@@ -18,9 +19,10 @@ BBFIT = [sys.executable, "-W", "error", "-m", "bbfit.cli"]
 
 
 def test_view_says_where_it_is_and_ends_by_ctrl_c(small_run: Path) -> None:
-    process = subprocess.Popen([*BBFIT, "view", str(small_run), "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen([*BBFIT, "view", str(small_run), "--port", "0"], **pipes, text=True, preexec_fn=heed_ctrl_c)
     assert process.stdout is not None
-    found = re.fullmatch(r"look at (http://127\.0\.0\.1:\d+)\n", process.stdout.readline())
+    found = re.fullmatch(r"look at (http://127\.0\.0\.1:\d+) \(Ctrl-C ends it\)\n", process.stdout.readline())
     try:
         assert found is not None
         with urllib.request.urlopen(found[1], timeout=30) as answer:

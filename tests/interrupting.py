@@ -1,0 +1,11 @@
+"""Stopping a process from the keyboard."""
+
+from __future__ import annotations
+
+import signal
+
+
+def heed_ctrl_c() -> None:
+    """For ``subprocess``'s ``preexec_fn``: a process that a shell starts in the background, as these tests may be, ignores Ctrl-C, and so
+    would its children."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
