@@ -160,8 +160,7 @@ def _prepare(source: str | Path | None, out: str | Path, config: RunConfig, tell
         fail("run", f"{source} is given, so that no tree is grown", "leave out the species and the options of growing one")
     # What cannot be used is refused before a folder is made for it.
     given = ViewDataset.load(source, seed=config.fit.seed) if source.is_dir() else None
-    mesh = source if given is None else tree
-    if mesh is not None:
+    if mesh := source if given is None else tree:
         check_tree(mesh)
     record = _record(output_folder("out", out), source, config)
     if given is not None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import threading
+import signal
+import time
 import webbrowser
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -64,10 +65,11 @@ def view_command(
     if original_bytes < 0:
         fail("original_bytes", f"expected at least 0, got {original_bytes}")
     with view(run, host=host, port=port, original_bytes=original_bytes) as page:
-        _announce(page.url, port, open=open)
-        if page.notes:
-            out_console.print("\n".join(page.notes), style="yellow", soft_wrap=True, highlight=False)
-        _stay()
+        with _until_ctrl_c() as stay:
+            _announce(page.url, port, " (Ctrl-C ends it)", open=open)
+            if page.notes:
+                out_console.print("\n".join(page.notes), style="yellow", soft_wrap=True, highlight=False)
+            stay()
 
 
 class Onlooker:
@@ -99,8 +101,9 @@ class Onlooker:
             return
         self._watch.finish()
         if err_console.is_terminal:
-            out_console.print(f"the page stays at {self._url} until Ctrl-C", soft_wrap=True)
-            _stay()
+            with _until_ctrl_c() as stay:
+                out_console.print(f"the page stays at {self._url} until Ctrl-C", soft_wrap=True)
+                stay()
 
 
 @contextlib.contextmanager
@@ -119,14 +122,27 @@ def watched(config: WatchConfig, out: Path, source: Path | None, tree: Path | No
         yield Onlooker(watch, page.url)
 
 
-def _announce(url: str, port: int, *, open: bool) -> None:
+def _announce(url: str, port: int, ending: str = "", *, open: bool) -> None:
     taken = f"port {port} is taken; " if port and not url.endswith(f":{port}") else ""
-    out_console.print(f"{taken}look at {url} (Ctrl-C ends it)", soft_wrap=True)
+    out_console.print(f"{taken}look at {url}{ending}", soft_wrap=True)
     if open and not webbrowser.open(url):
         err_console.print("no browser could be opened", style="yellow")
 
 
-def _stay() -> None:
-    """Wait for Ctrl-C, which here is no failure."""
-    with contextlib.suppress(KeyboardInterrupt):
-        threading.Event().wait()
+@contextlib.contextmanager
+def _until_ctrl_c() -> Iterator[Callable[[], None]]:
+    """A function that waits for Ctrl-C, which here is no failure; one pressed before it is called counts.
+
+    A handler notes it, since an exception can be lost where none may leave, such as in what a collected object does last.
+    """
+    pressed = list[int]()
+    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+
+    def stay() -> None:
+        while not pressed:
+            time.sleep(0.1)
+
+    try:
+        yield stay
+    finally:
+        signal.signal(signal.SIGINT, before)

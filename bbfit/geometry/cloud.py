@@ -144,7 +144,7 @@ class BillboardCloud:
         """
         from safetensors import SafetensorError, safe_open
 
-        if (inside := Path(path) / "cloud.safetensors").is_file():
+        if (inside := Path(path) / "cloud.safetensors").is_file():  # a run's folder
             fail("cloud", f"{path} is a folder", f"give the file {inside}")
         path = check_file("cloud", path)
         if path.suffix.lower() in (".glb", ".gltf", ".obj"):

@@ -255,5 +255,10 @@ def test_unusable_files_are_refused_by_name(tmp_path: Path) -> None:
         save_file(tensors, path, metadata)
         with pytest.raises(InputError, match=r"cloud\.safetensors.*bbfit fit"):
             BillboardCloud.load(path)
-    with pytest.raises(InputError, match="not a file"):
+    with pytest.raises(InputError, match=r"is a folder; give the file .*cloud\.safetensors"):
         BillboardCloud.load(tmp_path)
+    with pytest.raises(InputError, match="not a file"):
+        BillboardCloud.load(tmp_path.parent)
+    (tmp_path / "model.glb").write_bytes(b"glTF")
+    with pytest.raises(InputError, match="is a model; give the cloud"):
+        BillboardCloud.load(tmp_path / "model.glb")
