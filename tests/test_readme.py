@@ -28,6 +28,7 @@ import markdown
 import pytest
 from documented import DOCS, PAGES, ROOT, SITE, blocks, prose
 from interrupting import heed_ctrl_c
+from one_at_a_time import one_at_a_time
 
 import bbfit
 from bbfit.cli import _COMMANDS, main
@@ -139,7 +140,8 @@ def run_bbfit(words: list[str], place: Place) -> None:
         return look(words)
     arguments = expanded([*words, *small(words)])
     if "--ray" in words:
-        subprocess.run([sys.executable, "-m", "bbfit.cli", *arguments], check=True)
+        with one_at_a_time("ray"):
+            subprocess.run([sys.executable, "-m", "bbfit.cli", *arguments], check=True)
     else:
         assert main(arguments) == 0
     if "--out" in words:

@@ -11,6 +11,7 @@ import pytest
 import ray
 import sweep_works
 from billboard_scene import crossing_billboards, write_views
+from one_at_a_time import one_at_a_time
 from ray.cluster_utils import Cluster
 
 from bbfit.blender.config import ViewsConfig
@@ -31,7 +32,7 @@ pytestmark = [pytest.mark.filterwarnings("ignore::ResourceWarning"), pytest.mark
 @pytest.fixture(scope="module")
 def head() -> Iterator[Cluster]:
     """A node with one core."""
-    with pytest.MonkeyPatch.context() as patch:
+    with one_at_a_time("ray"), pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(Path(__file__).parent))  # so that nodes can import the work of these tests
         made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
         yield made
