@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import socket
+import time
 from collections.abc import Callable, Iterator
 from urllib.parse import urlparse
 
@@ -137,8 +138,14 @@ def test_slider_and_camera_follow_each_other(seen: Seen) -> None:
     assert visitor.distance == pytest.approx(visitor.panel.reach.distance(120), rel=1e-6)
     assert visitor.panel.metres.value == pytest.approx(visitor.distance, rel=1e-3)
     far = visitor.panel.metres.value
-    tab.do(lambda page: (page.mouse.move(150, 200), page.mouse.wheel(0, -600)))  # towards the tree
-    wait_for(lambda: visitor.panel.metres.value < 0.9 * far)
+    tab.still()  # the browser's camera is there
+
+    def nearer() -> bool:
+        tab.do(lambda page: (page.mouse.move(150, 200), page.mouse.wheel(0, -600)))  # towards the tree
+        time.sleep(0.5)
+        return visitor.panel.metres.value < 0.9 * far
+
+    wait_for(nearer)
     wait_for(lambda: visitor.panel.slider.value == visitor.panel.reach.step(visitor.distance))
 
 
