@@ -25,7 +25,7 @@ from bbfit.exporting.lod import glb_counts
 from bbfit.exporting.model import as_shipped, shipped_cards
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
-from bbfit.fitting.initialize import pixels_a_metre
+from bbfit.fitting.initialize import pixels_a_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, read_rgba, to_bytes, unpremultiply, write_png
 from bbfit.pipeline import Progress, RunConfig, original_tree, run
@@ -136,7 +136,7 @@ class _Comparison:
     ) -> None:
         self._files, self._views, self._folder, self._config, self._stages, self._tell = files, views, folder, config, stages, tell
         self._hash = [fingerprint(files), views.fingerprint]
-        self._bake = BakeConfig(float(pixels_a_metre(views.train.cameras)), views=stages.views)
+        self._bake = BakeConfig(float(pixels_a_meter(views.train.cameras)), views=stages.views)
         self._size: int | None = None
         count, many, crossed = config.billboards, config.many, config.crossed
         self._systems: dict[str, tuple[str, Callable[[Path], _Made]]] = {

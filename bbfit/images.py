@@ -75,22 +75,22 @@ def premultiply(straight: Tensor) -> Tensor:
 def unpremultiply(premultiplied: Tensor) -> Tensor:
     """Premultiplied to straight alpha, [..., 4]; black where nothing is."""
     alpha = premultiplied[..., 3:]
-    colour = torch.where(alpha > 0, premultiplied[..., :3] / alpha.clamp_min(1e-12), 0.0)
-    return torch.cat([colour.clamp(0, 1), alpha], -1)
+    color = torch.where(alpha > 0, premultiplied[..., :3] / alpha.clamp_min(1e-12), 0.0)
+    return torch.cat([color.clamp(0, 1), alpha], -1)
 
 
-def over_colour(premultiplied: Tensor, colour: float | Tensor = 1.0) -> Tensor:
+def over_color(premultiplied: Tensor, color: float | Tensor = 1.0) -> Tensor:
     """Composite premultiplied RGBA over an opaque background, [..., 4] -> [..., 3]."""
     check_shape("image", (premultiplied.shape[-1],), (4,))
-    return premultiplied[..., :3] + (1 - premultiplied[..., 3:]) * colour
+    return premultiplied[..., :3] + (1 - premultiplied[..., 3:]) * color
 
 
-def bleed_colour(texture: Tensor) -> Tensor:
-    """Give every transparent texel the colour of the nearest opaque one.
+def bleed_color(texture: Tensor) -> Tensor:
+    """Give every transparent texel the color of the nearest opaque one.
 
-    Filtering straight alpha shows the colour of transparent texels: next to visible ones in bilinear filtering, everywhere in mip
+    Filtering straight alpha shows the color of transparent texels: next to visible ones in bilinear filtering, everywhere in mip
     levels. Transparent is what rounds to alpha 0 in 8 bits, and it becomes exactly 0. As opaque counts at least half of the texture's
-    largest alpha: fainter texels often have a colour that no view determined. The nearest is found by the exact Euclidean distance
+    largest alpha: fainter texels often have a color that no view determined. The nearest is found by the exact Euclidean distance
     transform (Felzenszwalb and Huttenlocher 2012).
 
     Parameters

@@ -44,7 +44,7 @@ def write_transforms(folder: Path, camera: Camera, image_paths: list[str], train
     """Write both transforms files for a batch of cameras.
 
     ``image_paths`` are relative to ``folder`` and end in ``.png``. Orthographic cameras, which the layout does not know, are marked
-    with ``camera_model = "ORTHOGRAPHIC"`` and ``orthographic_extent_x`` in metres, as well as intrinsics in pixels per metre.
+    with ``camera_model = "ORTHOGRAPHIC"`` and ``orthographic_extent_x`` in meters, as well as intrinsics in pixels per meter.
     """
     matrices = camera_to_nerf(camera.world_to_camera.double())
     k = camera.intrinsics[0].double()
@@ -147,10 +147,10 @@ def _intrinsics(frame: Frame, width: int, height: int) -> torch.Tensor:
             scale_x, scale_y = width / float(header.get("w", width)), height / float(header.get("h", height))
             focal_x = float(header["fl_x"])
             focal_y = float(header.get("fl_y", focal_x))
-            centre_x = float(header.get("cx", float(header.get("w", width)) / 2))
-            centre_y = float(header.get("cy", float(header.get("h", height)) / 2))
+            center_x = float(header.get("cx", float(header.get("w", width)) / 2))
+            center_y = float(header.get("cy", float(header.get("h", height)) / 2))
             intrinsics = torch.tensor(
-                [[focal_x * scale_x, 0, centre_x * scale_x - 0.5], [0, focal_y * scale_y, centre_y * scale_y - 0.5], [0, 0, 1]],
+                [[focal_x * scale_x, 0, center_x * scale_x - 0.5], [0, focal_y * scale_y, center_y * scale_y - 0.5], [0, 0, 1]],
                 dtype=torch.float64,
             )
         else:

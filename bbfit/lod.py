@@ -18,7 +18,7 @@ from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.lod import LodLevel, glb_counts, lod_glb, stands_alone
 from bbfit.exporting.model import shipped_cards
 from bbfit.files import output_folder, write_bytes, write_json
-from bbfit.fitting.initialize import pixels_a_metre
+from bbfit.fitting.initialize import pixels_a_meter
 from bbfit.pipeline import Progress, RunConfig, RunResult, export_config, run
 from bbfit.reporting.plots import lod_picture
 from bbfit.views import ViewDataset
@@ -48,7 +48,7 @@ def build_lod(
     """Render a tree, fit billboard clouds of several sizes, and write them and the tree as levels of detail in one GLB.
 
     Each level takes over at the distance from which on its error stays below ``config.error_pixels``. The error is that of its silhouette,
-    in metres at the tree's axis, by the training view in which it is largest, and a margin for views between those; it shrinks with
+    in meters at the tree's axis, by the training view in which it is largest, and a margin for views between those; it shrinks with
     distance as everything does. No level is shown larger than the views that it was fitted to. Its textures are as fine as the screen can
     show from there. Where the exports' format of textures is left open it is auto: KTX2 with mip levels if its encoder is there, and PNG.
 
@@ -109,9 +109,9 @@ class _Place:
     """Where a level takes over."""
 
     scale: float
-    """Pixels a metre on the screen below which it is shown; infinity for the finest level."""
+    """Pixels a meter on the screen below which it is shown; infinity for the finest level."""
     error: float
-    """Metres by which its silhouette is off in the worst training view."""
+    """Meters by which its silhouette is off in the worst training view."""
     unseen: float
     """The same in the worst held-out view."""
     halvings: int
@@ -144,7 +144,7 @@ def _original(files: list[Path], folder: Path, config: LodConfig, tell: Progress
 
 def _places(views: ViewDataset, runs: list[RunResult], config: LodConfig) -> list[_Place]:
     """Where billboard clouds take over; the first from the start if it is the finest level."""
-    view_scale = float(pixels_a_metre(views.train.cameras))
+    view_scale = float(pixels_a_meter(views.train.cameras))
     places = list[_Place]()
     for fitted in runs:
         error, unseen = (worst_silhouette(fitted.cloud, split) / view_scale for split in (views.train, views.test))
@@ -159,7 +159,7 @@ def _levels(
     views: ViewDataset, models: list[bytes], fits: list[RunResult | None], places: list[_Place], config: LodConfig, name: str
 ) -> tuple[LodLevel, ...]:
     """What is known of the levels."""
-    view_scale = float(pixels_a_metre(views.train.cameras))
+    view_scale = float(pixels_a_meter(views.train.cameras))
     low, high = views.request["tree"]["bounds"]
     height, radius = high[1] - low[1], math.dist(low, high) / 2
     focal = config.screen_height / 2 / math.tan(math.radians(config.screen_fov_degrees) / 2)
@@ -175,12 +175,12 @@ def _levels(
                 vertices=vertices,
                 triangles=triangles,
                 bytes=len(model),
-                error_metres=place.error,
+                error_meters=place.error,
                 error_pixels=place.error * shown,
                 held_out_error_pixels=place.unseen * shown,
                 psnr=None if fitted is None else fitted.report.mean.over_white.psnr,
                 tree_pixels=None if math.isinf(place.scale) else height * place.scale,
-                distance_metres=focal / place.scale,
+                distance_meters=focal / place.scale,
                 screen_coverage=min(1.0, math.pi * (radius * least) ** 2 / (config.screen_width * config.screen_height)),
             )
         )

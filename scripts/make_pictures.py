@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import bbfit
-from bbfit.images import over_colour
+from bbfit.images import over_color
 from bbfit.trees.species import known_species
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -31,7 +31,7 @@ def picture(name: str, folder: Path) -> np.ndarray:
     bbfit.write_tree(bbfit.grow(name, seed=SEED, leaves=LEAVES.get(name, 1.0)), tree)
     bbfit.render_views(tree, folder / name, bbfit.ViewsConfig(count=2, size=SIZE, samples=64))
     views = bbfit.ViewDataset.load(folder / name)
-    return over_colour(views.train.targets([0])[0], 1.0).numpy()
+    return over_color(views.train.targets([0])[0], 1.0).numpy()
 
 
 def acer() -> None:
@@ -57,7 +57,7 @@ def draw_acer(views: bbfit.ViewDataset, thesis: bbfit.BillboardCloud, default: b
         column[0].set_title(title, fontsize=10)
         for axis, index in zip(column, (0, len(views.test) // 3), strict=True):
             image = views.test.targets([index])[0] if cloud is None else bbfit.render(cloud, views.test.cameras[index])
-            axis.imshow(over_colour(image.clamp(0, 1), 1.0).numpy()[40:472, 40:472])
+            axis.imshow(over_color(image.clamp(0, 1), 1.0).numpy()[40:472, 40:472])
             axis.axis("off")
     figure.tight_layout()
     figure.savefig(DOCS / "acer.png", dpi=100)

@@ -15,7 +15,7 @@ from bbfit.views import ViewDataset
 
 
 def crossing_billboards(count: int = 2) -> BillboardCloud:
-    """Upright billboards of 2 x 3 metres with blotches of random colour and alpha, float32."""
+    """Upright billboards of 2 x 3 meters with blotches of random color and alpha, float32."""
     cloud = even_upright(
         count,
         axis=torch.tensor([0.0, 1.5, 0.0]),

@@ -30,12 +30,12 @@ def shared() -> Path:
 def smooth_texture(height: int, width: int, seed: int) -> torch.Tensor:
     """A smooth straight-alpha texture that is opaque in the middle and fades to nothing, [h, w, 4]."""
     generator = torch.Generator().manual_seed(seed)
-    colour = torch.nn.functional.interpolate(
+    color = torch.nn.functional.interpolate(
         torch.rand(1, 3, 4, 4, generator=generator), (height, width), mode="bicubic", align_corners=True
     )
     y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
     alpha = (1.6 * (1 - (x**2 + y**2).sqrt() / 0.8)).clamp(0, 1)
-    return torch.cat([colour[0].permute(1, 2, 0).clamp(0, 1), alpha[..., None]], -1)
+    return torch.cat([color[0].permute(1, 2, 0).clamp(0, 1), alpha[..., None]], -1)
 
 
 def write_views(folder: Path, cloud: BillboardCloud, camera: Camera, *, seed: int = 0) -> Path:

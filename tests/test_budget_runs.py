@@ -89,7 +89,7 @@ def test_the_record_holds_the_fit_that_was_chosen(done: RunResult) -> None:
     assert {name: fitted[name] for name in ("billboards", "sides", "placement", "max_texels")} == {
         name: getattr(chosen, name) for name in ("billboards", "sides", "placement", "max_texels")
     }
-    assert fitted == dataclasses.asdict(FitConfig(**fitted).resolve()) and fitted["steps"] == 6 and fitted["searches"] == 1
+    assert fitted == dataclasses.asdict(FitConfig(**fitted).resolve()) and fitted["steps"] == 6 and fitted["restarts"] == 1
     assert record["config"]["budget"] == dataclasses.asdict(CONFIG.budget)
     assert tuple(record["stages"]) == STAGES
     assert done.cloud.vertex_count == chosen.vertices <= 8

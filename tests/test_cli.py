@@ -22,7 +22,7 @@ from bbfit.images import write_png
 from bbfit.trees.species import figures_file, known_species
 
 DATA = Path(__file__).resolve().parents[1] / "data"
-QUICK = ["--billboards", "2", "--candidates", "2", "--revisions", "0", "--steps", "3"]
+QUICK = ["--billboards", "2", "--candidates", "2", "--refinement-rounds", "0", "--steps", "3"]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_help_shows_defaults_and_needs_no_torch(command: list[str]) -> None:
 
 
 def test_fit_writes_what_run_writes_for_the_same_views(views_folder: Path, fitted: Path, tmp_path: Path) -> None:
-    nested = ["--fit.billboards", "2", "--fit.candidates", "2", "--fit.revisions", "0", "--fit.steps", "3"]
+    nested = ["--fit.billboards", "2", "--fit.candidates", "2", "--fit.refinement-rounds", "0", "--fit.steps", "3"]
     assert main(["run", str(views_folder), "--out", str(tmp_path), *nested]) == 0
     for name in ("cloud.safetensors", "model.glb", "model.obj"):
         assert (tmp_path / name).read_bytes() == (fitted / name).read_bytes()
@@ -230,7 +230,7 @@ def test_a_budget_that_cannot_be_kept_is_exit_code_2(
     ("options", "says"),
     [
         (["--max-texels", "1"], "max_texels: 1 are too few for 2 textures"),
-        (["--searches", "0"], "searches: expected at least 1, got 0"),
+        (["--restarts", "0"], "restarts: expected at least 1, got 0"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -304,7 +304,7 @@ def test_sweep_shows_its_runs_and_what_failed(views_folder: Path, tmp_path: Path
         "2",
         "--fit.candidates",
         "1",
-        "--fit.revisions",
+        "--fit.refinement-rounds",
         "0",
     ]
     command = ["sweep", "--out", str(tmp_path / "out"), "--views", str(views_folder), "--trees", str(bad), *options]
@@ -395,7 +395,7 @@ def test_a_disk_that_fills_up_leaves_the_earlier_model(fitted: Path, tmp_path: P
 def test_a_run_killed_outright_goes_on(views_folder: Path, tmp_path: Path) -> None:
     """SIGKILL in the middle of the fit; the same command ends with the result of an unbroken run."""
     script = "import sys; from bbfit.cli import main; sys.exit(main(sys.argv[1:]))"
-    options = ["--billboards", "2", "--candidates", "2", "--revisions", "0", "--steps", "120", "--checkpoint-every", "10"]
+    options = ["--billboards", "2", "--candidates", "2", "--refinement-rounds", "0", "--steps", "120", "--checkpoint-every", "10"]
     command = [sys.executable, "-c", script, "fit", str(views_folder), *options, "--out"]
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}  # as this process, so that the results are equal to the bit
     process = subprocess.Popen([*command, str(tmp_path / "broken")], stderr=subprocess.DEVNULL, env=one_thread)

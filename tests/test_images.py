@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bbfit.checks import InputError, MissingFileError
-from bbfit.images import encode_png, over_colour, premultiply, read_rgba, to_bytes, unpremultiply, write_png
+from bbfit.images import encode_png, over_color, premultiply, read_rgba, to_bytes, unpremultiply, write_png
 
 
 def noise(channels: int = 4) -> NDArray[np.uint8]:
@@ -23,7 +23,7 @@ def noise(channels: int = 4) -> NDArray[np.uint8]:
 
 def test_png_round_trip_keeps_every_byte(tmp_path: Path) -> None:
     image = noise()
-    image[:4, :, 3] = 0  # colour under full transparency stays as well
+    image[:4, :, 3] = 0  # color under full transparency stays as well
     write_png(tmp_path / "a.png", image)
     assert np.array_equal(read_rgba(tmp_path / "a.png"), image)
     with Image.open(tmp_path / "a.png") as other:  # a second reader: channels in order, alpha straight
@@ -43,9 +43,9 @@ def test_other_writers_pictures_are_read(tmp_path: Path) -> None:
     Image.fromarray(image).save(tmp_path / "a.webp", lossless=True, exact=True)
     assert np.array_equal(read_rgba(tmp_path / "a.webp"), image)
 
-    grey = np.ascontiguousarray(image[..., [0, 3]])
-    Image.fromarray(grey).save(tmp_path / "grey.png")
-    assert np.array_equal(read_rgba(tmp_path / "grey.png"), grey[..., [0, 0, 0, 1]])
+    gray = np.ascontiguousarray(image[..., [0, 3]])
+    Image.fromarray(gray).save(tmp_path / "gray.png")
+    assert np.array_equal(read_rgba(tmp_path / "gray.png"), gray[..., [0, 0, 0, 1]])
 
     paletted = Image.fromarray(image).quantize(32)
     paletted.save(tmp_path / "palette.png")
@@ -118,8 +118,8 @@ def test_nothing_is_black_and_has_finite_gradients() -> None:
 
 def test_over_a_background() -> None:
     image = torch.tensor([[0.25, 0, 0.5, 0.5], [0, 0, 0, 0], [0.1, 0.2, 0.3, 1]])
-    assert torch.allclose(over_colour(image), torch.tensor([[0.75, 0.5, 1], [1, 1, 1], [0.1, 0.2, 0.3]]))
-    assert torch.equal(over_colour(image, 0.0), image[:, :3])
-    assert over_colour(image, torch.tensor([1.0, 0, 0]))[1].tolist() == [1, 0, 0]
+    assert torch.allclose(over_color(image), torch.tensor([[0.75, 0.5, 1], [1, 1, 1], [0.1, 0.2, 0.3]]))
+    assert torch.equal(over_color(image, 0.0), image[:, :3])
+    assert over_color(image, torch.tensor([1.0, 0, 0]))[1].tolist() == [1, 0, 0]
     with pytest.raises(InputError, match="shape"):
-        over_colour(image[:, :3])
+        over_color(image[:, :3])

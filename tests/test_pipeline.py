@@ -20,7 +20,7 @@ from bbfit.images import read_rgba
 from bbfit.pipeline import RunConfig, RunResult, run
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
-CONFIG = RunConfig(fit=FitConfig(billboards=2, candidates=2, revisions=0, steps=20, checkpoint_every=5))
+CONFIG = RunConfig(fit=FitConfig(billboards=2, candidates=2, refinement_rounds=0, steps=20, checkpoint_every=5))
 FILES = ("cloud.safetensors", "comparison.png", "loss.csv", "loss.png", "metrics.json", "report.html", "run.json")
 MODELS = ("model.glb", "model.mtl", "model.obj", "model.png")
 
@@ -143,7 +143,7 @@ def test_from_a_tree_to_a_model(tmp_path: Path) -> None:
     """The whole job with Blender, on the tree that comes with bbfit; a second run does nothing."""
     config = RunConfig(
         views=ViewsConfig(count=8, size=48, samples=2, denoise=False),
-        fit=FitConfig(billboards=2, placement="even", placement_rate=0, steps=10),
+        fit=FitConfig(billboards=2, placement="even", placement_learning_rate=0, steps=10),
     )
     told = []
     run(TREE, tmp_path, config, on_progress=lambda stage, done, total, note="": told.append((stage, done, total)))

@@ -37,7 +37,7 @@ TREES = ("tree.glb", "acer.glb", "library/one.glb")
 VIEWS = ("tree", "acer", "quaking_aspen", "weeping_willow")
 SMALL_TREE = {"detail": 0.1, "leaves": 0.02}
 SMALL_VIEWS = {"size": 32, "count": 8, "samples": 1}
-SMALL_FIT = {"steps": 4, "searches": 1, "candidates": 1, "revisions": 0}
+SMALL_FIT = {"steps": 4, "restarts": 1, "candidates": 1, "refinement_rounds": 0}
 BUDGETS = {"--vertices", "--texels", "--bytes", "--target-psnr", "--auto", "--budget.vertices"}
 """Options that decide how many billboards there are."""
 # Blocks that are no commands: output and formulas, and what belongs into a page of an engine.

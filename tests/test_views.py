@@ -45,7 +45,7 @@ def test_cameras_and_pictures_survive_the_disk(views_folder: Path, known_cloud: 
         torch.testing.assert_close(split.cameras.intrinsics, ring.intrinsics[numbers], atol=1e-9, rtol=0)
         assert split.images([0]).dtype == torch.uint8
         image = render_reference(known_cloud, split.cameras)
-        # Straight colour and alpha are rounded to bytes: each is off by half a step, and so their product by at most one.
+        # Straight color and alpha are rounded to bytes: each is off by half a step, and so their product by at most one.
         assert (split.targets(range(len(split))) - image).abs().max() < 1 / 255
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 from bbfit.checks import InputTypeError, check_choice, check_count, check_range, fail
 
 Device = Literal["cpu", "cuda", "optix", "hip", "oneapi", "metal"]
-Axis = Literal["auto", "origin", "centre"]
+Axis = Literal["auto", "origin", "center"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ViewsConfig:
     denoise: bool = True
     """Clean the pictures with Open Image Denoise; takes about half of the time, and lets a few samples look like hundreds."""
     sun_strength: float = 2.5
-    """Strength of the sun in watts a square metre; 0 leaves only the ambient light."""
+    """Strength of the sun in watts a square meter; 0 leaves only the ambient light."""
     sun_azimuth: float = 30.0
     """Direction of the sun in degrees: 0 is behind the first view's camera, growing counter-clockwise seen from above, as views do."""
     sun_elevation: float = 45.0
@@ -47,8 +47,8 @@ class ViewsConfig:
     seed: int = 0
     """Another seed gives other noise, and holds out other views."""
     axis: Axis = "auto"
-    """Vertical line that the cameras circle: through the file's origin, or through the centre of the tree's bounding box.
-    Auto takes the origin where it lies inside the bounding box seen from above, as where the trunk stands on it, else the centre."""
+    """Vertical line that the cameras circle: through the file's origin, or through the center of the tree's bounding box.
+    Auto takes the origin where it lies inside the bounding box seen from above, as where the trunk stands on it, else the center."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.elevations, tuple | list) or not self.elevations:
@@ -69,4 +69,4 @@ class ViewsConfig:
         check_choice("device", self.device, ("cpu", "cuda", "optix", "hip", "oneapi", "metal"))
         check_count("workers", self.workers)
         check_count("seed", self.seed, 0)
-        check_choice("axis", self.axis, ("auto", "origin", "centre"))
+        check_choice("axis", self.axis, ("auto", "origin", "center"))

@@ -14,12 +14,12 @@ _PIECE = 1 << 20
 
 
 def tree_as_glb(tree: str | Path, out: str | Path, *, triangles: int | None = None) -> Path:
-    """Write a tree as one self-contained GLB file, Y up in metres, where and how large :func:`~bbfit.blender.render_views` sees it.
+    """Write a tree as one self-contained GLB file, Y up in meters, where and how large :func:`~bbfit.blender.render_views` sees it.
 
-    What Blender's glTF exporter keeps is kept: materials, texture coordinates, textures with their alpha, and vertex colours that a
+    What Blender's glTF exporter keeps is kept: materials, texture coordinates, textures with their alpha, and vertex colors that a
     material uses. Modifiers, shape keys and poses are applied, collections and curves turned into meshes; objects that share a mesh
     go on to share it. Only what renders is written, without cameras, lights or animations. Surfaces without a material get the
-    renderer's plain one, grey or of their vertex colours. The same input gives the same bytes.
+    renderer's plain one, gray or of their vertex colors. The same input gives the same bytes.
 
     With ``triangles`` edges are collapsed (Blender's Decimate modifier) over the whole tree at once, in one joint mesh; what is left
     of the leaves is enlarged until they cover what they did before (Cook et al., "Stochastic Simplification of Aggregate Detail",

@@ -29,11 +29,11 @@ FREE = ("workers", "device")
 """Settings that may differ between two starts on one folder: they change how long the pictures take, not what they show."""
 FILTER_REACH = 2.0
 """Pixels that a surface's picture reaches beyond it, rounded up: Cycles' filter (Blackman-Harris) spreads it 1.5 pixels about a pixel's
-centre."""
+center."""
 # Settings of views that cameras given one by one replace.
 _UNUSED = ("count", "size", "elevations", "fov_degrees", "orthographic", "axis")
 # How far a camera's intrinsics may be from what Blender is told, in pixels.
-_CENTRED = 1e-6
+_CENTERD = 1e-6
 
 
 def render_pictures(
@@ -54,10 +54,10 @@ def render_pictures(
     Parameters
     ----------
     tree : as for :func:`~bbfit.blender.views_folder.render_views`.
-    cameras : V pinhole or parallel cameras with square pictures of at most 16384 pixels, square pixels and a centred principal point.
+    cameras : V pinhole or parallel cameras with square pictures of at most 16384 pixels, square pixels and a centerd principal point.
     out : folder to write to; made if need be.
     config : light, samples, denoising, device, workers and seed; the rest of it is not used.
-    clips : nearest and farthest distance from each camera along its axis that is seen, in metres, V pairs with 0 < nearest < farthest;
+    clips : nearest and farthest distance from each camera along its axis that is seen, in meters, V pairs with 0 < nearest < farthest;
         everything when left out.
     on_progress : called with the number of finished pictures and of all pictures, at the start and after each picture.
 
@@ -135,7 +135,7 @@ def vertical_axis(low: NDArray[np.floating], high: NDArray[np.floating], axis: s
 
     Parameters
     ----------
-    low, high : [3] corners of the tree's bounding box in metres.
+    low, high : [3] corners of the tree's bounding box in meters.
     """
     target = torch.from_numpy((np.asarray(low, np.float64) + high) / 2)
     through_origin = all(low[i] <= 0 <= high[i] for i in (0, 2))
@@ -176,7 +176,7 @@ def frames(
     matrices = camera_to_nerf(camera.world_to_camera)
     found = []
     for index in indices:
-        extent = camera.width / float(camera.intrinsics[index, 0, 0])  # at distance 1, or in metres when orthographic
+        extent = camera.width / float(camera.intrinsics[index, 0, 0])  # at distance 1, or in meters when orthographic
         found.append(
             {
                 "frame": index,
@@ -206,7 +206,7 @@ def _check(cameras: Camera, clips: Sequence[tuple[float, float]] | None) -> None
     expected = torch.zeros_like(k)
     expected[:, 0, 0] = expected[:, 1, 1] = k[:, 0, 0]
     expected[:, :2, 2], expected[:, 2, 2] = (size - 1) / 2, 1
-    if not torch.allclose(k, expected, rtol=1e-9, atol=_CENTRED):
+    if not torch.allclose(k, expected, rtol=1e-9, atol=_CENTERD):
         fail("cameras", "expected square pixels and the principal point in the middle of the picture")
     if clips is not None:
         if len(clips) != len(cameras):

@@ -131,7 +131,7 @@ def _show(value: Any) -> str:
 
 
 def _cameras(points: NDArray[np.float64], config: ViewsConfig) -> tuple[Camera, torch.Tensor, float]:
-    """Cameras that see every point, the point that they look at and their distance from it in metres."""
+    """Cameras that see every point, the point that they look at and their distance from it in meters."""
     target = vertical_axis(points.min(0), points.max(0), config.axis)
     orbit = Orbit(config.count, tuple(config.elevations))
     camera = orbit.frame(

@@ -126,7 +126,7 @@ def prepare(job: dict[str, Any], answer: Any) -> None:
 
 
 def load(path: str) -> None:
-    """Read the tree into an empty scene, Z up, in metres; the importers turn Y-up formats (glTF, OBJ) by their own defaults."""
+    """Read the tree into an empty scene, Z up, in meters; the importers turn Y-up formats (glTF, OBJ) by their own defaults."""
     import bpy
 
     ending = Path(path).suffix.lower()
@@ -242,7 +242,7 @@ def measure_mesh(evaluated: Any) -> tuple[np.ndarray, int, float]:
 
 
 def add_plain_material() -> None:
-    """Give surfaces without a material a matt grey, or their vertex colours."""
+    """Give surfaces without a material a matt gray, or their vertex colors."""
     import bpy
 
     for found in bpy.data.objects:
@@ -252,13 +252,13 @@ def add_plain_material() -> None:
             found.data.materials.append(None)  # a slot
         for slot in found.material_slots:
             if slot.material is None:
-                colours = getattr(found.data, "color_attributes", [])
-                slot.material = plain_material(colours[0].name if len(colours) else "")
+                colors = getattr(found.data, "color_attributes", [])
+                slot.material = plain_material(colors[0].name if len(colors) else "")
     bpy.context.view_layer.update()
 
 
 def plain_material(attribute: str) -> Any:
-    """A matt material, grey or coloured by a vertex attribute."""
+    """A matt material, gray or colored by a vertex attribute."""
     import bpy
 
     name = f"bbfit plain {attribute}".strip()
@@ -306,7 +306,7 @@ def add_light(job: dict[str, Any]) -> None:
 
 
 def set_up_cycles(job: dict[str, Any]) -> None:
-    """Renderer, colours and file format; every setting that pictures depend on and factory settings leave open."""
+    """Renderer, colors and file format; every setting that pictures depend on and factory settings leave open."""
     import bpy
 
     scene = bpy.context.scene

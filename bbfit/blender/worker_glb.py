@@ -198,11 +198,11 @@ def thinned(placed: list[Placed], ratio: float) -> list[Placed]:
 
 
 def groups(placed: list[Placed]) -> list[list[Placed]]:
-    """Objects that can be joined without their materials changing: of the same colours and texture coordinates, or without the latter."""
+    """Objects that can be joined without their materials changing: of the same colors and texture coordinates, or without the latter."""
     found: dict[tuple[Any, ...], dict[tuple[str, ...], list[Placed]]] = {}
     for item in sorted(placed, key=lambda item: not item.mesh.uv_layers):
-        colours = item.mesh.color_attributes
-        shades = (*((layer.name, layer.domain, layer.data_type) for layer in colours), colours.render_color_index)
+        colors = item.mesh.color_attributes
+        shades = (*((layer.name, layer.domain, layer.data_type) for layer in colors), colors.render_color_index)
         sheets = (*(layer.name for layer in item.mesh.uv_layers), *(layer.name for layer in item.mesh.uv_layers if layer.active_render))
         alike = found.setdefault(shades, {})
         alike.setdefault(sheets or next(iter(alike), ()), []).append(item)

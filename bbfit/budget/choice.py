@@ -22,7 +22,7 @@ from bbfit.fitting.config import FitConfig, Placement, Sides
 from bbfit.fitting.levels import resize_textures
 from bbfit.fitting.loop import fit
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import over_colour
+from bbfit.images import over_color
 from bbfit.views import ViewDataset, ViewSet
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
@@ -32,7 +32,7 @@ WORTH_DB = 0.75
 # One in so many training views is for validation.
 _SHARE = 5
 # Short fits: what they change, and how many billboards more in vain end the trials of a budget of texels or bytes.
-_SHORT: dict[str, Any] = {"steps": 160, "views_per_step": 2, "searches": 1}
+_SHORT: dict[str, Any] = {"steps": 160, "views_per_step": 2, "restarts": 1}
 _IN_VAIN = 2
 # What two short fits may differ by for no reason, in dB.
 _LUCK = 0.15
@@ -299,7 +299,7 @@ class _Trials:
 def mean_psnr(cloud: BillboardCloud, views: ViewSet) -> float:
     """Mean over views of the PSNR over white, in dB."""
     pairs = (held_out(cloud, views, index) for index in range(len(views)))
-    return float(np.mean([metrics.psnr(*(over_colour(picture).numpy() for picture in pair)) for pair in pairs]))
+    return float(np.mean([metrics.psnr(*(over_color(picture).numpy() for picture in pair)) for pair in pairs]))
 
 
 def _gain(more: Trial, fewer: Trial) -> float:

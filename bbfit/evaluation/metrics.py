@@ -1,7 +1,7 @@
 """How much a render differs from its target, one view at a time, on the honest scale: data range 1.
 
 All functions take the target first and give a plain ``float`` summed in float64. "Over white" pictures are RGB [H, W, 3] composited
-over white (:func:`bbfit.images.over_colour`), the others premultiplied RGBA [H, W, 4]; both hold display-referred values in [0, 1].
+over white (:func:`bbfit.images.over_color`), the others premultiplied RGBA [H, W, 4]; both hold display-referred values in [0, 1].
 
 No result is infinite or NaN, so that every one can stand in a JSON file. A mean squared error counts as at least :data:`MSE_FLOOR`, so
 identical pictures have a PSNR of 120 dB. A ratio to something that the target does not have (the sharpness of a flat picture, the
@@ -139,7 +139,7 @@ def silhouette_distance(target: Image, render: Image) -> float:
 def sharpness(target: Image, render: Image) -> float | None:
     """Mean absolute gradient of the render over that of the target, over white: 1 is as sharp, below is blurred, above is noisy.
 
-    The gradient is the difference of neighbouring pixels, across and down, averaged over both directions and over RGB. ``None`` for a
+    The gradient is the difference of neighboring pixels, across and down, averaged over both directions and over RGB. ``None`` for a
     flat target.
     """
     check_shape("render", render.shape, target.shape)
@@ -147,7 +147,7 @@ def sharpness(target: Image, render: Image) -> float | None:
 
 
 def brightness(target: Image, render: Image) -> float | None:
-    """Mean colour of the render inside the target's silhouette over that of the target: 1 is as bright, below is darker.
+    """Mean color of the render inside the target's silhouette over that of the target: 1 is as bright, below is darker.
 
     On the premultiplied RGB of two RGBA pictures (what is seen over black), so holes in the render darken it too. The silhouette is where
     the target's alpha >= 0.5. ``None`` if the silhouette is empty or black.

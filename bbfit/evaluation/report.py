@@ -63,7 +63,7 @@ class Measures:
     sharpness: float | None
     """Mean absolute gradient over the target's; ``None`` for a flat target."""
     brightness: float | None
-    """Mean colour inside the target's silhouette over the target's; ``None`` for an empty or black silhouette."""
+    """Mean color inside the target's silhouette over the target's; ``None`` for an empty or black silhouette."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from bbfit.evaluation import metrics, thesis_scale
 from bbfit.evaluation.report import Cost, Measures, OverWhite, Report, Rgba, ThesisScale, ViewScore
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import over_colour
+from bbfit.images import over_color
 from bbfit.rendering.dispatch import render
 from bbfit.views import ViewSet
 
@@ -133,7 +133,7 @@ def measure(target: Tensor, image: Tensor) -> Measures:
     check_shape("target", tuple(target.shape), (None, None, 4))
     check_shape("image", tuple(image.shape), tuple(target.shape))
     rgba = tuple(picture.detach().cpu().double().numpy() for picture in (target, image))
-    white = tuple(over_colour(picture.detach().cpu().double()).numpy() for picture in (target, image))
+    white = tuple(over_color(picture.detach().cpu().double()).numpy() for picture in (target, image))
     return Measures(
         OverWhite(metrics.psnr(*white), metrics.ssim(*white), metrics.flip(*white)),
         Rgba(metrics.root_mean_squared_error(*rgba), metrics.psnr(*rgba), metrics.alpha_iou(*rgba)),

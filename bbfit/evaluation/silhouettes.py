@@ -31,5 +31,5 @@ def worst_silhouette(cloud: BillboardCloud, views: ViewSet, *, stop: Callable[[]
 
 
 def scale_within(error: float, error_pixels: float) -> float:
-    """Pixels a metre up to which an error in metres, measured in training views, stays within so many pixels, also between those views."""
+    """Pixels a meter up to which an error in meters, measured in training views, stays within so many pixels, also between those views."""
     return error_pixels / (_MARGIN * error) if error else math.inf

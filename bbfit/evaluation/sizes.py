@@ -13,7 +13,7 @@ from bbfit.checks import check_count, check_shape, fail
 from bbfit.evaluation import metrics
 from bbfit.evaluation.report import SizeScore
 from bbfit.geometry.camera import Camera
-from bbfit.images import over_colour
+from bbfit.images import over_color
 from bbfit.views import ViewSet
 
 
@@ -97,7 +97,7 @@ def _score(draw: Callable[[Camera], Tensor], views: ViewSet, halving: int, width
         if not images.isfinite().all():
             fail("draw", f"gives numbers that are not finite for view {name} at {width} x {height} pixels", "check the model")
         seen, *shifted = images.clamp(0, 1)
-        psnrs.append(metrics.psnr(over_colour(target).numpy(), over_colour(seen).numpy()))
+        psnrs.append(metrics.psnr(over_color(target).numpy(), over_color(seen).numpy()))
         squares.append(metrics.mean_squared_error(target[..., 3].numpy(), seen[..., 3].numpy()))
         covers = [float(image[..., 3].sum()) for image in shifted or [seen]]
         drawn += sum(covers) / len(covers)
@@ -107,7 +107,7 @@ def _score(draw: Callable[[Camera], Tensor], views: ViewSet, halving: int, width
 
 
 def _shifted(camera: Camera, halvings: int) -> Camera:
-    """The camera, and if there are halvings itself with its pixels' centres moved to those of their 4^halvings parts."""
+    """The camera, and if there are halvings itself with its pixels' centers moved to those of their 4^halvings parts."""
     parts = 2**halvings
     steps = [(part + 0.5) / parts - 0.5 for part in range(parts)]
     moves = [(0.0, 0.0), *(itertools.product(steps, steps) if halvings else ())]

@@ -1,4 +1,4 @@
-"""All textures of a cloud in one picture, packed by xatlas and filled so that filtering finds no foreign colour."""
+"""All textures of a cloud in one picture, packed by xatlas and filled so that filtering finds no foreign color."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from bbfit.exporting.packing import packed
-from bbfit.images import bleed_colour
+from bbfit.images import bleed_color
 
 # Graphics cards compress textures in blocks of 4 x 4 texels.
 BLOCK = 4
@@ -46,7 +46,7 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
 
     Returns
     -------
-    :class:`Atlas`. Alpha is 0 outside the textures; transparent texels have a neighbour's colour (:func:`fill_cell`).
+    :class:`Atlas`. Alpha is 0 outside the textures; transparent texels have a neighbor's color (:func:`fill_cell`).
     """
     sizes = np.array([texture.shape[1::-1] for texture in textures], dtype=np.int64)
     unit = max(BLOCK, 1 << (padding.bit_length() - 1))
@@ -54,7 +54,7 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
     places = packed(cells)
     width, height = ((places + cells).max(0) * unit).tolist()
     image = np.zeros((height, width, 4), np.uint8)
-    image[..., :3] = _mean_colour(textures)  # the gaps between cells, which only the smallest mip levels see
+    image[..., :3] = _mean_color(textures)  # the gaps between cells, which only the smallest mip levels see
     for texture, place, cell in zip(textures, places * unit, cells * unit, strict=True):
         (x, y), (w, h) = place.tolist(), cell.tolist()
         image[y : y + h, x : x + w] = fill_cell(texture, padding, w, h)
@@ -62,7 +62,7 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
 
 
 def fill_cell(texture: NDArray[np.uint8], padding: int, width: int, height: int) -> NDArray[np.uint8]:
-    """Put a texture into its cell, transparent texels and the margin in their neighbours' colour (:func:`~bbfit.images.bleed_colour`).
+    """Put a texture into its cell, transparent texels and the margin in their neighbors' color (:func:`~bbfit.images.bleed_color`).
 
     Returns
     -------
@@ -70,15 +70,15 @@ def fill_cell(texture: NDArray[np.uint8], padding: int, width: int, height: int)
     """
     h, w = texture.shape[:2]
     cell = np.pad(texture, ((padding, height - h - padding), (padding, width - w - padding), (0, 0)))
-    cell = bleed_colour(torch.from_numpy(cell)).numpy()
-    # The rim fades out in its own colour, as in the reference renderer.
+    cell = bleed_color(torch.from_numpy(cell)).numpy()
+    # The rim fades out in its own color, as in the reference renderer.
     inner = cell[padding : padding + h, padding : padding + w, :3]
     cell[padding - 1 : padding + h + 1, padding - 1 : padding + w + 1, :3] = np.pad(inner, ((1, 1), (1, 1), (0, 0)), "edge")
     return cell
 
 
-def _mean_colour(textures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Alpha-weighted mean colour, [3]."""
+def _mean_color(textures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Alpha-weighted mean color, [3]."""
     flat = [texture.reshape(-1, 4).astype(np.float64) for texture in textures]
     weight = sum(part[:, 3].sum() for part in flat)
     total = sum((part[:, 3] @ part[:, :3] for part in flat), np.zeros(3))

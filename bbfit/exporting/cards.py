@@ -19,7 +19,7 @@ class Card:
     """A flat convex polygon that shows a part of one texture of the atlas, or all of it."""
 
     corners: NDArray[np.float64]
-    """K >= 3 points in metres, counter-clockwise as seen from where the normal points, [K, 3]."""
+    """K >= 3 points in meters, counter-clockwise as seen from where the normal points, [K, 3]."""
     uvs: NDArray[np.float64]
     """Texture coordinates with (0, 0) at the atlas's top-left corner and (1, 1) at its bottom-right corner, [K, 2]."""
     normal: NDArray[np.float64]
@@ -29,7 +29,7 @@ class Card:
     rectangle: int
     """Which texture of the atlas it shows."""
     origin: NDArray[np.float64] | None = None
-    """Point in metres by which programs that sort what is transparent are to sort it, [3]; it then gets a node of its own."""
+    """Point in meters by which programs that sort what is transparent are to sort it, [3]; it then gets a node of its own."""
 
     @property
     def triangles(self) -> NDArray[np.int64]:
@@ -54,7 +54,7 @@ class Cards:
 
     @property
     def vertex_count(self) -> int:
-        """Vertices of all cards, with the two that centre the bounds of each that has an origin."""
+        """Vertices of all cards, with the two that center the bounds of each that has an origin."""
         return sum(len(card.corners) + 2 * (card.origin is not None) for card in self.cards)
 
     def with_cards(self, cards: list[Card]) -> Cards:
@@ -65,13 +65,13 @@ class Cards:
 def cloud_cards(cloud: BillboardCloud, padding: int) -> Cards:
     """Rectangles and atlas that any renderer with bilinear filtering shows as :func:`~bbfit.rendering.reference.render_reference` does.
 
-    A billboard's picture fades to transparent over one texel beyond its outermost texel centres, so half a texel beyond its
-    rectangle. Each card is half a texel larger than its rectangle on every side and reaches to the centres of the padding texels
+    A billboard's picture fades to transparent over one texel beyond its outermost texel centers, so half a texel beyond its
+    rectangle. Each card is half a texel larger than its rectangle on every side and reaches to the centers of the padding texels
     around its texture. A two-sided billboard gives two cards at the same place, front and back, of opposite winding.
 
-    Textures are rounded to 8 bits, which moves a premultiplied colour by at most 1/255 a layer. Transparent texels change their
-    colour (:func:`~bbfit.exporting.atlas.fill_cell`); that shows within a texel of the silhouette, by at most 1/4 a layer, where they
-    had another colour before. Alpha is not touched by it.
+    Textures are rounded to 8 bits, which moves a premultiplied color by at most 1/255 a layer. Transparent texels change their
+    color (:func:`~bbfit.exporting.atlas.fill_cell`); that shows within a texel of the silhouette, by at most 1/4 a layer, where they
+    had another color before. Alpha is not touched by it.
 
     Raises
     ------

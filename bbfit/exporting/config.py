@@ -56,7 +56,7 @@ class ExportConfig:
     mip_files: bool = False
     """Write the mip levels as PNG files beside the model too, for programs that take them."""
     material: Material | None = None
-    """unlit: colours as they are, with the light that the tree was rendered in. pbr: a rough dielectric that the program lights once more.
+    """unlit: colors as they are, with the light that the tree was rendered in. pbr: a rough dielectric that the program lights once more.
     Left out: unlit."""
     padding: int = 8
     """Texels kept free around each texture in the atlas, at least 1; with 8 the mip levels 1 to 3 never mix two textures."""

@@ -2,7 +2,7 @@
 
 It differs from the renderer of clouds in what files add to a cloud: textures of 8 bits, polygons that may be smaller than their
 rectangles, culling, mip levels. Graphics cards also round the level and filter weights, to 8 bits or so, and take the derivatives from
-differences of neighbouring pixels; that is left out.
+differences of neighboring pixels; that is left out.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bbfit.geometry.camera import Camera
 from bbfit.rendering.compositing import composite, opacity, thresholds
 from bbfit.rendering.reference import EDGE_ON
 
-# How far outside a polygon, in shares of the atlas, a pixel's centre counts as in it, so that no rounding opens a seam between two.
+# How far outside a polygon, in shares of the atlas, a pixel's center counts as in it, so that no rounding opens a seam between two.
 _SLACK = 1e-9
 # Pieces belong to one sheet if their corners lie where its map takes them, but for this share of their distance from the origin.
 _SAME = 1e-6
@@ -42,7 +42,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Hits:
-    """Where the rays through the centres of a camera's pixels meet a sheet from a side that is shown: M of them."""
+    """Where the rays through the centers of a camera's pixels meet a sheet from a side that is shown: M of them."""
 
     x: Tensor
     """Columns of the pixels, int64 [M]; no pixel occurs twice."""
@@ -53,11 +53,11 @@ class Hits:
     detail: Tensor
     """Level of detail, float64 [M], negative where texels are magnified."""
     depth: Tensor
-    """Metres along the camera's axis, float64 [M]."""
+    """Meters along the camera's axis, float64 [M]."""
 
 
 @dataclass(frozen=True)
-class Levels:
+class MipChain:
     """A mip chain as one list of texels."""
 
     texels: Tensor
@@ -75,14 +75,14 @@ def draw_cards(cards: Cards, camera: Camera) -> Tensor:
 
     Without mip levels the picture is that of :func:`~bbfit.rendering.dispatch.render` up to the rounding of textures to 8 bits, for cards
     that show all of their rectangles. Filtering, like blending, is done on display-referred values, which is what fits are made for;
-    programs that filter in linear light show slightly lighter colours, and the same alpha.
+    programs that filter in linear light show slightly lighter colors, and the same alpha.
 
     With mip levels the level of detail is log2 of the longer of the texel coordinates' two derivatives along the screen's axes (OpenGL
     4.6, section 8.14.1), exact for every pixel; it is held within the levels that there are. The bilinear samples of the two nearest
-    levels are mixed by it (LINEAR_MIPMAP_LINEAR), colour and alpha apart, and what comes out is tested or blended. Beyond the atlas its
+    levels are mixed by it (LINEAR_MIPMAP_LINEAR), color and alpha apart, and what comes out is tested or blended. Beyond the atlas its
     outermost texels go on.
 
-    A pixel is shown by a card if its centre lies in the polygon. Depth order is that of :func:`~bbfit.rendering.compositing.composite`,
+    A pixel is shown by a card if its center lies in the polygon. Depth order is that of :func:`~bbfit.rendering.compositing.composite`,
     pixel by pixel. As in the reference renderer nothing shows of a plane seen edge-on, nor where a ray meets it behind the camera.
 
     Parameters
@@ -107,7 +107,7 @@ def draw_cards(cards: Cards, camera: Camera) -> Tensor:
     return image if camera.batched else image[0]
 
 
-def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> Levels:
+def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> MipChain:
     """Mip levels in one list.
 
     Parameters
@@ -128,7 +128,7 @@ def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> Levels
             fail("chain", f"level {number} is {level.dtype} {list(level.shape)}", f"expected uint8 {list(expected)}")
     heights, widths = torch.tensor([level.shape[:2] for level in chain]).unbind(-1)
     texels = torch.from_numpy(np.concatenate([level.reshape(-1, shape[-1]) for level in chain]))
-    return Levels(texels, (heights * widths).cumsum(0) - heights * widths, widths, heights)
+    return MipChain(texels, (heights * widths).cumsum(0) - heights * widths, widths, heights)
 
 
 def sheets_of(cards: Cards) -> list[Sheet]:
@@ -146,9 +146,9 @@ def sheets_of(cards: Cards) -> list[Sheet]:
                     sheet.pieces.append(card)
                     break
         else:
-            middle, centre = card.uvs.mean(0), card.corners.mean(0)
-            slopes = (np.linalg.pinv(card.uvs - middle) @ (card.corners - centre)).T
-            to_world = np.concatenate([np.column_stack([slopes, centre - slopes @ middle]), [[0.0, 0.0, 1.0]]])
+            middle, center = card.uvs.mean(0), card.corners.mean(0)
+            slopes = (np.linalg.pinv(card.uvs - middle) @ (card.corners - center)).T
+            to_world = np.concatenate([np.column_stack([slopes, center - slopes @ middle]), [[0.0, 0.0, 1.0]]])
             sheets.append(Sheet([card], to_world, int(areas[: card.rectangle].sum())))
     return sheets
 
@@ -171,7 +171,7 @@ def hits(cards: Cards, sheet: Sheet, camera: Camera) -> Hits:
     return Hits(x, y, uv, (torch.maximum(*rates) / scale.abs()).log2(), depth)
 
 
-def filtered(levels: Levels, uv: Tensor, detail: Tensor) -> Tensor:
+def filtered(levels: MipChain, uv: Tensor, detail: Tensor) -> Tensor:
     """Trilinear samples in [0, 255] at points [M, 2] by level of detail [M]: float32 [M, C]."""
     detail = detail.clamp(0, len(levels.starts) - 1)
     level = detail.long()
@@ -183,13 +183,13 @@ def filtered(levels: Levels, uv: Tensor, detail: Tensor) -> Tensor:
     return found
 
 
-def _bilinear(levels: Levels, uv: Tensor, level: Tensor) -> Tensor:
+def _bilinear(levels: MipChain, uv: Tensor, level: Tensor) -> Tensor:
     """Samples at points [M, 2] of levels int64 [M], clamped to the edge: float32 [M, C]."""
     width, height = levels.widths[level], levels.heights[level]
     x, y = (uv[:, 0] * width - 0.5).clamp_min(0), (uv[:, 1] * height - 0.5).clamp_min(0)
     left, top = torch.minimum(x.long(), width - 1), torch.minimum(y.long(), height - 1)
     right, down = (left + 1 < width).long(), (top + 1 < height).long() * width
-    x, y = (x - left).float()[:, None], (y - top).float()[:, None]  # beyond the last texel both neighbours are that one
+    x, y = (x - left).float()[:, None], (y - top).float()[:, None]  # beyond the last texel both neighbors are that one
     start = levels.starts[level] + top * width + left
     a, b, c, d = (levels.texels[start + step].float() for step in (0, right, down, down + right))
     # So written, equal texels give their own value exactly, whatever the weights: alpha at the cutoff stays there.
@@ -197,10 +197,10 @@ def _bilinear(levels: Levels, uv: Tensor, level: Tensor) -> Tensor:
     return upper + (lower - upper) * y
 
 
-def _view(cards: Cards, sheets: list[Sheet], levels: Levels, camera: Camera) -> Tensor:
+def _view(cards: Cards, sheets: list[Sheet], levels: MipChain, camera: Camera) -> Tensor:
     """One camera's picture, [H, W, 4]."""
     height, width = camera.height, camera.width
-    colours, alphas, depths = [], [], []
+    colors, alphas, depths = [], [], []
     for sheet in sheets:
         met = hits(cards, sheet, camera)
         straight = filtered(levels, met.uv, met.detail) / 255
@@ -212,10 +212,10 @@ def _view(cards: Cards, sheets: list[Sheet], levels: Levels, camera: Camera) -> 
             layer, depth = torch.zeros(4, height, width), torch.full((height, width), torch.inf)
             layer[:, met.y, met.x] = straight.mT
             depth[met.y, met.x] = met.depth.float()
-            colours.append(layer[None, :3])
+            colors.append(layer[None, :3])
             alphas.append(layer[None, 3:])
             depths.append(depth[None, None])
-    return composite(colours, alphas, depths)[0].permute(1, 2, 0) if colours else torch.zeros(height, width, 4)
+    return composite(colors, alphas, depths)[0].permute(1, 2, 0) if colors else torch.zeros(height, width, 4)
 
 
 def _faces(sheet: Sheet, camera: Camera) -> bool:

@@ -53,12 +53,12 @@ def encode_ktx2(levels: list[NDArray[np.uint8]]) -> bytes:
 
 
 def encode_webp(image: NDArray[np.uint8], lossless: bool = True) -> bytes:
-    """Encode straight RGBA, uint8 [h, w, 4], as WebP; the colour of transparent texels stays, for filtering finds it.
+    """Encode straight RGBA, uint8 [h, w, 4], as WebP; the color of transparent texels stays, for filtering finds it.
 
     Parameters
     ----------
     image : at most 16,383 texels a side.
-    lossless : texel for texel; otherwise alpha is exact and colour at quality 90 of 100, at half of its resolution.
+    lossless : texel for texel; otherwise alpha is exact and color at quality 90 of 100, at half of its resolution.
 
     Raises
     ------

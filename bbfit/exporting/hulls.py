@@ -22,7 +22,7 @@ _SAMPLES = 500_000
 
 
 def texel_corners(cards: Cards, card: Card) -> NDArray[np.float64]:
-    """A card's corners in texels of its texture, x to the right and y down, (0, 0) at the top-left texel's centre, [K, 2]."""
+    """A card's corners in texels of its texture, x to the right and y down, (0, 0) at the top-left texel's center, [K, 2]."""
     return card.uvs * np.array(cards.atlas.image.shape[1::-1]) - 0.5 - cards.atlas.corners[card.rectangle]
 
 
@@ -33,7 +33,7 @@ def rimmed_alpha(cards: Cards, rectangle: int) -> NDArray[np.float64]:
 
 
 def bilinear(rimmed: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Alpha at points in texels, [..., 2] -> [...], filtered bilinearly; 0 outside the rim's texel centres."""
+    """Alpha at points in texels, [..., 2] -> [...], filtered bilinearly; 0 outside the rim's texel centers."""
     height, width = rimmed.shape
     x, y = points[..., 0] + 1, points[..., 1] + 1
     outside = ~((x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1))  # also what is not a number
@@ -63,18 +63,18 @@ def area(polygon: NDArray[np.float64]) -> float:
 
 
 def shown_cells(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], least: float) -> NDArray[np.int64]:
-    """Squares between four texel centres that overlap a convex polygon and in which alpha reaches a value, row and column of each, [C, 2].
+    """Squares between four texel centers that overlap a convex polygon and in which alpha reaches a value, row and column of each, [C, 2].
 
     The square of row r and column c has its top-left corner at (c - 1, r - 1). Exact: by the separating axes of the square and the polygon.
     """
     reached = rimmed >= least
     cells = np.argwhere(reached[:-1, :-1] | reached[1:, :-1] | reached[:-1, 1:] | reached[1:, 1:])
-    centres = cells[:, ::-1] - 0.5
+    centers = cells[:, ::-1] - 0.5
     normals, offsets = sides(polygon)
     low, high = polygon.min(0) - 0.5 + 1e-9, polygon.max(0) + 0.5 - 1e-9
-    overlaps = ((centres > low) & (centres < high)).all(-1)
-    cells, centres = cells[overlaps], centres[overlaps]
-    nearest = centres @ normals.T - 0.5 * abs(normals).sum(-1)  # of the square's corners, the farthest inside
+    overlaps = ((centers > low) & (centers < high)).all(-1)
+    cells, centers = cells[overlaps], centers[overlaps]
+    nearest = centers @ normals.T - 0.5 * abs(normals).sum(-1)  # of the square's corners, the farthest inside
     return cells[(nearest < offsets - 1e-9).all(-1)]
 
 

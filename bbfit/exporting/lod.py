@@ -28,7 +28,7 @@ class LodLevel:
     """Triangles, counted in the file."""
     bytes: int
     """Size as a file of its own."""
-    error_metres: float
+    error_meters: float
     """How far its silhouette is off (:func:`bbfit.evaluation.metrics.silhouette_distance`) in the training view that is worst; 0 for the
     tree itself."""
     error_pixels: float
@@ -39,7 +39,7 @@ class LodLevel:
     """Over white, in held-out views at their full size; ``None`` for the tree itself."""
     tree_pixels: float | None
     """Height of the tree on the screen, in pixels, below which the level is shown; ``None`` for the finest, which has no such bound."""
-    distance_metres: float
+    distance_meters: float
     """Distance of the tree from the camera from which on the level is shown, on the screen that was asked for."""
     screen_coverage: float
     """Least share of the screen that the tree's bounding sphere covers where the level is shown; 0 for the coarsest."""
@@ -50,7 +50,7 @@ def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel]) -> bytes:
 
     The scene holds the first level alone, under a node of its own; programs that do not know MSFT_lod show just that. The nodes of the
     other levels stand beside the scene, as the extension has it. The first level's node says in its ``extras`` down to which coverage of
-    the screen each level is shown (``MSFT_screencoverage``) and from which distance on (``lod_distances``, in metres).
+    the screen each level is shown (``MSFT_screencoverage``) and from which distance on (``lod_distances``, in meters).
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel]) -> bytes:
     first = tree["nodes"][roots[0]]
     first["extras"] = {
         "MSFT_screencoverage": [level.screen_coverage for level in levels],
-        "lod_distances": [level.distance_metres for level in levels],
+        "lod_distances": [level.distance_meters for level in levels],
     }
     if len(roots) > 1:
         first["extensions"] = {"MSFT_lod": {"ids": roots[1:]}}

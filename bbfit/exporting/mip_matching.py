@@ -33,7 +33,7 @@ _SIDE = 96
 _ORBIT = Orbit(24)
 # Levels count up to the last that matters to views so many pixels wide; those beyond take its factor.
 _LEAST_WIDTH = 8
-# Each level's factor is sought so often, since its neighbours' factors matter to it; the first time with one factor for all beyond it.
+# Each level's factor is sought so often, since its neighbors' factors matter to it; the first time with one factor for all beyond it.
 _SWEEPS = 2
 # A factor is sought within so many doublings of 1, later of what it was, which are halved so often; it is good if coverage is as wanted
 # but for this share.
@@ -41,7 +41,7 @@ _FIRST, _LATER, _TOLERANCE = (2.0, 8), (0.25, 5), 0.002
 
 
 @dataclass(frozen=True)
-class _Sight:
+class _VisibleTexels:
     """What V cameras see of the cards, each sheet's hits in all views in one row."""
 
     pixels: list[Tensor]
@@ -71,11 +71,11 @@ def reduced(cards: Cards, halvings: int) -> Cards:
     if halvings == 0:
         return cards
     image = _chain(cards)[halvings]
-    sight, _ = _look(cards, _around(cards))
-    wanted = _coverage(sight, [cards.atlas.image[..., 3:]], 0, cards.alpha)
+    visible, _ = _visible_texels(cards, _around(cards))
+    wanted = _coverage(visible, [cards.atlas.image[..., 3:]], 0, cards.alpha)
 
     def excess(factor: float) -> float:
-        return _coverage(sight, _scaled([image[..., 3:]], np.array([factor])), 0, cards.alpha) / wanted - 1
+        return _coverage(visible, _scaled([image[..., 3:]], np.array([factor])), 0, cards.alpha) / wanted - 1
 
     factor = _root(excess, 1.0, *_FIRST) if wanted else 1.0
     image = np.concatenate([image[..., :3], *_scaled([image[..., 3:]], np.array([factor]))], -1)
@@ -99,7 +99,7 @@ def matched_chain(cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Cam
 
     For each level there is a distance from which half of all pixels of the cards are filtered with this or coarser levels. As seen from
     there, though on more pixels, so that few of them do not decide by chance, coverage is counted in all views together, and the level's
-    factor found by bisection. Level 0 stays as it was fitted. Alpha is clipped at 1, colours are left alone.
+    factor found by bisection. Level 0 stays as it was fitted. Alpha is clipped at 1, colors are left alone.
 
     The modes blend and hash are matched alike: a hash covers as much as a blend does, on average.
 
@@ -124,12 +124,12 @@ def matched_chain(cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Cam
     joined(chain, cards.atlas.image.shape)  # for its checks
     reduction = max(1.0, max(cameras.width, cameras.height) / _SIDE)
     width, height = (max(1, round(side / reduction)) for side in (cameras.width, cameras.height))
-    sight, detail = _look(cards, cameras.resized(width, height))
+    visible, detail = _visible_texels(cards, cameras.resized(width, height))
     # Pictures a quarter as large have a median level of detail that is two more, and so on.
     last = min(len(chain) - 1, math.ceil(detail + math.log2(width / _LEAST_WIDTH)))
     factors = np.ones(len(chain))
     alphas = [level[..., 3:] for level in chain]
-    wanted = _coverage(sight, alphas[:1], 0, cards.alpha)
+    wanted = _coverage(visible, alphas[:1], 0, cards.alpha)
     if wanted == 0:
         return list(chain)  # nothing shows, near or far
     for sweep in range(_SWEEPS):
@@ -138,14 +138,14 @@ def matched_chain(cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Cam
 
             def excess(factor: float, level: int = level, beyond: int = beyond) -> float:
                 factors[level:beyond] = factor
-                return _coverage(sight, _scaled(alphas, factors), level, cards.alpha) / wanted - 1
+                return _coverage(visible, _scaled(alphas, factors), level, cards.alpha) / wanted - 1
 
             factors[level:beyond] = _root(excess, factors[level], *(_LATER if sweep else _FIRST))
     scaled = _scaled(alphas, factors)
     return [chain[0], *(np.concatenate([level[..., :3], alpha], -1) for level, alpha in zip(chain[1:], scaled[1:], strict=True))]
 
 
-def _look(cards: Cards, cameras: Camera) -> tuple[_Sight, float]:
+def _visible_texels(cards: Cards, cameras: Camera) -> tuple[_VisibleTexels, float]:
     """What the cameras see, and the median level of detail."""
     pixels, uvs, details, count = [], [], [], cameras.width * cameras.height
     for sheet in sheets_of(cards):
@@ -156,7 +156,7 @@ def _look(cards: Cards, cameras: Camera) -> tuple[_Sight, float]:
     if not any(map(len, pixels)):
         fail("cameras", "see nothing of the cards", "give those of the views that they were fitted to")
     detail = float(torch.cat(details).median())
-    return _Sight(pixels, uvs, [each - detail for each in details], count * len(cameras)), detail
+    return _VisibleTexels(pixels, uvs, [each - detail for each in details], count * len(cameras)), detail
 
 
 def _scaled(alphas: list[NDArray[np.uint8]], factors: NDArray[np.float64]) -> list[NDArray[np.uint8]]:
@@ -166,10 +166,10 @@ def _scaled(alphas: list[NDArray[np.uint8]], factors: NDArray[np.float64]) -> li
     ]
 
 
-def _coverage(sight: _Sight, alphas: list[NDArray[np.uint8]], level: int, mode: AlphaMode) -> float:
+def _coverage(visible: _VisibleTexels, alphas: list[NDArray[np.uint8]], level: int, mode: AlphaMode) -> float:
     """Mean alpha of the pictures if that level is the median level of detail, in [0, 1]; ``alphas`` are the levels' [h, w, 1]."""
-    levels, clear = joined(alphas, alphas[0].shape), torch.ones(sight.count)
-    for pixels, uv, detail in zip(sight.pixels, sight.uvs, sight.details, strict=True):
+    levels, clear = joined(alphas, alphas[0].shape), torch.ones(visible.count)
+    for pixels, uv, detail in zip(visible.pixels, visible.uvs, visible.details, strict=True):
         alpha = filtered(levels, uv, detail + level)[:, 0] / 255
         clear[pixels] *= 1 - (alpha if mode.kind == "hash" else opacity(alpha, mode))  # whatever the order of depth
     return 1 - float(clear.double().mean())

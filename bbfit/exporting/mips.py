@@ -1,4 +1,4 @@
-"""Mip levels of an atlas that is shown with a cutoff: leaves keep their area and their colour however far away they are.
+"""Mip levels of an atlas that is shown with a cutoff: leaves keep their area and their color however far away they are.
 
 Averaged alone, foliage vanishes with distance: the alpha of ever larger texels tends to its mean, which is under the cutoff. See
 Castano, "Computing alpha mipmaps" (2010).
@@ -30,9 +30,9 @@ def mip_chain(atlas: Atlas, cutoff: float | None) -> list[NDArray[np.uint8]]:
     """The atlas at half its sides, a quarter and so on, down to 1 x 1 texel.
 
     Each side is half of the level's before, rounded down, at least 1, as KTX 2.0 and graphics interfaces have it. Every texel is the
-    mean of what it covers of the atlas, by area, also where sides are odd. Colours are averaged in linear light and weighted by alpha;
-    a texel that covers nothing visible gets the plain mean of the colours there, which in an :class:`Atlas` are those of visible
-    neighbours. Alpha is averaged as it is.
+    mean of what it covers of the atlas, by area, also where sides are odd. Colors are averaged in linear light and weighted by alpha;
+    a texel that covers nothing visible gets the plain mean of the colors there, which in an :class:`Atlas` are those of visible
+    neighbors. Alpha is averaged as it is.
 
     With a cutoff, the alpha of each texture is then multiplied at each level by the factor that gives it the coverage which it has in
     the atlas (Castano 2010; :func:`coverage`), and clipped at 1. A texel that two textures share is scaled with the one that has more
@@ -60,8 +60,8 @@ def mip_chain(atlas: Atlas, cutoff: float | None) -> list[NDArray[np.uint8]]:
         check_range("cutoff", cutoff, 0, 1, open_low=True)
     height, width = atlas.image.shape[:2]
     alpha = atlas.image[..., 3:].astype(np.float32)
-    colour = srgb_to_linear(np.arange(256) / 255).astype(np.float32)[atlas.image[..., :3]]
-    weighted = np.concatenate([colour * alpha, alpha], -1)
+    color = srgb_to_linear(np.arange(256) / 255).astype(np.float32)[atlas.image[..., :3]]
+    weighted = np.concatenate([color * alpha, alpha], -1)
     levels = [atlas.image]
     if cutoff is not None:
         rectangles = np.stack([atlas.corners, atlas.corners + atlas.sizes], 1) / (width, height)
@@ -72,7 +72,7 @@ def mip_chain(atlas: Atlas, cutoff: float | None) -> list[NDArray[np.uint8]]:
         hidden = mean[..., 3:] == 0
         mean[..., :3] /= np.where(hidden, 1, mean[..., 3:])
         if hidden.any():
-            mean[..., :3] = np.where(hidden, _shrink(colour, size), mean[..., :3])
+            mean[..., :3] = np.where(hidden, _shrink(color, size), mean[..., :3])
         mean[..., :3] = 255 * linear_to_srgb(mean[..., :3])
         levels.append(_rounded(mean))
         if cutoff is not None:
@@ -167,7 +167,7 @@ def _factor(wanted: float, reached: Callable[[float], float]) -> float:
         while reached(high) < wanted and high < _LARGEST_FACTOR:
             low, high = high, 2 * high
     else:
-        while reached(low) > wanted and low > 1 / _LARGEST_FACTOR:  # a neighbour's alpha may reach in
+        while reached(low) > wanted and low > 1 / _LARGEST_FACTOR:  # a neighbor's alpha may reach in
             low, high = low / 2, low
     for _ in range(_HALVINGS):
         middle = math.sqrt(low * high)
@@ -185,6 +185,6 @@ def _filtered(texels: NDArray[np.uint16], first: int, last: int) -> Iterator[NDA
     """
     for place in range(_POINTS):
         start, end = (-(-(edge - place) // _POINTS) for edge in (first, last))
-        after = 2 * place >= _POINTS  # whether the point is past its texel's centre, and so between that and the next
+        after = 2 * place >= _POINTS  # whether the point is past its texel's center, and so between that and the next
         weight = (2 * place + 1 + _POINTS) % (2 * _POINTS)
         yield texels[start + after : end + after] * (2 * _POINTS - weight) + texels[start + after + 1 : end + after + 1] * weight

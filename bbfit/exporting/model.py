@@ -22,7 +22,7 @@ from bbfit.model_files import check_model_path
 def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None = None) -> list[Path]:
     """Write a billboard cloud as GLB (one file) or as OBJ with an MTL and a PNG of the same stem, by the ending of ``path``.
 
-    Textures are rounded to 8 bits and otherwise kept texel for texel. Coordinates keep the cloud's metres and origin.
+    Textures are rounded to 8 bits and otherwise kept texel for texel. Coordinates keep the cloud's meters and origin.
 
     Returns
     -------

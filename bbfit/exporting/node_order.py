@@ -1,6 +1,6 @@
 """Which of a set of cards is in front, where, and the points by which sorting them gives that order from every side.
 
-Programs sort transparent objects from back to front by one number each: three.js by the depth of the centre of the object's bounds along
+Programs sort transparent objects from back to front by one number each: three.js by the depth of the center of the object's bounds along
 the viewing direction, Babylon.js and Unity by the camera's distance from it. Only the order of layers that overlap on the screen
 matters, and for a camera that looks along f, card i in front of card j is drawn right by depth if f . (o_j - o_i) > 0: linear in the
 points o, and by distance nearly so.
@@ -50,13 +50,13 @@ class Rig:
     """Cameras around the cards, as far as orders depend on them."""
 
     eyes: NDArray[np.float64]
-    """Positions in metres, [V, 3]."""
+    """Positions in meters, [V, 3]."""
     forwards: NDArray[np.float64]
     """Unit viewing directions, [V, 3]."""
 
 
 @dataclass(frozen=True)
-class Sight:
+class VisibilitySamples:
     """What the rays of some cameras meet: per ray all layers in their true order, and of those every two."""
 
     cameras: Rig
@@ -116,7 +116,7 @@ def check_rig(cards: Cards) -> Rig:
     return rings(cards, (-12.0, 8.0, 31.0, 58.0, 82.0), 13, (1.8, 4.0))
 
 
-def look(cards: Cards, cameras: Rig, across: int = 32) -> Sight:
+def sample_visibility(cards: Cards, cameras: Rig, across: int = 32) -> VisibilitySamples:
     """Send ``across`` x ``across`` rays from every camera over the cards.
 
     Cards of one texture count as parts of one sheet, as :func:`~bbfit.exporting.cards.cloud_cards` makes it, which a ray meets once.
@@ -150,7 +150,7 @@ def _extent(card: Card) -> float:
 
 
 def _rays(points: NDArray, cameras: Rig, across: int) -> tuple[NDArray, NDArray]:
-    """Directions, one metre deep, through the middles of a grid over the points' picture, [V, R, 3], and a cell's size, [V]."""
+    """Directions, one meter deep, through the middles of a grid over the points' picture, [V, R, 3], and a cell's size, [V]."""
     eyes, forwards = cameras.eyes, cameras.forwards
     helper = np.where(abs(forwards[:, 1:2]) < 0.99, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     right = np.cross(forwards, helper)
@@ -171,7 +171,7 @@ def _rays(points: NDArray, cameras: Rig, across: int) -> tuple[NDArray, NDArray]
     return rays.reshape(len(eyes), -1, 3), cell
 
 
-def _paired(cameras: Rig, cell: NDArray, rectangle: NDArray, depth: NDArray, alpha: NDArray, points: NDArray) -> Sight:
+def _paired(cameras: Rig, cell: NDArray, rectangle: NDArray, depth: NDArray, alpha: NDArray, points: NDArray) -> VisibilitySamples:
     """Sort each ray's layers, given as [S, V, R] (and [S, V, R, 2]) for S sheets and R rays of V cameras, and list the pairs."""
     camera, ray = np.nonzero((alpha > 0).any(0))
     depth, alpha, points, cell = depth[:, camera, ray], alpha[:, camera, ray], points[:, camera, ray], cell[camera]
@@ -194,10 +194,10 @@ def _paired(cameras: Rig, cell: NDArray, rectangle: NDArray, depth: NDArray, alp
     index = index.reshape(2, -1)
     layer, at = np.divmod(used, max(len(camera), 1))
     sheet = order[layer, at]
-    return Sight(cameras, rectangle[sheet], points[sheet, at], camera[ray], index[0], index[1], weight)
+    return VisibilitySamples(cameras, rectangle[sheet], points[sheet, at], camera[ray], index[0], index[1], weight)
 
 
-def shown_by(cards: Cards, sight: Sight) -> NDArray[np.int64]:
+def shown_by(cards: Cards, sight: VisibilitySamples) -> NDArray[np.int64]:
     """Which card shows each hit, [H]; -1 for none. To a thousandth of a texel, as hits are in float32."""
     found = np.full(len(sight.points), -1)
     for rectangle in {card.rectangle for card in cards.cards}:
@@ -244,11 +244,13 @@ def misordered(cards: Cards, cameras: Camera | None = None) -> Misordered:
         rig = check_rig(cards)
     else:
         rig = Rig(*(part.double().cpu().numpy() for part in (cameras.batch().position, cameras.batch().forward)))
-    sight = look(cards, rig)
-    return judged(sight, shown_by(cards, sight), card_origins(cards))[0]
+    sight = sample_visibility(cards, rig)
+    return measure_order(sight, shown_by(cards, sight), card_origins(cards))[0]
 
 
-def judged(sight: Sight, card: NDArray[np.int64], origins: NDArray[np.float64]) -> tuple[Misordered, NDArray[np.float64]]:
+def measure_order(
+    sight: VisibilitySamples, card: NDArray[np.int64], origins: NDArray[np.float64]
+) -> tuple[Misordered, NDArray[np.float64]]:
     """The shares, and per pair of hits what it adds to their mean, [N]; ``card`` says which card shows each hit."""
     front, back = card[sight.front], card[sight.back]
     real = (front >= 0) & (back >= 0)
@@ -257,12 +259,12 @@ def judged(sight: Sight, card: NDArray[np.int64], origins: NDArray[np.float64]) 
 
 
 def fit_origins(
-    sight: Sight, card: NDArray[np.int64], middles: NDArray[np.float64], starts: list[NDArray[np.float64]], scale: float
+    sight: VisibilitySamples, card: NDArray[np.int64], middles: NDArray[np.float64], starts: list[NDArray[np.float64]], scale: float
 ) -> NDArray[np.float64]:
     """The points by which sorting P cards gives the order that the rays met, by both keys as far as possible, [P, 3].
 
     From the best start the wrong share is descended (L-BFGS, Byrd et al. 1995) with soft steps in place of right and wrong, which then get
-    steeper. Origins are pulled to the cards' middles a little, so that bounds centred on them stay small. The best point on the way is
+    steeper. Origins are pulled to the cards' middles a little, so that bounds centerd on them stay small. The best point on the way is
     returned.
 
     Parameters
@@ -270,7 +272,7 @@ def fit_origins(
     card : which card shows each hit, as :func:`shown_by` says, [H].
     middles : the cards' middles, [P, 3].
     starts : at least one, [P, 3] each.
-    scale : the tree's radius in metres.
+    scale : the tree's radius in meters.
     """
     from scipy.optimize import minimize
     from scipy.special import expit
@@ -313,7 +315,7 @@ def fit_origins(
 
 
 @dataclass(frozen=True)
-class Rivals:
+class Overlaps:
     """What one card overlaps, while all other origins stay."""
 
     eyes: NDArray[np.float64]
@@ -330,7 +332,7 @@ class Rivals:
     """Where on the card, in texels, [N, 2]."""
 
 
-def rivals(sight: Sight, card: NDArray[np.int64], origins: NDArray[np.float64], index: int) -> Rivals:
+def overlaps(sight: VisibilitySamples, card: NDArray[np.int64], origins: NDArray[np.float64], index: int) -> Overlaps:
     """What the card of that index overlaps, or every few of it if there is much."""
     front, back = card[sight.front], card[sight.back]
     rows = np.flatnonzero(((front == index) & (back >= 0)) | ((back == index) & (front >= 0)))
@@ -338,7 +340,7 @@ def rivals(sight: Sight, card: NDArray[np.int64], origins: NDArray[np.float64], 
     rows = rows[::every]
     ahead, camera = front[rows] == index, sight.camera[rows]
     other = np.where(ahead, back[rows], front[rows])
-    return Rivals(
+    return Overlaps(
         sight.cameras.eyes[camera],
         sight.cameras.forwards[camera],
         np.stack([key[camera, other] for key in keys(sight.cameras, origins)]),
@@ -348,7 +350,7 @@ def rivals(sight: Sight, card: NDArray[np.int64], origins: NDArray[np.float64], 
     )
 
 
-def left_wrong(against: Rivals, part: NDArray[np.bool_], start: NDArray[np.float64], radius: float) -> float:
+def left_wrong(against: Overlaps, part: NDArray[np.bool_], start: NDArray[np.float64], radius: float) -> float:
     """The share that stays wrong if a part of the overlaps belongs to a card of its own, whose origin is fitted from a start, [3]."""
     from scipy.optimize import minimize
     from scipy.special import expit

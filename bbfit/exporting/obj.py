@@ -15,7 +15,7 @@ _MATERIAL = "billboards"
 
 
 def obj_bytes(cards: Cards, config: ExportConfig, *, material_file: str) -> bytes:
-    """An OBJ file: a polygon for each card, in metres, ``config.up`` up; nine digits, which give every float32 back.
+    """An OBJ file: a polygon for each card, in meters, ``config.up`` up; nine digits, which give every float32 back.
 
     OBJ cannot say whether a face is culled from behind. A two-sided billboard is written as two faces of opposite winding, and the
     file's header asks for culling where there are any.
@@ -25,7 +25,7 @@ def obj_bytes(cards: Cards, config: ExportConfig, *, material_file: str) -> byte
     if config.up == "z":
         corners, normals = _z_up(corners), _z_up(normals)
     uvs = np.concatenate([card.uvs for card in cards.cards]) * [1.0, -1.0] + [0.0, 1.0]  # OBJ counts v from the bottom
-    lines = [f"# bbfit billboard cloud, metres, {'Z' if config.up == 'z' else 'Y'} up"]
+    lines = [f"# bbfit billboard cloud, meters, {'Z' if config.up == 'z' else 'Y'} up"]
     if any(card.culled for card in cards.cards):
         lines.append("# has separate front and back faces: turn on back-face culling")
     lines += [f"mtllib {material_file}", "o billboards"]
@@ -39,7 +39,7 @@ def obj_bytes(cards: Cards, config: ExportConfig, *, material_file: str) -> byte
 
 
 def mtl_bytes(*, texture_file: str) -> bytes:
-    """The material library: the texture's colour as it is (illumination model 0, no lighting) and its alpha as opacity."""
+    """The material library: the texture's color as it is (illumination model 0, no lighting) and its alpha as opacity."""
     lines = [
         "# bbfit billboard cloud",
         f"newmtl {_MATERIAL}",

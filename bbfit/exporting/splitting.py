@@ -10,7 +10,19 @@ from numpy.typing import NDArray
 from bbfit.checks import check_count, check_range
 from bbfit.exporting.cards import Card, Cards
 from bbfit.exporting.hulls import kept_half, rimmed_alpha, shown_cells, texel_corners
-from bbfit.exporting.node_order import Rivals, Sight, check_rig, fit_origins, fit_rig, frame, judged, left_wrong, look, rivals, shown_by
+from bbfit.exporting.node_order import (
+    Overlaps,
+    VisibilitySamples,
+    check_rig,
+    fit_origins,
+    fit_rig,
+    frame,
+    left_wrong,
+    measure_order,
+    overlaps,
+    sample_visibility,
+    shown_by,
+)
 from bbfit.rendering.compositing import TIE
 
 # Share of the pieces that are cut before origins are fitted again.
@@ -55,20 +67,20 @@ def split(cards: Cards, wrong: float = 1e-3, most: int = 200) -> Cards:
         return len(shown_cells(rimmed[card.rectangle], texel_corners(cards, card), 1e-9)) > 0
 
     pieces = [card for card in cards.cards if shows(card)] or [cards.cards[0]]
-    fitted, checked = look(cards, fit_rig(cards)), look(cards, check_rig(cards))
+    fitted, checked = sample_visibility(cards, fit_rig(cards)), sample_visibility(cards, check_rig(cards))
     origins = _middles(pieces)
     while True:
         now = cards.with_cards(pieces)
         card, middles = shown_by(now, fitted), _middles(pieces)
         origins = fit_origins(fitted, card, middles, [middles, _on_a_circle(middles, middle), origins], radius)
-        share, each = judged(fitted, card, origins)
-        unseen = judged(checked, shown_by(now, checked), origins)[0]
+        share, each = measure_order(fitted, card, origins)
+        unseen = measure_order(checked, shown_by(now, checked), origins)[0]
         if max(share.mean, unseen.mean) <= wrong or len(pieces) >= most:
             break
         between = _between(fitted, card, each, len(pieces))
         room = min(max(1, int(_AT_ONCE * len(pieces))), most - len(pieces))
         worst = [index for index in np.argsort(-between.sum(1), kind="stable")[: 2 * room].tolist() if between[index].any()]
-        gains = [_best_cut(now, index, between[index], rivals(fitted, card, origins, index), origins[index]) for index in worst]
+        gains = [_best_cut(now, index, between[index], overlaps(fitted, card, origins, index), origins[index]) for index in worst]
         chosen = dict[int, NDArray[np.float64]]()
         for _, index, height in sorted(gains, key=lambda gain: (-gain[0], gain[1])):
             # Once the partner that it is most wrong with is cut, a piece may be right as it is.
@@ -87,18 +99,18 @@ def split(cards: Cards, wrong: float = 1e-3, most: int = 200) -> Cards:
     return cards.with_cards([replace(piece, origin=origin) for piece, origin in zip(pieces, origins, strict=True)])
 
 
-def centred(card: Card) -> NDArray[np.float64]:
-    """A card's corners and two points more, for no triangle to use, that centre its bounds on its origin, [K + 2, 3].
+def centerd(card: Card) -> NDArray[np.float64]:
+    """A card's corners and two points more, for no triangle to use, that center its bounds on its origin, [K + 2, 3].
 
-    Programs that sort by the centre of the bounds then sort by the origin. The two are opposite corners of the smallest such box.
+    Programs that sort by the center of the bounds then sort by the origin. The two are opposite corners of the smallest such box.
     """
-    assert card.origin is not None, "only cards with an origin are centred on it"
+    assert card.origin is not None, "only cards with an origin are centerd on it"
     reach = abs(card.corners - card.origin).max(0)
     return np.concatenate([card.corners, [card.origin - reach, card.origin + reach]])
 
 
 def _heights(card: Card, other: Card) -> NDArray[np.float64]:
-    """How far a card's corners lie in front of another's plane, in metres, [K]."""
+    """How far a card's corners lie in front of another's plane, in meters, [K]."""
     return (card.corners - other.corners.mean(0)) @ other.normal
 
 
@@ -118,14 +130,14 @@ def _middles(pieces: list[Card]) -> NDArray[np.float64]:
     return np.stack([piece.corners.mean(0) for piece in pieces])
 
 
-def _on_a_circle(middles: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
+def _on_a_circle(middles: NDArray[np.float64], center: NDArray[np.float64]) -> NDArray[np.float64]:
     """The pieces' directions from the upright axis, all at one height and radius, which is right for half planes that end at the axis."""
-    outwards = (middles - centre) * [1.0, 0.0, 1.0]
+    outwards = (middles - center) * [1.0, 0.0, 1.0]
     radius = np.linalg.norm(outwards, axis=-1, keepdims=True)
-    return centre + outwards * (radius.mean() / np.maximum(radius, 1e-3 * radius.max() + 1e-12))
+    return center + outwards * (radius.mean() / np.maximum(radius, 1e-3 * radius.max() + 1e-12))
 
 
-def _between(sight: Sight, card: NDArray[np.int64], each: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def _between(sight: VisibilitySamples, card: NDArray[np.int64], each: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """How much of the wrong order lies between every two pieces, [P, P], symmetric."""
     bad = np.flatnonzero(each)
     pairs = card[sight.front[bad]] * count + card[sight.back[bad]]
@@ -134,7 +146,7 @@ def _between(sight: Sight, card: NDArray[np.int64], each: NDArray[np.float64], c
 
 
 def _best_cut(
-    cards: Cards, index: int, wrong: NDArray[np.float64], against: Rivals, origin: NDArray[np.float64]
+    cards: Cards, index: int, wrong: NDArray[np.float64], against: Overlaps, origin: NDArray[np.float64]
 ) -> tuple[float, int, NDArray[np.float64]]:
     """How much of the wrong share goes if a card is cut where that helps most, its index, and its corners' heights over the cut.
 

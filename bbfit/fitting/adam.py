@@ -36,7 +36,7 @@ def _update_blocks(
     correction: float,
     epsilon: float,
     rest_after: int,
-    crispness: float,
+    binarization: float,
     alpha_rate: float,
     texels: wp.array(dtype=texel_block),  # type: ignore[valid-type]
     gradient: wp.array(dtype=texel_block),  # type: ignore[valid-type]
@@ -60,11 +60,11 @@ def _update_blocks(
                     decay1 = wp.pow(beta1, float(idle - rest_after))
                     decay2 = wp.pow(beta2, float(idle - rest_after))
             p = texels[i]
-            if crispness != 0.0:
+            if binarization != 0.0:
                 for t in range(wp.static(BLOCK)):
                     alpha = p[4 * t + 3]
                     if alpha > 0.0:
-                        g[4 * t + 3] += crispness * (1.0 - 2.0 * alpha)
+                        g[4 * t + 3] += binarization * (1.0 - 2.0 * alpha)
             m = first_moment[i] * decay1 + g * (1.0 - beta1)
             v = second_moment[i] * decay2 + wp.cw_mul(g, g) * (1.0 - beta2)
             first_moment[i] = m
@@ -122,7 +122,7 @@ class AdamState:
         kept = {name: tensor.to(self.texels.device) for name, tensor in tensors.items()}
         return replace(AdamState.start(kept["texels"]), **kept)
 
-    def update(self, step: int, rate: float, betas: tuple[float, float], crispness: float = 0.0, alpha_rate: float = 1.0) -> None:
+    def update(self, step: int, rate: float, betas: tuple[float, float], binarization: float = 0.0, alpha_rate: float = 1.0) -> None:
         """Take step number ``step``, from 1, at the given rate, the moments decaying by ``betas`` a step; keep the texels in [0, 1].
 
         ``crispness`` times the derivative of alpha (1 - alpha) is added to the gradient of every alpha that is not 0. Alpha moves by
@@ -141,7 +141,7 @@ class AdamState:
             (1 - beta2**step) ** -0.5,
             EPSILON,
             rest_after(beta1),
-            crispness,
+            binarization,
             alpha_rate,
             *(
                 wp.from_torch(tensor.view(-1, 4 * BLOCK), dtype=texel_block)

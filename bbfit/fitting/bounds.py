@@ -35,12 +35,12 @@ def facing_view_bounds(planes: BillboardCloud, views: ViewSet, *, pairs: bool) -
 
     Parameters
     ----------
-    planes : billboards through a common centre, of any extent.
+    planes : billboards through a common center, of any extent.
     pairs : whether odd entries are the backs of pairs, which face the other way.
 
     Returns
     -------
-    [N, 4] left, right, bottom, top in metres along the billboard's axes from its centre.
+    [N, 4] left, right, bottom, top in meters along the billboard's axes from its center.
     """
     cosines = facing(views.cameras, planes.normals, planes.centers[0])
     if pairs:
@@ -89,8 +89,8 @@ def opaque_bounds(cloud: BillboardCloud) -> Tensor:
         spare = (sides / 10).ceil().clamp_min(2)
         low = torch.where(low < 1, low - spare, (low - 2).clamp_min(0))
         high = torch.where(high > sides - 1, high + spare, torch.minimum(high + 2, sides))
-        metres = (torch.stack([low, high]) / sides * 2 - 1) * cloud.half_extents[n]
-        bounds.append(torch.stack([metres[0, 0], metres[1, 0], -metres[1, 1], -metres[0, 1]]))
+        meters = (torch.stack([low, high]) / sides * 2 - 1) * cloud.half_extents[n]
+        bounds.append(torch.stack([meters[0, 0], meters[1, 0], -meters[1, 1], -meters[0, 1]]))
     return torch.stack(bounds)
 
 
@@ -131,9 +131,9 @@ def _union(a: Tensor, b: Tensor) -> Tensor:
 def _outline(views: ViewSet, view: int) -> Tensor:
     """Corners of the convex hull of a view's pixels with alpha > 0, in pixel coordinates of pixel *edges*, [P, 2] float64."""
     mask = (views.image(view)[..., 3] > 0).numpy().astype(np.uint8)
-    centres = torch.from_numpy(cv2.convexHull(cv2.findNonZero(mask))[:, 0]).double()
+    centers = torch.from_numpy(cv2.convexHull(cv2.findNonZero(mask))[:, 0]).double()
     to_edges = torch.tensor([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]], dtype=torch.float64)
-    return (centres[:, None] + to_edges).flatten(0, 1)
+    return (centers[:, None] + to_edges).flatten(0, 1)
 
 
 def _box(views: ViewSet, view: int) -> Tensor:
@@ -155,7 +155,7 @@ def _bounds_on_plane(planes: BillboardCloud, n: int, camera: Camera, pixels: Ten
 
 
 def smallest_rectangle(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Centre, unit axis along its width, half width and height, [2] each, of the smallest rectangle around points of a plane, [P, 2].
+    """Center, unit axis along its width, half width and height, [2] each, of the smallest rectangle around points of a plane, [P, 2].
 
     It is turned only if that makes it a fifth smaller, and then by 45 degrees at most.
     """

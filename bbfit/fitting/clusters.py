@@ -29,7 +29,7 @@ class Planes:
     normals: Tensor
     """Unit vectors, float64 [K, 3]."""
     offsets: Tensor
-    """Metres, float64 [K]."""
+    """Meters, float64 [K]."""
     labels: Tensor
     """Plane of every point, int64 [P]."""
 
@@ -92,7 +92,7 @@ def _refined(points: Tensor, normals: Tensor, offsets: Tensor, seen: Tensor, *, 
 
 
 def _displacement(points: Tensor, normals: Tensor, offsets: Tensor, seen: Tensor) -> Tensor:
-    """How far moving each point onto each plane is seen, root mean square over views, in metres, [P, K]."""
+    """How far moving each point onto each plane is seen, root mean square over views, in meters, [P, K]."""
     visible = ((normals @ seen) * normals).sum(-1).clamp_min(0).sqrt()
     return (points @ normals.mT - offsets).abs() * visible
 
@@ -127,14 +127,14 @@ def best_planes(sums: Tensor, *, upright: bool) -> tuple[Tensor, Tensor, Tensor]
     return normals, (normals * means).sum(-1), values[:, 0].clamp_min(0)
 
 
-def rectangles(points: Tensor, planes: Planes, texels_a_metre: float, margin: float, *, two_sided: bool) -> BillboardCloud:
+def rectangles(points: Tensor, planes: Planes, texels_a_meter: float, margin: float, *, two_sided: bool) -> BillboardCloud:
     """The smallest rectangles on the planes that hold the points of each, float64, with transparent textures.
 
     Rectangles stand upright unless a turned one is a fifth smaller.
 
     Parameters
     ----------
-    margin : metres added on every side.
+    margin : meters added on every side.
     two_sided : whether each gets a texture for its back.
     """
     parts = []
@@ -146,8 +146,8 @@ def rectangles(points: Tensor, planes: Planes, texels_a_metre: float, margin: fl
         right = torch.nn.functional.normalize(torch.linalg.cross(up, normal), dim=0)
         up = torch.linalg.cross(normal, right)
         flat = torch.stack([own @ right, own @ up], -1) if len(own) else torch.zeros(1, 2, dtype=points.dtype)
-        centre, axis, half = smallest_rectangle(flat)
-        middle = normal * offset + right * centre[0] + up * centre[1]
+        center, axis, half = smallest_rectangle(flat)
+        middle = normal * offset + right * center[0] + up * center[1]
         parts.append((middle, axis[0] * right + axis[1] * up, axis[0] * up - axis[1] * right, half + margin))
     centers, rights, ups, halves = (torch.stack(part) for part in zip(*parts, strict=True))
     return sized(
@@ -160,19 +160,19 @@ def rectangles(points: Tensor, planes: Planes, texels_a_metre: float, margin: fl
             torch.full((len(centers),), two_sided),
             torch.zeros(len(centers) * (1 + two_sided), 4),
         ),
-        texels_a_metre,
+        texels_a_meter,
     )
 
 
-def splatted(cloud: BillboardCloud, points: Tensor, colours: Tensor, labels: Tensor) -> BillboardCloud:
+def splatted(cloud: BillboardCloud, points: Tensor, colors: Tensor, labels: Tensor) -> BillboardCloud:
     """The same billboards with textures made of the points that each carries.
 
-    A texel's colour is the mean of its points' colours, and its alpha is 1 - exp(-n / m), with n points on it and m of them, on average,
+    A texel's color is the mean of its points' colors, and its alpha is 1 - exp(-n / m), with n points on it and m of them, on average,
     on those texels of the billboard that have any: what a random arrangement of as much surface covers.
 
     Parameters
     ----------
-    points, colours, labels : [P, 3], straight RGB [P, 3] and billboard [P].
+    points, colors, labels : [P, 3], straight RGB [P, 3] and billboard [P].
     """
     textures = []
     for k, (h, w) in enumerate(cloud.texture_sizes.tolist()):
@@ -182,8 +182,8 @@ def splatted(cloud: BillboardCloud, points: Tensor, colours: Tensor, labels: Ten
         v = (1 - offset @ cloud.ups[k] / cloud.half_extents[k, 1]) * h / 2
         index = v.long().clamp(0, h - 1) * w + u.long().clamp(0, w - 1)
         number = torch.zeros(h * w).index_add_(0, index, torch.ones(len(index)))
-        colour = torch.zeros(h * w, 3).index_add_(0, index, colours[own]) / number.clamp_min(1)[:, None]
-        colour[number == 0] = colours[own].mean(0) if len(index) else 0.5
+        color = torch.zeros(h * w, 3).index_add_(0, index, colors[own]) / number.clamp_min(1)[:, None]
+        color[number == 0] = colors[own].mean(0) if len(index) else 0.5
         alpha = 1 - torch.exp(-number / number[number > 0].mean()) if len(index) else number
-        textures.append(torch.cat([colour, alpha[:, None]], -1).repeat(1 + int(cloud.two_sided[k]), 1))
+        textures.append(torch.cat([color, alpha[:, None]], -1).repeat(1 + int(cloud.two_sided[k]), 1))
     return cloud.with_texels(torch.cat(textures))

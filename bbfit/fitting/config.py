@@ -22,7 +22,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "alpha": "mask",
         "billboards": 8,
         "placement": "clusters",
-        "placement_rate": 0.015,
+        "placement_learning_rate": 0.015,
         "bounds": "silhouette",
         "loss": "backgrounds",
         "ssim_weight": 0.01,
@@ -39,13 +39,13 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "alpha": "blend",
         "billboards": 4,
         "placement": "even",
-        "placement_rate": 0.0,
+        "placement_learning_rate": 0.0,
         "texel_density": 1.0,
         "bounds": "viewport",
         "loss": "l2",
         "ssim_weight": 0.0,
         "sharpness_weight": 0.0,
-        "crispness_weight": 0.0,
+        "binarization_weight": 0.0,
         "levels": 1,
         "steps": 10_000,
         "views_per_step": 1,
@@ -59,9 +59,9 @@ _PRESETS: dict[str, dict[str, Any]] = {
 # What the default preset takes by the alpha mode: what is cut off has no half-transparent texels to smooth it, and drawing by chance is
 # the noisier the more there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
-    "mask": {"texel_density": 1.0, "sharpness_weight": 24.0, "crispness_weight": 0.06},
-    "blend": {"texel_density": 1.25, "sharpness_weight": 14.0, "crispness_weight": 0.004},
-    "hash": {"texel_density": 1.25, "sharpness_weight": 14.0, "crispness_weight": 0.03},
+    "mask": {"texel_density": 1.0, "sharpness_weight": 24.0, "binarization_weight": 0.06},
+    "blend": {"texel_density": 1.25, "sharpness_weight": 14.0, "binarization_weight": 0.004},
+    "hash": {"texel_density": 1.25, "sharpness_weight": 14.0, "binarization_weight": 0.03},
 }
 
 
@@ -84,14 +84,14 @@ class FitConfig:
     Preset: clusters; thesis: even."""
     orientation: Orientation = "any"
     """How clusters may stand: upright, leaning any way (free), or as does better (any)."""
-    searches: int | None = None
+    restarts: int | None = None
     """Searches for a placement, of which the best one counts. Left out: two from eight billboards on, else one."""
     candidates: int = 12
     """Clusterings that a search compares; more take longer and may find a better one."""
-    revisions: int | None = None
+    refinement_rounds: int | None = None
     """Rounds in which the best placement found is revised, by moving, splitting and merging billboards.
     Left out: five for eight billboards, at least one and at most six."""
-    placement_rate: float | None = None
+    placement_learning_rate: float | None = None
     """How fast billboards move while they are fitted, at first: radians a step, and shares of the tree's radius. 0: they stay.
     Preset: 0.015; thesis: 0."""
     sides: Sides = "one"
@@ -111,20 +111,20 @@ class FitConfig:
     ssim_weight: float | None = None
     """Weight of 1 - SSIM, which keeps structure, beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: float | None = None
-    """Weight against blur: of the squared difference in mean contrast of neighbouring pixels, at full resolution.
+    """Weight against blur: of the squared difference in mean contrast of neighboring pixels, at full resolution.
     Preset: 24 (mask) or 14; thesis: 0."""
-    crispness_weight: float | None = None
+    binarization_weight: float | None = None
     """Weight for opaque leaves and clear air: of alpha * (1 - alpha), summed over texels, over a view's pixels, at full resolution.
     Preset: 0.06 (mask), 0.004 (blend) or 0.03 (hash); thesis: 0."""
     levels: int | None = None
     """How many resolutions there are, from coarse to fine, sides doubling from each to the next; steps are shared out evenly.
     Preset: 4; thesis: 1."""
     steps: int | None = None
-    """Steps of the optimiser. Preset: 1200; thesis: 10000."""
+    """Steps of the optimizer. Preset: 1200; thesis: 10000."""
     views_per_step: int | None = None
     """Views that a step looks at, at full resolution; twice as many at each coarser one. Preset: 2; thesis: 1."""
     learning_rate: float | None = None
-    """Step size of the optimiser, Adam, at first. Preset: 0.3; thesis: 0.01."""
+    """Step size of the optimizer, Adam, at first. Preset: 0.3; thesis: 0.01."""
     beta1: float | None = None
     """What is left of Adam's first moment, the mean gradient, after a step. Preset: 0.8; thesis: 0.9."""
     beta2: float | None = None
@@ -148,13 +148,13 @@ class FitConfig:
             check_count("billboards", self.billboards)
         check_choice("placement", self.placement, (None, "even", "clusters"))
         check_choice("orientation", self.orientation, ("any", "upright", "free"))
-        if self.searches is not None:
-            check_count("searches", self.searches)
+        if self.restarts is not None:
+            check_count("restarts", self.restarts)
         check_count("candidates", self.candidates)
-        if self.revisions is not None:
-            check_count("revisions", self.revisions, 0)
-        if self.placement_rate is not None:
-            check_range("placement_rate", self.placement_rate, 0, 1)
+        if self.refinement_rounds is not None:
+            check_count("refinement_rounds", self.refinement_rounds, 0)
+        if self.placement_learning_rate is not None:
+            check_range("placement_learning_rate", self.placement_learning_rate, 0, 1)
         check_choice("sides", self.sides, ("one", "two", "pair"))
         check_choice("bounds", self.bounds, (None, "viewport", "thesis", "silhouette"))
         if self.texel_density is not None:
@@ -169,8 +169,8 @@ class FitConfig:
             check_range("ssim_weight", self.ssim_weight, 0, 1)
         if self.sharpness_weight is not None:
             check_range("sharpness_weight", self.sharpness_weight, 0, 1000)
-        if self.crispness_weight is not None:
-            check_range("crispness_weight", self.crispness_weight, 0, 10)
+        if self.binarization_weight is not None:
+            check_range("binarization_weight", self.binarization_weight, 0, 10)
         check_choice("backend", self.backend, ("auto", "reference", "fused"))
         if self.levels is not None:
             check_count("levels", self.levels)
@@ -186,7 +186,7 @@ class FitConfig:
 
     def coarse(self) -> FitConfig:
         """The same for less than full resolution: without the weights that count only there."""
-        return replace(self, sharpness_weight=0.0, crispness_weight=0.0)
+        return replace(self, sharpness_weight=0.0, binarization_weight=0.0)
 
     def resolve(self) -> FitConfig:
         """The same with every ``None`` replaced by the preset's value.
@@ -203,12 +203,12 @@ class FitConfig:
         textures = (resolved.billboards or 0) * (1 if resolved.sides == "one" else 2)
         if resolved.max_texels is not None and resolved.max_texels < textures:
             fail("max_texels", f"{resolved.max_texels} are too few for {textures} textures", "allow more")
-        if resolved.searches is None:
+        if resolved.restarts is None:
             assert resolved.billboards is not None
-            resolved = replace(resolved, searches=min(2, max(1, resolved.billboards // 4)))
-        if resolved.revisions is None:
+            resolved = replace(resolved, restarts=min(2, max(1, resolved.billboards // 4)))
+        if resolved.refinement_rounds is None:
             assert resolved.billboards is not None
-            resolved = replace(resolved, revisions=min(6, max(1, resolved.billboards - 3)))
+            resolved = replace(resolved, refinement_rounds=min(6, max(1, resolved.billboards - 3)))
         if resolved.sides == "pair" and resolved.placement == "clusters":
             fail("sides", "pairs stand evenly around an axis, not in clusters", "add --placement even, or choose one or two")
         return resolved

@@ -22,7 +22,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
 @wp.func
 def over_white(c: wp.vec4) -> wp.vec3:
-    """A premultiplied colour over white."""
+    """A premultiplied color over white."""
     through = 1.0 - c[3]
     return wp.vec3(c[0] + through, c[1] + through, c[2] + through)
 

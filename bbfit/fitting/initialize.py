@@ -27,7 +27,7 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
     """
     camera, config = views.cameras, config.resolve()
     assert config.billboards is not None and config.texel_density is not None
-    axis, focal = convergence_point(camera), pixels_a_metre(camera)
+    axis, focal = convergence_point(camera), pixels_a_meter(camera)
     density = config.texel_density * float(focal)
     size = torch.tensor([camera.height, camera.width])
     sides = config.sides
@@ -50,21 +50,21 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
     return random_textures(planes.to(torch.float32), planes.texture_sizes, config.seed)
 
 
-def pixels_a_metre(camera: Camera) -> Tensor:
-    """Pixels that a metre takes up where the tree's axis is seen face on, a scalar."""
+def pixels_a_meter(camera: Camera) -> Tensor:
+    """Pixels that a meter takes up where the tree's axis is seen face on, a scalar."""
     focal = camera.intrinsics[:, 0, 0].mean()
     return focal if camera.orthographic else focal / (camera.position - convergence_point(camera)).norm(dim=-1).mean()
 
 
 def tree_radius(views: ViewSet) -> float:
-    """Root mean square distance of the tree from its middle, in metres, as some views show it; as deep as it is wide."""
+    """Root mean square distance of the tree from its middle, in meters, as some views show it; as deep as it is wide."""
     alphas = torch.stack([views.image(i)[..., 3].double() for i in range(0, len(views), max(1, len(views) // 8))])
     spread = 0.0
     for weights, share in ((alphas.sum(1), 2.0), (alphas.sum(2), 1.0)):
         weights = weights / weights.sum(-1, keepdim=True)
         at = torch.arange(weights.shape[1], dtype=torch.float64)
         spread += share * float(((weights * at.square()).sum(-1) - (weights * at).sum(-1).square()).mean())
-    return math.sqrt(spread) / float(pixels_a_metre(views.cameras))
+    return math.sqrt(spread) / float(pixels_a_meter(views.cameras))
 
 
 def random_textures(cloud: BillboardCloud, sizes: Tensor, seed: int) -> BillboardCloud:
@@ -74,18 +74,18 @@ def random_textures(cloud: BillboardCloud, sizes: Tensor, seed: int) -> Billboar
     return replace(cloud, texture_sizes=sizes, texels=texels)
 
 
-def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_metre: float, most: int | None = None) -> BillboardCloud:
-    """Cut billboards down to ``bounds``, [N, 4] left, right, bottom, top in metres from their centres, and size them (:func:`sized`)."""
+def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_meter: float, most: int | None = None) -> BillboardCloud:
+    """Cut billboards down to ``bounds``, [N, 4] left, right, bottom, top in meters from their centers, and size them (:func:`sized`)."""
     left, right, bottom, top = bounds.unbind(-1)
     middle, sides = torch.stack([left + right, bottom + top], -1) / 2, torch.stack([right - left, top - bottom], -1)
     centers = planes.centers + middle[:, :1] * planes.rights + middle[:, 1:] * planes.ups
-    return sized(replace(planes, centers=centers, half_extents=sides / 2), texels_a_metre, most)
+    return sized(replace(planes, centers=centers, half_extents=sides / 2), texels_a_meter, most)
 
 
-def sized(cloud: BillboardCloud, texels_a_metre: float, most: int | None = None) -> BillboardCloud:
-    """The same billboards with transparent textures of ``texels_a_metre``, square texels, rectangles rounded up to whole ones.
+def sized(cloud: BillboardCloud, texels_a_meter: float, most: int | None = None) -> BillboardCloud:
+    """The same billboards with transparent textures of ``texels_a_meter``, square texels, rectangles rounded up to whole ones.
 
-    With ``most`` there are fewer texels to the metre if it takes that to have no more of them than so many.
+    With ``most`` there are fewer texels to the meter if it takes that to have no more of them than so many.
 
     Raises
     ------
@@ -96,12 +96,12 @@ def sized(cloud: BillboardCloud, texels_a_metre: float, most: int | None = None)
     if most is not None and most < int(sides.sum()):
         fail("max_texels", f"{most} are too few for {int(sides.sum())} textures", "allow more")
     while True:
-        sizes = _at_least_one(2 * cloud.half_extents * texels_a_metre).flip(-1)
+        sizes = _at_least_one(2 * cloud.half_extents * texels_a_meter).flip(-1)
         count = int((sizes.prod(-1) * sides).sum())
         if most is None or count <= most:
             break
-        texels_a_metre *= min(0.995, math.sqrt(most / count))
-    half_extents = sizes.flip(-1).to(cloud.half_extents) / texels_a_metre / 2
+        texels_a_meter *= min(0.995, math.sqrt(most / count))
+    half_extents = sizes.flip(-1).to(cloud.half_extents) / texels_a_meter / 2
     return replace(cloud, half_extents=half_extents, texture_sizes=sizes, texels=cloud.texels.new_zeros(1, 4).expand(count, 4))
 
 

@@ -62,9 +62,9 @@ class Targets:
 
 
 def resize_textures(cloud: BillboardCloud, sizes: Tensor) -> BillboardCloud:
-    """The same rectangles with textures of other sizes, int64 [N, 2], filtered as premultiplied colours.
+    """The same rectangles with textures of other sizes, int64 [N, 2], filtered as premultiplied colors.
 
-    The colour of what is fully transparent is filtered as it is, since a fit goes on from it.
+    The color of what is fully transparent is filtered as it is, since a fit goes on from it.
     """
     textures = [_resized(texture, size).reshape(-1, 4) for texture, size in zip(cloud.textures(), sizes.tolist(), strict=True)]
     return replace(cloud, texture_sizes=sizes, texels=torch.cat(textures))
@@ -83,7 +83,7 @@ def resampled(cloud: BillboardCloud, onto: BillboardCloud, sizes: Tensor) -> Bil
 
     They get new sizes, int64 [N, 2].
 
-    Filtered as :func:`resize_textures` does it. Beyond the border of a texture there is nothing, in the colour of the border.
+    Filtered as :func:`resize_textures` does it. Beyond the border of a texture there is nothing, in the color of the border.
     """
     if torch.equal(cloud.centers, onto.centers) and torch.equal(cloud.half_extents, onto.half_extents):
         return resize_textures(cloud, sizes)

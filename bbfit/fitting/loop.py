@@ -1,4 +1,4 @@
-"""The optimisation loop (thesis, algorithm 1), resumable."""
+"""The optimization loop (thesis, algorithm 1), resumable."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.coverage import matched_coverage
-from bbfit.fitting.initialize import bounded, pixels_a_metre, random_textures, sized, start_cloud, tree_radius
+from bbfit.fitting.initialize import bounded, pixels_a_meter, random_textures, sized, start_cloud, tree_radius
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.points import hull_points, mesh_points
@@ -29,7 +29,7 @@ from bbfit.fitting.steps import BLEND, HARDEST, Stepper, make_stepper
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
-from bbfit.images import bleed_colour
+from bbfit.images import bleed_color
 from bbfit.views import ViewDataset
 
 _START, _FOUND = "start.", "found."
@@ -39,7 +39,7 @@ _HARDENING = 0.3
 
 @dataclass(frozen=True)
 class Step:
-    """What ``on_step`` is told after every optimiser step."""
+    """What ``on_step`` is told after every optimizer step."""
 
     index: int
     """Steps done, from 1."""
@@ -68,7 +68,7 @@ class FitResult:
 
 
 @dataclass
-class _Progress:
+class _FitState:
     """What a checkpoint holds."""
 
     losses: list[float]
@@ -96,7 +96,7 @@ def fit(
     First a placement is searched for, unless it is to be the even one. Then each step draws some training views, renders the cloud from
     their cameras, and lets Adam (Kingma and Ba 2015) move the texels, and at all but the finest level the billboards, down the gradient of
     the loss; texels are kept in [0, 1]. Views and textures start coarse and are refined level by level; billboards that have moved are cut
-    to what they show at the end of a level. At the end transparent texels get their neighbours' colour.
+    to what they show at the end of a level. At the end transparent texels get their neighbors' color.
 
     Parameters
     ----------
@@ -135,13 +135,13 @@ def fit(
 
     start, fitted, losses = done.start, done.found, done.losses
     assert config.texel_density is not None
-    density, radius = config.texel_density * float(pixels_a_metre(views.train.cameras)), tree_radius(views.train)
+    density, radius = config.texel_density * float(pixels_a_meter(views.train.cameras)), tree_radius(views.train)
     for level in (levels := levels_of(config, views.train.cameras)):
         if len(losses) > level.end:
             continue  # the checkpoint is of a later level
         sizes = shrunk_sizes(start, level.halvings)
         cloud = random_textures(start, sizes, config.seed) if fitted is None else resampled(fitted, start, sizes)
-        movement = Movement(cloud, radius) if config.placement_rate and (level.halvings or len(levels) == 1) else None
+        movement = Movement(cloud, radius) if config.placement_learning_rate and (level.halvings or len(levels) == 1) else None
         asked = config.coarse() if level.halvings else config
         stepper = make_stepper(cloud.to(device), Targets.at(views.train, level.halvings), asked, movement)
         del cloud  # the stepper has its own texels, and those of large views take hundreds of megabytes
@@ -150,13 +150,13 @@ def fit(
             stepper.restore(done.tensors, len(losses) - level.begin)
         for index in range(len(losses), level.end):
             rate = learning_rate(config, index)
-            placement_rate = (config.placement_rate or 0.0) * rate / config.learning_rate
-            chosen = draw_views(config, len(views.train), index, level.halvings)
-            losses.append(float(stepper.step(chosen, rate, placement_rate, drawn_as(config, level, index))))
+            placement_learning_rate = (config.placement_learning_rate or 0.0) * rate / config.learning_rate
+            chosen = sample_views(config, len(views.train), index, level.halvings)
+            losses.append(float(stepper.step(chosen, rate, placement_learning_rate, drawn_as(config, level, index))))
             if on_step is not None:
                 on_step(Step(index + 1, config.steps, losses[-1], rate, partial(_cloud_of, stepper)))
             if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
-                _save(checkpoint, mark, _Progress(losses, start, None, stepper.tensors(), time.perf_counter() - begun))
+                _save(checkpoint, mark, _FitState(losses, start, None, stepper.tensors(), time.perf_counter() - begun))
         fitted = stepper.finish()
         del stepper
         if movement is not None:
@@ -165,25 +165,25 @@ def fit(
     fitted = replace(fitted, alpha=AlphaMode(config.alpha, config.alpha_cutoff))
     if config.alpha == "mask":
         fitted = matched_coverage(fitted, views.train, config.backend)
-    # No view determines the colour of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
-    bled = [bleed_colour(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
+    # No view determines the color of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
+    bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
-    stand = config.placement == "even" and not config.placement_rate
+    stand = config.placement == "even" and not config.placement_learning_rate
     return FitResult(fitted if stand else trimmed(fitted), losses, config, time.perf_counter() - begun)
 
 
-def _begin(views: ViewDataset, config: FitConfig, tree: str | Path | None, on_place: Callable[[int, int], None] | None) -> _Progress:
+def _begin(views: ViewDataset, config: FitConfig, tree: str | Path | None, on_place: Callable[[int, int], None] | None) -> _FitState:
     """Before the first step: evenly placed billboards, or what the search finds."""
     if config.placement == "even":
-        return _Progress([], start_cloud(views.train, config), None, {}, 0.0)
+        return _FitState([], start_cloud(views.train, config), None, {}, 0.0)
     if tree is None:
         points = hull_points(views.train, seed=config.seed)
     else:
         points = mesh_points(tree, views.train, seed=config.seed)
     assert config.texel_density is not None
     found = find_placement(views.train, points, config, on_place)
-    density = config.texel_density * float(pixels_a_metre(views.train.cameras))
-    return _Progress([], sized(found, density, config.max_texels), found, {}, 0.0)
+    density = config.texel_density * float(pixels_a_meter(views.train.cameras))
+    return _FitState([], sized(found, density, config.max_texels), found, {}, 0.0)
 
 
 def _cloud_of(stepper: Stepper) -> BillboardCloud:
@@ -191,7 +191,7 @@ def _cloud_of(stepper: Stepper) -> BillboardCloud:
 
 
 @dataclass(frozen=True)
-class Level:
+class ResolutionLevel:
     """Steps that are taken at one resolution."""
 
     halvings: int
@@ -202,16 +202,16 @@ class Level:
     """Steps after the level."""
 
 
-def levels_of(config: FitConfig, cameras: Camera) -> list[Level]:
+def levels_of(config: FitConfig, cameras: Camera) -> list[ResolutionLevel]:
     """The levels of a resolved configuration, coarse to fine; levels of very small pictures are left out."""
     assert config.levels is not None and config.steps is not None
     side = min(cameras.width, cameras.height)
     halvings = [h for h in reversed(range(config.levels)) if h == 0 or side >> h >= LEAST_SIDE]
     edges = [config.steps * i // len(halvings) for i in range(len(halvings) + 1)]
-    return [Level(*level) for level in zip(halvings, edges, edges[1:], strict=False)]
+    return [ResolutionLevel(*level) for level in zip(halvings, edges, edges[1:], strict=False)]
 
 
-def drawn_as(config: FitConfig, level: Level, index: int) -> AlphaMode:
+def drawn_as(config: FitConfig, level: ResolutionLevel, index: int) -> AlphaMode:
     """How step ``index`` (from 0) of a resolved configuration draws: as blend, but for a mask at full resolution.
 
     There the ramp about the cutoff hardens over the first third of the level's steps, and then is a step. At lower resolutions what is cut
@@ -236,7 +236,7 @@ def learning_rate(config: FitConfig, index: int) -> float:
     return config.learning_rate * 0.5 * (1 + math.cos(math.pi * index / config.steps))
 
 
-def draw_views(config: FitConfig, count: int, index: int, halvings: int = 0) -> list[int]:
+def sample_views(config: FitConfig, count: int, index: int, halvings: int = 0) -> list[int]:
     """The training views of step ``index``, of ``count``: a function of the seed and the step alone, so that any step can be resumed.
 
     One view a step is drawn at random with replacement (thesis, algorithm 1); several are dealt from reshuffled decks, so that all
@@ -260,7 +260,7 @@ def _device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def _save(path: Path, mark: str, progress: _Progress) -> None:
+def _save(path: Path, mark: str, progress: _FitState) -> None:
     tensors = {name: tensor.detach().cpu() for name, tensor in progress.tensors.items()}
     tensors["losses"] = torch.tensor(progress.losses, dtype=torch.float64)
     for prefix, cloud in {_START: progress.start, _FOUND: progress.found}.items():
@@ -270,7 +270,7 @@ def _save(path: Path, mark: str, progress: _Progress) -> None:
     write_tensors(path, tensors, {"fit": mark, "seconds": repr(progress.seconds)})
 
 
-def _load(path: Path, mark: str) -> _Progress | None:
+def _load(path: Path, mark: str) -> _FitState | None:
     """What is kept in a checkpoint, or ``None`` if there is none for this very fit."""
     from safetensors import SafetensorError, safe_open
 
@@ -291,4 +291,4 @@ def _load(path: Path, mark: str) -> _Progress | None:
     texels = parts[_START]["texture_sizes"].prod(-1) * (1 + parts[_START]["two_sided"].long())
     start = BillboardCloud(**parts[_START], texels=torch.zeros(1, 4).expand(int(texels.sum()), 4))
     found = BillboardCloud(**parts[_FOUND]) if parts[_FOUND] else None
-    return _Progress(tensors.pop("losses").tolist(), start, found, tensors, float(metadata["seconds"]))
+    return _FitState(tensors.pop("losses").tolist(), start, found, tensors, float(metadata["seconds"]))

@@ -19,12 +19,12 @@ def image_loss(render: Tensor, target: Tensor, kind: Loss, ssim_weight: float, s
 
     Differences are summed over the four channels and averaged over pixels, as the thesis's ``1/p * sum`` does.
 
-    ``backgrounds`` is what the squared difference of colours over an opaque background is in expectation, if every channel b of the
-    background is uniform in [0, 1]. With the differences c of premultiplied colour and a of alpha it has a closed form,
+    ``backgrounds`` is what the squared difference of colors over an opaque background is in expectation, if every channel b of the
+    background is uniform in [0, 1]. With the differences c of premultiplied color and a of alpha it has a closed form,
 
         sum over channels of E[(c - a b)^2] = sum of (c^2 - a c) + a^2,
 
-    the L2 loss but for one term: colour that is missing is worth less where alpha is missing with it, since the background shows instead.
+    the L2 loss but for one term: color that is missing is worth less where alpha is missing with it, since the background shows instead.
 
     Parameters
     ----------
@@ -70,9 +70,9 @@ def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
 
 
 def sharpness_difference(render: Tensor, target: Tensor) -> Tensor:
-    """How differently sharp two pictures are over white, block by block: 0 if each has as much contrast between neighbours as the other.
+    """How differently sharp two pictures are over white, block by block: 0 if each has as much contrast between neighbors as the other.
 
-    For blocks of 8 x 8 pixels the mean absolute difference of neighbours, across and down, is compared by its square, and that is averaged
+    For blocks of 8 x 8 pixels the mean absolute difference of neighbors, across and down, is compared by its square, and that is averaged
     over blocks, channels and views and summed over both directions. A squared difference of the pictures alone is least for a blur
     wherever a detail cannot be in the right place in every view; this asks for as much detail as there is, wherever it is.
 
@@ -95,7 +95,7 @@ def sharpness_difference(render: Tensor, target: Tensor) -> Tensor:
     return total
 
 
-def blending(texels: Tensor) -> Tensor:
+def binarization_loss(texels: Tensor) -> Tensor:
     """How much of the texels is neither there nor not: the sum of alpha (1 - alpha); texels without alpha have no derivative. A scalar."""
     alpha = texels[:, 3]
     return torch.where(alpha > 0, alpha * (1 - alpha), 0).sum()

@@ -18,12 +18,12 @@ _EXTENT_RATE = 0.3
 class Movement:
     """How far N billboards have moved from where they began, as eight numbers each.
 
-    Three are a translation, in multiples of ``reach``; three a rotation vector in radians, about the billboard's centre; two the
+    Three are a translation, in multiples of ``reach``; three a rotation vector in radians, about the billboard's center; two the
     logarithms by which its half extents have grown. Gradients arrive through the homographies.
     """
 
     def __init__(self, cloud: BillboardCloud, reach: float) -> None:
-        cloud = cloud.bare().to("cpu")
+        cloud = cloud.without_textures().to("cpu")
         self._cloud = replace(cloud, **{name: getattr(cloud, name).double() for name in ("centers", "rights", "ups", "half_extents")})
         self._units = torch.tensor([reach] * 3 + [1.0] * 3 + [_EXTENT_RATE] * 2, dtype=torch.float64)
         self._kept = torch.zeros(3, len(cloud), 8, dtype=torch.float64)  # the numbers, and their first and second moments
@@ -49,7 +49,7 @@ class Movement:
         )
 
     def placement(self) -> Tensor:
-        """Where the billboards are now: centres, rights, ups and half extents side by side, float64 [N, 11]; many times faster."""
+        """Where the billboards are now: centers, rights, ups and half extents side by side, float64 [N, 11]; many times faster."""
         moved, cloud = self.parameters * self._units, self._cloud
         vectors = moved[:, 3:6]
         angles = vectors.norm(dim=-1, keepdim=True)

@@ -12,7 +12,7 @@ from torch.nn.functional import max_pool2d
 from bbfit.blender.meshes import tree_mesh
 from bbfit.blender.sources import UP_AXIS
 from bbfit.checks import fail
-from bbfit.fitting.initialize import pixels_a_metre
+from bbfit.fitting.initialize import pixels_a_meter
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, convergence_point
 from bbfit.views import ViewSet
 
@@ -75,8 +75,8 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
     # Beyond the picture there is nothing either, unless the tree is cut off by its border.
     cropped = [bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()) for mask in masks]
     cameras = cameras.resized(masks[0].shape[1], masks[0].shape[0])
-    centre, extent = convergence_point(cameras), max(cameras.width, cameras.height) / float(pixels_a_metre(cameras))
-    low, high = centre - extent / 2, centre + extent / 2
+    center, extent = convergence_point(cameras), max(cameras.width, cameras.height) / float(pixels_a_meter(cameras))
+    low, high = center - extent / 2, center + extent / 2
     generator, found = torch.Generator().manual_seed(seed), list[Tensor]()
     for _ in range(_ROUNDS):
         points = low + (high - low) * torch.rand(_CARVED, 3, dtype=torch.float64, generator=generator)
@@ -94,7 +94,7 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
     return hull
 
 
-def point_colours(pixels: list[tuple[Tensor, Tensor]], pictures: Tensor) -> Tensor:
+def point_colors(pixels: list[tuple[Tensor, Tensor]], pictures: Tensor) -> Tensor:
     """Straight RGB of points as views show them on average, occlusion ignored, [P, 3] float32.
 
     Parameters

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, seen_across, splatted, split_planes
 from bbfit.fitting.config import FitConfig
-from bbfit.fitting.initialize import pixels_a_metre, tree_radius
+from bbfit.fitting.initialize import pixels_a_meter, tree_radius
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.losses import pixel_losses
 from bbfit.fitting.movement import Movement
-from bbfit.fitting.points import pixels_of, point_colours
+from bbfit.fitting.points import pixels_of, point_colors
 from bbfit.fitting.steps import make_stepper
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.dispatch import render
@@ -70,12 +70,12 @@ class _Search:
         self._pictures = self._targets.pictures(range(len(views)))
         cameras = self._targets.cameras
         assert config.texel_density is not None and config.billboards is not None
-        assert config.searches is not None and config.revisions is not None
-        self._density = float(pixels_a_metre(cameras)) * config.texel_density
+        assert config.restarts is not None and config.refinement_rounds is not None
+        self._density = float(pixels_a_meter(cameras)) * config.texel_density
         self._seen = seen_across(cameras)
         self._pixels = [pixels_of(points, cameras[index]) for index in range(len(cameras))]
         self._all_upright = config.orientation == "upright"
-        self._colours = point_colours(self._pixels, self._pictures)
+        self._colors = point_colors(self._pixels, self._pictures)
         self._radius = tree_radius(views)
         self._added = config.billboards // _ADDED
         self._clusters, self._survivors = config.billboards - self._added, max(1, round(_SURVIVORS * config.candidates))
@@ -84,13 +84,13 @@ class _Search:
         self._chains = min(self._survivors, max(1, config.billboards // 2))
         completed = sum(max(1, self._chains >> addition) for addition in range(self._added))
         each = _STEPS * config.candidates + _MORE_STEPS * self._survivors + _MEND_STEPS * _ADDITIONS * completed
-        self._total = config.searches * each + _MEND_STEPS * _REVISIONS * config.revisions
+        self._total = config.restarts * each + _MEND_STEPS * _REVISIONS * config.refinement_rounds
 
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
-        assert self._config.searches is not None and self._config.revisions is not None
-        best = min((self._searched(number) for number in range(self._config.searches)), key=itemgetter(1))
-        for turn in range(self._config.revisions):
+        assert self._config.restarts is not None and self._config.refinement_rounds is not None
+        best = min((self._searched(number) for number in range(self._config.restarts)), key=itemgetter(1))
+        for turn in range(self._config.refinement_rounds):
             best = min(best, self._best_of([best[0], *self._revised(best[0], turn)]), key=itemgetter(1))
         return best[0]
 
@@ -187,19 +187,19 @@ class _Search:
         return self._textured(held, Planes(normal[None], offset[None], torch.zeros(len(held), dtype=torch.int64)))
 
     def _textured(self, held: Tensor, planes: Planes) -> BillboardCloud:
-        points, colours = self._points[held], self._colours[held]
-        bare = rectangles(points, planes, self._density, _MARGIN * self._radius, two_sided=self._config.sides == "two")
-        return splatted(bare, points, colours, planes.labels).to(torch.float32)
+        points, colors = self._points[held], self._colors[held]
+        without_textures = rectangles(points, planes, self._density, _MARGIN * self._radius, two_sided=self._config.sides == "two")
+        return splatted(without_textures, points, colors, planes.labels).to(torch.float32)
 
     def _fitted(self, clouds: list[BillboardCloud], steps: int, rate: float) -> tuple[list[BillboardCloud], list[float]]:
         """Clouds of equal numbers after some steps in which the billboards move with their textures, and their losses over all views."""
         config, together = self._config, BillboardCloud.joined(clouds)
-        movement = Movement(together, self._radius) if config.placement_rate else None
+        movement = Movement(together, self._radius) if config.placement_learning_rate else None
         stepper = make_stepper(together.to(config.device), self._targets, config, movement, groups=len(clouds))
         for step in range(steps):
             fall = 0.5 * (1 + math.cos(math.pi * step / steps))
             chosen = torch.randperm(len(self._targets.cameras), generator=self._generator)[:_BATCH].tolist()
-            stepper.step(chosen, rate * fall, (config.placement_rate or 0.0) * fall)
+            stepper.step(chosen, rate * fall, (config.placement_learning_rate or 0.0) * fall)
             self._done += len(clouds)
             self._on_work(self._done, self._total)
         clouds = stepper.finish().parts(len(clouds))

@@ -1,4 +1,4 @@
-"""One optimiser step: render, loss, gradient, update; by the fused kernels, or by the reference renderer and autograd."""
+"""One optimizer step: render, loss, gradient, update; by the fused kernels, or by the reference renderer and autograd."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.levels import Targets
-from bbfit.fitting.losses import blending, image_loss
+from bbfit.fitting.losses import binarization_loss, image_loss
 from bbfit.fitting.movement import Movement
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
@@ -31,12 +31,12 @@ BLEND = AlphaMode()
 
 
 def alpha_rate(alpha: AlphaMode) -> float:
-    """By how much alpha moves less than colour in a step: the harder the ramp, the more a change of alpha shows."""
+    """By how much alpha moves less than color in a step: the harder the ramp, the more a change of alpha shows."""
     return 1.0 if alpha.kind == "blend" else min(alpha.hardness, HARDEST) ** -0.5
 
 
 class Stepper(Protocol):
-    """An optimiser of a cloud's texels and, if it has been given a movement, of where the billboards stand."""
+    """An optimizer of a cloud's texels and, if it has been given a movement, of where the billboards stand."""
 
     @property
     def texels(self) -> Tensor:
@@ -49,7 +49,7 @@ class Stepper(Protocol):
     def finish(self) -> BillboardCloud:
         """The same as :attr:`cloud` without a copy; no step may follow."""
 
-    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
+    def step(self, chosen: Sequence[int], rate: float, placement_learning_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
         """Take the next step on the chosen views, drawn in an alpha mode; return the loss before the update, a scalar."""
 
     def tensors(self) -> dict[str, Tensor]:
@@ -79,7 +79,7 @@ class ReferenceStepper:
     def __init__(
         self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None, groups: int = 1
     ) -> None:
-        self._cloud, self._targets, self._config, self._movement, self._groups = cloud.bare(), targets, config, movement, groups
+        self._cloud, self._targets, self._config, self._movement, self._groups = cloud.without_textures(), targets, config, movement, groups
         self._start(cloud.texels.clone(), torch.zeros_like(cloud.texels), torch.zeros_like(cloud.texels), 0)
 
     def _start(self, texels: Tensor, first_moment: Tensor, second_moment: Tensor, steps: int) -> None:
@@ -114,13 +114,13 @@ class ReferenceStepper:
         texels = self.texels.detach().cpu()
         return self._movement.now(texels) if self._movement else self._cloud.to("cpu").with_texels(texels)
 
-    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
+    def step(self, chosen: Sequence[int], rate: float, placement_learning_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
         """See :class:`Stepper`."""
         device = self.texels.device
         self._adam.param_groups[0]["lr"] = rate
         cloud, moved = replace(self._cloud, texels=self.texels, alpha=alpha), None
         if self._movement:
-            moved = self._movement.parameters.clone().requires_grad_(bool(placement_rate))
+            moved = self._movement.parameters.clone().requires_grad_(bool(placement_learning_rate))
             cloud = replace(self._movement.placed(moved, self.texels).to(torch.float32).to(device), alpha=alpha)
         config, cameras = self._config, self._targets.cameras[list(chosen)].to(device)
         assert config.loss is not None
@@ -129,7 +129,7 @@ class ReferenceStepper:
             image = render_reference(group, cameras)
             loss = loss + image_loss(image, target, config.loss, config.ssim_weight or 0.0, config.sharpness_weight or 0.0)
         self._adam.zero_grad()
-        (loss + (config.crispness_weight or 0.0) * blending(self.texels) / (target.shape[1] * target.shape[2])).backward()
+        (loss + (config.binarization_weight or 0.0) * binarization_loss(self.texels) / (target.shape[1] * target.shape[2])).backward()
         before = self.texels.detach()[:, 3].clone()
         self._adam.step()
         with torch.no_grad():
@@ -137,7 +137,7 @@ class ReferenceStepper:
             self.texels.clamp_(0, 1)
         if moved is not None and moved.grad is not None:
             assert self._movement is not None
-            self._movement.update(moved.grad, placement_rate)
+            self._movement.update(moved.grad, placement_learning_rate)
         return loss.detach()
 
 
@@ -151,7 +151,7 @@ class FusedStepper:
         from bbfit.rendering.fused_projection import Projector
         from bbfit.rendering.projection import project
 
-        self._cloud, self._targets, self._config, self._movement, self._groups = cloud.bare(), targets, config, movement, groups
+        self._cloud, self._targets, self._config, self._movement, self._groups = cloud.without_textures(), targets, config, movement, groups
         self._begin, self.steps = padded(cloud.texels), 0
         self._scratch: list[Tensor] | None = None
         self._standing = None if movement else project(self._cloud, targets.cameras.to(cloud.texels.device))
@@ -189,7 +189,7 @@ class FusedStepper:
         if self._movement:
             self._movement.restore(tensors)
 
-    def step(self, chosen: Sequence[int], rate: float, placement_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
+    def step(self, chosen: Sequence[int], rate: float, placement_learning_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
         """See :class:`Stepper`."""
         from bbfit.rendering.fused import PixelLoss, differentiate
 
@@ -209,7 +209,7 @@ class FusedStepper:
             target = target.repeat(groups, 1, 1, 1)
         loss = PixelLoss(target, self._targets.shrunk is None, config.loss, 1 / pixels)
         lost, of_image = self._perceived(projection, loss)
-        moves = movement is not None and placement_rate > 0
+        moves = movement is not None and placement_learning_rate > 0
         sums, of_matrices = differentiate(
             state.texels,
             projection,
@@ -223,11 +223,11 @@ class FusedStepper:
         if of_matrices is not None:
             assert movement is not None and self._projector is not None
             of_matrices = of_matrices.unflatten(0, (groups, -1)).transpose(0, 1).flatten(1, 2)
-            movement.update(movement.pull_back(placement, self._projector.pull_back(of_matrices).cpu()), placement_rate)
+            movement.update(movement.pull_back(placement, self._projector.pull_back(of_matrices).cpu()), placement_learning_rate)
         self.steps += 1
         assert config.beta1 is not None and config.beta2 is not None
-        crispness = (config.crispness_weight or 0.0) / (projection.width * projection.height)
-        state.update(self.steps, rate, (config.beta1, config.beta2), crispness, alpha_rate(alpha))
+        binarization = (config.binarization_weight or 0.0) / (projection.width * projection.height)
+        state.update(self.steps, rate, (config.beta1, config.beta2), binarization, alpha_rate(alpha))
         return sums.sum() / pixels + lost
 
     def _perceived(self, projection: Projection, loss: PixelLoss) -> tuple[Tensor | float, Tensor | None]:

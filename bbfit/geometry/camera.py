@@ -1,11 +1,11 @@
 """Cameras, and the conventions that hold everywhere in bbfit.
 
 World
-    Right-handed, Y up, metres, as glTF.
+    Right-handed, Y up, meters, as glTF.
 Camera axes
     +X right, +Y down, +Z forward, as OpenCV and kornia.
 Pixels
-    (0, 0) is the *centre* of the top-left pixel, in images and textures alike.
+    (0, 0) is the *center* of the top-left pixel, in images and textures alike.
 
 The Z-up worlds of Blender and of the NeRF-synthetic layout are converted at the border, by :func:`camera_from_nerf` and
 :func:`camera_to_nerf`.
@@ -38,7 +38,7 @@ class Camera:
     world_to_camera: Tensor
     """Rigid transform, [V, 4, 4] or [4, 4]."""
     intrinsics: Tensor
-    """Calibration matrix, [V, 3, 3] or [3, 3]: focal lengths in pixels (pixels per metre when orthographic) and principal point."""
+    """Calibration matrix, [V, 3, 3] or [3, 3]: focal lengths in pixels (pixels per meter when orthographic) and principal point."""
     width: int
     """Image width in pixels."""
     height: int
@@ -85,7 +85,7 @@ class Camera:
         scale = torch.tensor([width / self.width, height / self.height], dtype=self.intrinsics.dtype, device=self.intrinsics.device)
         intrinsics = self.intrinsics.clone()
         intrinsics[..., :2, :] *= scale[:, None]
-        intrinsics[..., :2, 2] += (scale - 1) / 2  # pixel centres lie at whole numbers, so the corner is at -1/2
+        intrinsics[..., :2, 2] += (scale - 1) / 2  # pixel centers lie at whole numbers, so the corner is at -1/2
         return Camera(self.world_to_camera, intrinsics, width, height, self.orthographic)
 
     @property
@@ -98,7 +98,7 @@ class Camera:
 
     @property
     def position(self) -> Tensor:
-        """Camera centres in the world, [V, 3] or [3]."""
+        """Camera centers in the world, [V, 3] or [3]."""
         return self.camera_to_world[..., :3, 3]
 
     @property
@@ -128,7 +128,7 @@ class Camera:
 
         Parameters
         ----------
-        points : [P, 3] in metres.
+        points : [P, 3] in meters.
 
         Returns
         -------
@@ -141,9 +141,9 @@ class Camera:
 
 
 def pinhole_intrinsics(fov_x_degrees: float, width: int, height: int) -> Tensor:
-    """Intrinsics of a pinhole with square pixels and a centred principal point, [3, 3] float64.
+    """Intrinsics of a pinhole with square pixels and a centerd principal point, [3, 3] float64.
 
-    The field of view spans pixel *edges*, as in Blender and in the NeRF-synthetic layout, so the principal point in our centre-based
+    The field of view spans pixel *edges*, as in Blender and in the NeRF-synthetic layout, so the principal point in our center-based
     coordinates is ((width - 1) / 2, (height - 1) / 2).
     """
     focal = 0.5 * width / math.tan(math.radians(fov_x_degrees) / 2)
@@ -151,13 +151,13 @@ def pinhole_intrinsics(fov_x_degrees: float, width: int, height: int) -> Tensor:
 
 
 def orthographic_intrinsics(extent_x: float, width: int, height: int) -> Tensor:
-    """Intrinsics of an orthographic camera whose image is ``extent_x`` metres wide, [3, 3] float64."""
+    """Intrinsics of an orthographic camera whose image is ``extent_x`` meters wide, [3, 3] float64."""
     return _intrinsics(width / extent_x, width, height)
 
 
 def _intrinsics(focal: float, width: int, height: int) -> Tensor:
-    centre = ((width - 1) / 2, (height - 1) / 2)
-    return torch.tensor([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]], dtype=torch.float64)
+    center = ((width - 1) / 2, (height - 1) / 2)
+    return torch.tensor([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]], dtype=torch.float64)
 
 
 def look_at(position: Tensor, target: Tensor) -> Tensor:
@@ -165,7 +165,7 @@ def look_at(position: Tensor, target: Tensor) -> Tensor:
 
     Parameters
     ----------
-    position : [V, 3] camera centres in metres.
+    position : [V, 3] camera centers in meters.
     target : [3] or [V, 3] points looked at.
 
     Returns

@@ -27,18 +27,18 @@ class BillboardCloud:
     sides. A two-sided entry owns two textures, each drawn only when the camera is on its side; both are stored as seen from the front,
     so that equal texels of both lie at the same point in space.
 
-    Texture row 0 is at the top. The rectangle spans the texels' outer *edges*; beyond the outermost texel centres the picture fades
+    Texture row 0 is at the top. The rectangle spans the texels' outer *edges*; beyond the outermost texel centers the picture fades
     to transparent over one texel, exactly as bilinear filtering does in an atlas with a transparent margin.
     """
 
     centers: Tensor
-    """Rectangle centres in metres, [N, 3]."""
+    """Rectangle centers in meters, [N, 3]."""
     rights: Tensor
     """Unit vectors along texture columns' index (to the right), [N, 3]."""
     ups: Tensor
     """Unit vectors from texture bottom to top, perpendicular to ``rights``, [N, 3]."""
     half_extents: Tensor
-    """Half width and half height in metres, [N, 2]."""
+    """Half width and half height in meters, [N, 2]."""
     texture_sizes: Tensor
     """Texture height and width in texels, int64 [N, 2]."""
     two_sided: Tensor
@@ -81,7 +81,7 @@ class BillboardCloud:
 
     @property
     def texel_density(self) -> float:
-        """Texels a metre along a side, of all textures together; 0 without any."""
+        """Texels a meter along a side, of all textures together; 0 without any."""
         area = float((4 * self.half_extents.prod(-1) * (1 + self.two_sided.long())).sum())
         return math.sqrt(len(self.texels) / area) if len(self) else 0.0
 
@@ -103,7 +103,7 @@ class BillboardCloud:
         """The same rectangles with other texels, [P, 4]."""
         return replace(self, texels=texels)
 
-    def bare(self) -> BillboardCloud:
+    def without_textures(self) -> BillboardCloud:
         """The same rectangles with transparent texels, which take no memory; do not write to them."""
         return self.with_texels(self.texels.new_zeros(1, 4).expand(len(self.texels), 4))
 
@@ -178,10 +178,10 @@ def even_upright(
     Parameters
     ----------
     count : N >= 1.
-    axis : [3] point that all rectangles are centred on horizontally and vertically.
-    half_extents : [2] or [N, 2] in metres.
+    axis : [3] point that all rectangles are centerd on horizontally and vertically.
+    half_extents : [2] or [N, 2] in meters.
     texture_sizes : [2] or [N, 2] height and width in texels.
-    sides : ``"one"``, ``"two"`` (front and back texture), or ``"pair"``: two one-sided rectangles ``gap`` metres apart along the
+    sides : ``"one"``, ``"two"`` (front and back texture), or ``"pair"``: two one-sided rectangles ``gap`` meters apart along the
         normal, both always drawn (thesis, section 6.4). A pair stands next to each other: entries 2k (front) and 2k + 1 (back).
     """
     check_count("billboards", count)

@@ -12,14 +12,14 @@ _SIGNS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
 
 
 def corners(cloud: BillboardCloud) -> Tensor:
-    """The corners of a cloud's rectangles in order around each, from the lower left as seen from the front, [N, 4, 3] float64 in metres."""
+    """The corners of a cloud's rectangles in order around each, from the lower left as seen from the front, [N, 4, 3] float64 in meters."""
     right, up = (cloud.rights * cloud.half_extents[:, :1]).double()[:, None], (cloud.ups * cloud.half_extents[:, 1:]).double()[:, None]
     across, upwards = torch.tensor(_SIGNS, dtype=torch.float64, device=cloud.centers.device)[..., None].unbind(1)
     return cloud.centers.double()[:, None] + across * right + upwards * up
 
 
 def shown_bounds(cloud: BillboardCloud, *, spared: float = 0.0) -> Tensor:
-    """Lowest and highest corner of what a cloud shows, its texels of at least half of the largest alpha, [2, 3] float64 in metres.
+    """Lowest and highest corner of what a cloud shows, its texels of at least half of the largest alpha, [2, 3] float64 in meters.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from bbfit.geometry.cloud import BillboardCloud
 def texel_to_world(cloud: BillboardCloud) -> Tensor:
     """Affine maps from homogeneous texel coordinates to homogeneous world points, [N, 4, 3]."""
     size = cloud.texture_sizes.flip(-1).to(cloud.half_extents)  # width, height
-    step = 2 * cloud.half_extents / size  # metres a texel
+    step = 2 * cloud.half_extents / size  # meters a texel
     along_x = cloud.rights * step[:, :1]
     along_y = -cloud.ups * step[:, 1:]
     origin = cloud.centers - (along_x * (size[:, :1] - 1) + along_y * (size[:, 1:] - 1)) / 2
@@ -26,14 +26,14 @@ def texel_to_world(cloud: BillboardCloud) -> Tensor:
 
 
 def texel_to_pixel(cloud: BillboardCloud, camera: Camera) -> Tensor:
-    """Homographies from texel centres to pixel centres, [V, N, 3, 3]; singular where a plane is seen edge-on."""
+    """Homographies from texel centers to pixel centers, [V, N, 3, 3]; singular where a plane is seen edge-on."""
     return camera.batch().world_to_pixel[:, None] @ texel_to_world(cloud)
 
 
 def pixel_depth(cloud: BillboardCloud, camera: Camera) -> tuple[Tensor, Tensor]:
     """Rows whose quotient is the depth at which a pixel's ray meets a plane, numerator and denominator, both [V, N, 3].
 
-    The ray of the homogeneous pixel p meets the plane (numerator . p) / (denominator . p) metres along the camera's +Z: behind the
+    The ray of the homogeneous pixel p meets the plane (numerator . p) / (denominator . p) meters along the camera's +Z: behind the
     camera where that is negative, at infinity, on the plane's horizon, where the denominator vanishes. Nothing is inverted that
     depends on the plane, so planes seen edge-on do no harm, and coincident planes have exactly equal depths whatever their textures.
     """
@@ -51,7 +51,7 @@ def pixel_depth(cloud: BillboardCloud, camera: Camera) -> tuple[Tensor, Tensor]:
 def signed_distance(cloud: BillboardCloud, camera: Camera) -> Tensor:
     """How far each camera stands in front of each plane, [V, N]: positive on the front, negative behind, zero edge-on.
 
-    In metres for a pinhole; for parallel projection the sine of the angle between the viewing direction and the plane.
+    In meters for a pinhole; for parallel projection the sine of the angle between the viewing direction and the plane.
     """
     camera = camera.batch()
     if camera.orthographic:

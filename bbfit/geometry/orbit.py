@@ -67,7 +67,7 @@ class Orbit:
 
         Parameters
         ----------
-        points : [P, 3] vertices in metres.
+        points : [P, 3] vertices in meters.
         target : [3] point that the cameras look at.
         fov_x_degrees : horizontal field of view in (0, 170]; ``None`` for orthographic cameras.
         margin : share of the image kept free on each side, in [0, 0.4].

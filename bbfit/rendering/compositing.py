@@ -15,10 +15,10 @@ HASH = (0x8DA6B343, 0xD8163841, 0xCB1AB31F, 0x7FEB352D, 0x846CA68B)
 """Factors of :func:`thresholds`: of a pixel's column and row and of a texture, and of the two rounds of mixing."""
 TIE = 1e-5
 """Relative difference of depths below which two layers count as equally deep. It is far above rounding and far below what shows: which
-of two planes is in front where they cross exactly at a pixel's centre must not depend on rounding."""
+of two planes is in front where they cross exactly at a pixel's center must not depend on rounding."""
 
 
-def composite(colours: list[Tensor], alphas: list[Tensor], depths: list[Tensor]) -> Tensor:
+def composite(colors: list[Tensor], alphas: list[Tensor], depths: list[Tensor]) -> Tensor:
     """Blend layers by Porter and Duff's over operator (1984, section 4.3), each pixel in its own depth order.
 
     A layer contributes its alpha times the transmittance of all layers in front of it, ``prod(1 - alpha_j)``. Written pair by pair
@@ -27,7 +27,7 @@ def composite(colours: list[Tensor], alphas: list[Tensor], depths: list[Tensor])
 
     Parameters
     ----------
-    colours : N >= 1 straight colours, [V, 3, H, W] in [0, 1].
+    colors : N >= 1 straight colors, [V, 3, H, W] in [0, 1].
     alphas : N opacities, [V, 1, H, W] in [0, 1].
     depths : N depths, [V, 1, H, W]; smaller is nearer. Not differentiated.
 
@@ -41,10 +41,10 @@ def composite(colours: list[Tensor], alphas: list[Tensor], depths: list[Tensor])
             i_in_front = depths[i] <= depths[j] * (1 + TIE)
             weights[j] = weights[j] * (1 - alphas[i] * i_in_front)
             weights[i] = weights[i] * (1 - alphas[j] * ~i_in_front)
-    colour = colours[0] * weights[0]
-    for n in range(1, len(colours)):
-        colour = torch.addcmul(colour, colours[n], weights[n])
-    return torch.cat([colour, sum(weights[1:], weights[0])], 1)
+    color = colors[0] * weights[0]
+    for n in range(1, len(colors)):
+        color = torch.addcmul(color, colors[n], weights[n])
+    return torch.cat([color, sum(weights[1:], weights[0])], 1)
 
 
 def opacity(alpha: Tensor, mode: AlphaMode) -> Tensor:

@@ -42,7 +42,7 @@ class Lens:
 
 @wp.struct
 class Rectangle:
-    """Where a billboard is: its centre, axes and half extents."""
+    """Where a billboard is: its center, axes and half extents."""
 
     center: wp.vec3d
     right: wp.vec3d
@@ -204,7 +204,7 @@ class Projector:
 
         Parameters
         ----------
-        placement : centres, rights, ups and half extents side by side, float64 [N, 11].
+        placement : centers, rights, ups and half extents side by side, float64 [N, 11].
         """
         views, count = len(chosen), len(placement)
         placement = placement.to(self._device, torch.float64).contiguous()

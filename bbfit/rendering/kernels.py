@@ -183,7 +183,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                             order[place] = k
                             hit += 1
                     k += 1
-                colour = wp.vec4()
+                color = wp.vec4()
                 through = float(1.0)
                 i = int(0)
                 while i < hit:
@@ -196,9 +196,9 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                             alpha = wp.where(s[3] >= threshold(column + c, row, firsts[layer]), 1.0, 0.0)
                         weight = through * alpha
                         through -= weight
-                        colour += wp.vec4(s[0] * weight, s[1] * weight, s[2] * weight, weight)
+                        color += wp.vec4(s[0] * weight, s[1] * weight, s[2] * weight, weight)
                     i += 1
-                image[view, row, column + c] = colour
+                image[view, row, column + c] = color
                 c += 1
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
@@ -302,7 +302,7 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                             anything = not empty(occupied, wp.vec3i(firsts[k], heights[k], widths[k]), left[k, c], top[k, c])
                     k += 1
                 if anything:
-                    colour = wp.vec4()
+                    color = wp.vec4()
                     through = float(1.0)
                     i = int(0)
                     while i < hit:
@@ -313,14 +313,14 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                         slopes[i] = opacity_slope(s[3], test)
                         share = through * alpha
                         through -= share
-                        colour += wp.vec4(s[0] * share, s[1] * share, s[2] * share, share)
+                        color += wp.vec4(s[0] * share, s[1] * share, s[2] * share, share)
                         reds[i] = s[0]
                         greens[i] = s[1]
                         blues[i] = s[2]
                         alphas[i] = alpha
                         i += 1
                     if given_target:
-                        d = colour - premultiplied(packed, straight)
+                        d = color - premultiplied(packed, straight)
                         if norm == L1:
                             total += wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2]) + wp.abs(d[3])
                             g += wp.vec4(sign(d[0]), sign(d[1]), sign(d[2]), sign(d[3])) * weight
@@ -328,9 +328,9 @@ def kernels(capacity: int, lanes: int) -> SimpleNamespace:
                             total += wp.dot(d, d)
                             g += d * (2.0 * weight)
                             if norm == BACKGROUNDS:
-                                colours = d[0] + d[1] + d[2]
-                                total -= d[3] * colours
-                                g -= wp.vec4(d[3], d[3], d[3], colours) * weight
+                                colors = d[0] + d[1] + d[2]
+                                total -= d[3] * colors
+                                g -= wp.vec4(d[3], d[3], d[3], colors) * weight
                     if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0:
                         behind = float(0.0)  # what the layers behind add to the loss, to first order, seen unobstructed
                         b = int(hit)

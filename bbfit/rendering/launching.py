@@ -17,7 +17,7 @@ FLAGS = "-march=native -ffp-contract=fast"
 """Clang's flags for CPU kernels: without them multiplications and additions are not fused."""
 
 
-def _initialise() -> None:
+def _initialize() -> None:
     """Start Warp without a word: a library does not print, and a machine without a GPU is nothing to warn of, though Warp's C code does."""
     wp.config.log_level = wp.LOG_ERROR
     try:
@@ -36,7 +36,7 @@ def _initialise() -> None:
         os.close(kept)
 
 
-_initialise()
+_initialize()
 
 
 def worker_count() -> int:

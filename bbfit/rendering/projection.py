@@ -22,7 +22,7 @@ class Projection:
     """N billboards in V views, as flat arrays."""
 
     to_texel: Tensor
-    """Homographies from pixel centres to texel centres, float32 [V, N, 3, 3], scaled so that the third coordinate of a pixel's image is the
+    """Homographies from pixel centers to texel centers, float32 [V, N, 3, 3], scaled so that the third coordinate of a pixel's image is the
     reciprocal of the depth (pinhole) or 1 (parallel projection). Carries gradients into the placement."""
     nearness: Tensor
     """Rows whose product with a homogeneous pixel is the nearness by which layers are ordered, float32 [V, N, 3]: the reciprocal of the

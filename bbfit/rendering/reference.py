@@ -15,9 +15,9 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.homography import pixel_depth, signed_distance, texel_to_pixel
 from bbfit.rendering.compositing import composite, opacity, thresholds
 
-# A plane is edge-on, and so not drawn, when the camera is nearer to it than this share of its distance to the billboard's centre.
+# A plane is edge-on, and so not drawn, when the camera is nearer to it than this share of its distance to the billboard's center.
 EDGE_ON = 1e-5
-# How often a plane is moved off a horizon that runs through a pixel's centre; once is nearly always enough.
+# How often a plane is moved off a horizon that runs through a pixel's center; once is nearly always enough.
 NUDGES = 8
 
 
@@ -25,7 +25,7 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
     """Draw a billboard cloud.
 
     Each texture is filtered bilinearly with straight alpha, as engines do, then premultiplied; a margin of one transparent texel in the
-    colour of its neighbour surrounds it. Filtered alpha becomes opacity as ``cloud.alpha`` says (without a gradient in the mode hash).
+    color of its neighbor surrounds it. Filtered alpha becomes opacity as ``cloud.alpha`` says (without a gradient in the mode hash).
     Pixels whose ray meets the plane behind the camera, or a plane seen edge-on, show nothing.
 
     Returns
@@ -52,13 +52,13 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
         warped = list(_warp(torch.cat(sources), matrices.flatten(0, 1), height, width).split(views))
     else:
         warped = [_warp(source, matrix, height, width) for source, matrix in zip(sources, matrices, strict=True)]
-    colours, alphas = zip(*(layer.split((3, 1), 1) for layer in warped), strict=True)
+    colors, alphas = zip(*(layer.split((3, 1), 1) for layer in warped), strict=True)
     if cloud.alpha.kind == "hash":
         opaque = _hashed(cloud, list(alphas), signed_distance(cloud, cameras) >= 0)
     else:
         opaque = [opacity(alpha, cloud.alpha) for alpha in alphas]
     shown = [alpha * mask for alpha, mask in zip(opaque, drawn, strict=True)]
-    image = composite(list(colours), shown, list(depth)).permute(0, 2, 3, 1)
+    image = composite(list(colors), shown, list(depth)).permute(0, 2, 3, 1)
     return image if camera.batched else image[0]
 
 
@@ -74,7 +74,7 @@ def drawable(cloud: BillboardCloud, cameras: Camera) -> Tensor:
 def _warp(sources: Tensor, matrices: Tensor, height: int, width: int) -> Tensor:
     """Each source [B, 4, h, w] seen through its texel-to-pixel matrix [B, 3, 3]: straight RGBA, [B, 4, H, W].
 
-    On the horizon of a plane the texel lies at infinity. Where that line runs exactly through a pixel's centre (a plane parallel to
+    On the horizon of a plane the texel lies at infinity. Where that line runs exactly through a pixel's center (a plane parallel to
     the optical axis and an image of odd width will do) kornia divides by zero, and one such pixel makes the plane's whole gradient
     NaN. Such a plane is moved by a few roundings of a pixel's coordinate, in float32 by a millionth of the image.
     """

@@ -103,7 +103,7 @@ def weights(fx: float, fy: float) -> wp.vec4:
 
 @wp.func
 def fetch(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float) -> wp.vec4:
-    """Bilinear straight RGBA; beyond the outermost texel centres the colour stays and the alpha fades.
+    """Bilinear straight RGBA; beyond the outermost texel centers the color stays and the alpha fades.
 
     ``left`` and ``top`` are the whole parts of the texel coordinates, at least -1, ``fx`` and ``fy`` the rest.
     """

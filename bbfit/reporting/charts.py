@@ -1,4 +1,4 @@
-"""Charts of a run as SVG, in colours that the page they stand on decides, so that they read in light and in dark."""
+"""Charts of a run as SVG, in colors that the page they stand on decides, so that they read in light and in dark."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# What is drawn in these colours takes the page's custom property of that name.
+# What is drawn in these colors takes the page's custom property of that name.
 _THEME = {"#000001": "--ink", "#70767e": "--faint", "#e4e7ea": "--grid", "#1f5f8b": "--accent", "#a9c6da": "--soft", "#c8501e": "--worst"}
 _INK, _FAINT, _GRID, _ACCENT, _SOFT, _WORST = _THEME
 # Inches of 72 units of the SVG: the width of a phone, so that nothing shrinks there.
@@ -32,7 +32,7 @@ class Chart:
     """A chart and where things are on it."""
 
     svg: str
-    """An ``<svg>`` element with custom properties in place of colours; all of its ids begin with the chart's name."""
+    """An ``<svg>`` element with custom properties in place of colors; all of its ids begin with the chart's name."""
     marks: Mapping[str, float]
     """Numbers that a script needs to move what is marked, in the SVG's units."""
 
@@ -45,8 +45,8 @@ MEASURES = (("psnr", "PSNR, dB", max), ("ssim", "SSIM", max), ("flip", "FLIP", m
 _HUES = ("#3b82c4", "#d9702b", "#3f9e4d", "#c94f4f", "#8f6bc1", "#a06a4e", "#d066a8", "#7d8590", "#a3a21f", "#2aa6b5")
 
 
-def billboard_colour(index: int) -> str:
-    """The colour that a billboard has wherever it is drawn; after ten they come round."""
+def billboard_color(index: int) -> str:
+    """The color that a billboard has wherever it is drawn; after ten they come round."""
     return _HUES[index % len(_HUES)]
 
 
@@ -112,9 +112,9 @@ def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
 
 
 def plan_chart(cloud: BillboardCloud) -> Chart:
-    """Where billboards stand, seen from above with azimuth 0 at the bottom: each one's rectangle, numbered from 1, in metres.
+    """Where billboards stand, seen from above with azimuth 0 at the bottom: each one's rectangle, numbered from 1, in meters.
 
-    Lower edges are thick; upright billboards are lines. ``plan-eye`` is a camera at azimuth 0; the marks ``x`` and ``y`` are the centre
+    Lower edges are thick; upright billboards are lines. ``plan-eye`` is a camera at azimuth 0; the marks ``x`` and ``y`` are the center
     that it turns about.
     """
     from matplotlib.patches import Polygon
@@ -125,23 +125,23 @@ def plan_chart(cloud: BillboardCloud) -> Chart:
     middle = (quads.min((0, 1)) + quads.max((0, 1))) / 2 if len(cloud) else np.zeros(3)
     reach = float(np.linalg.norm((quads - middle)[..., [0, 2]], axis=-1).max()) if len(cloud) else 1.0
     for index, quad in enumerate(quads):
-        flat, colour = quad[:, [0, 2]], billboard_colour(index)
-        axes.add_patch(Polygon(flat, facecolor=colour, edgecolor=colour, linewidth=1, alpha=0.22))
+        flat, color = quad[:, [0, 2]], billboard_color(index)
+        axes.add_patch(Polygon(flat, facecolor=color, edgecolor=color, linewidth=1, alpha=0.22))
         lowest = np.argsort(quad[:, 1], kind="stable")[:2]
-        axes.plot(*flat[lowest].T, color=colour, linewidth=2.6, solid_capstyle="round")
+        axes.plot(*flat[lowest].T, color=color, linewidth=2.6, solid_capstyle="round")
         # The number stands at the end of the lower edge that is farther out, where lines do not cross.
         ends = flat[lowest] - middle[[0, 2]]
         end = ends[np.linalg.norm(ends, axis=-1).argmax()]
         x, z = middle[[0, 2]] + end * (1 + 0.09 * reach / max(float(np.linalg.norm(end)), 1e-9))
-        axes.text(x, z, str(index + 1), ha="center", va="center", fontsize=10, color=colour, fontweight="bold")
+        axes.text(x, z, str(index + 1), ha="center", va="center", fontsize=10, color=color, fontweight="bold")
     out = 1.32 * reach
     eye = np.array([[0, 0.86], [-0.07, 1.0], [0.07, 1.0]]) * out
     axes.add_patch(Polygon(eye + middle[[0, 2]], facecolor=_WORST, edgecolor="none", gid="eye"))
     axes.set_xlim(middle[0] - out, middle[0] + out)
     axes.set_ylim(middle[2] + out, middle[2] - out)  # +Z, where azimuth 0 looks from, is at the bottom
     axes.set_aspect("equal")
-    axes.set_xlabel("x, metres")
-    axes.set_ylabel("z, metres")
+    axes.set_xlabel("x, meters")
+    axes.set_ylabel("z, meters")
     _plain(axes)
     svg = _svg(figure, "plan")
     x, y = axes.transData.transform(middle[[0, 2]]) * 72 / figure.dpi
@@ -198,7 +198,7 @@ def _plain(axes: Axes) -> None:
 
 
 def _svg(figure: Figure, name: str) -> str:
-    """The figure as an element for a page: no colours of its own, text as text, ids that begin with ``name``."""
+    """The figure as an element for a page: no colors of its own, text as text, ids that begin with ``name``."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
@@ -214,6 +214,6 @@ def _svg(figure: Figure, name: str) -> str:
     svg = re.sub(r'\bid="', f'id="{name}-', svg)
     svg = re.sub(r'((?:xlink:)?href="#|url\(#)', rf"\g<1>{name}-", svg)
     svg = svg.replace("fill: #000000", f"fill: {_INK}").replace("stroke: #000000", f"stroke: {_INK}")
-    for colour, variable in _THEME.items():
-        svg = svg.replace(colour, f"var({variable})")
+    for color, variable in _THEME.items():
+        svg = svg.replace(color, f"var({variable})")
     return svg

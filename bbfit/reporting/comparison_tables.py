@@ -16,7 +16,7 @@ from torch import Tensor
 from bbfit.evaluation.report import Measures, OverWhite, Rgba, ThesisScale
 from bbfit.evaluation.scoring import OriginalTree, view_angles
 from bbfit.files import write_bytes
-from bbfit.images import encode_png, over_colour, premultiply, read_rgba, to_bytes
+from bbfit.images import encode_png, over_color, premultiply, read_rgba, to_bytes
 from bbfit.reporting.plots import FAINT, INK, PAPER, picture_font, spread_views
 from bbfit.reporting.sweep_tables import markdown
 from bbfit.views import ViewSet
@@ -161,7 +161,7 @@ def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) ->
     font, bold = picture_font("DejaVuSans.ttf", _TEXT - 2), picture_font("DejaVuSans-Bold.ttf", _TEXT)
     for number, (title, caption, picture) in enumerate(pictures):
         left, top = gap + number % _COLUMNS * (_TILE + gap), gap + number // _COLUMNS * (_TILE + line + gap)
-        image = Image.fromarray(to_bytes(over_colour(picture))).crop(part)
+        image = Image.fromarray(to_bytes(over_color(picture))).crop(part)
         scale = _TILE / max(image.size)
         sheet.paste(image.resize((round(image.width * scale), round(image.height * scale)), Image.Resampling.LANCZOS), (left, top))
         draw.text((left, top + _TILE + 4), title, INK, bold)

@@ -20,9 +20,9 @@ from bbfit.evaluation.sizes import shrunk
 from bbfit.exporting.encoders import encode_webp
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
-from bbfit.images import over_colour, to_bytes, unpremultiply
+from bbfit.images import over_color, to_bytes, unpremultiply
 from bbfit.model_files import generator, joined_glb, split_glb
-from bbfit.reporting.charts import MEASURES, azimuth_chart, billboard_colour, loss_chart, plan_chart, sizes_chart, worst_views
+from bbfit.reporting.charts import MEASURES, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
 from bbfit.reporting.plots import magma, spread_views
 from bbfit.views import ViewSet
 
@@ -110,12 +110,12 @@ def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: Ru
 
 
 def viewer_page(glb: bytes, bounds: NDArray[np.float64], *, layered: bool = False) -> str:
-    """A page that shows a GLB, to be turned and zoomed: trimesh's viewer, made to keep upright and to show colours as they are.
+    """A page that shows a GLB, to be turned and zoomed: trimesh's viewer, made to keep upright and to show colors as they are.
 
     Parameters
     ----------
     glb : a Y-up model without lights and cameras, whose pictures browsers read.
-    bounds : lowest and highest corner of what is to be seen at first, in metres, [2, 3].
+    bounds : lowest and highest corner of what is to be seen at first, in meters, [2, 3].
     layered : whether what is blended is drawn twice, as it is right but for what is less than half opaque, whatever its order: at first
         where alpha is at least a half, which then hides what is behind it, and then all that is not hidden.
     """
@@ -150,7 +150,7 @@ def _least_seen(cloud: BillboardCloud) -> float:
 def _view(cloud: BillboardCloud, views: ViewSet, score: ViewScore, index: int) -> dict[str, Any]:
     """A held-out view for the strip: its pictures and figures."""
     target, result = held_out(cloud, views, index)
-    error = metrics.flip_map(over_colour(target).numpy(), over_colour(result).numpy())
+    error = metrics.flip_map(over_color(target).numpy(), over_color(result).numpy())
     height, width = error.shape
     size = (min(width, _WIDEST), max(1, height * min(width, _WIDEST) // width))
     mapped = magma(shrunk(torch.from_numpy(error)[..., None], *size)[..., 0].numpy())
@@ -194,8 +194,8 @@ def _billboards(cloud: BillboardCloud) -> list[dict[str, Any]]:
         described.append(
             {
                 "number": number + 1,
-                "colour": billboard_colour(number),
-                "metres": [2 * side for side in half],
+                "color": billboard_color(number),
+                "meters": [2 * side for side in half],
                 "texels": list(textures.shape[1:3])[::-1],
                 "leans": float(normal[1].abs().clamp(max=1).asin().rad2deg()),
                 "covers": float(textures[..., 3].ge(_least_seen(cloud)).double().mean()),

@@ -20,7 +20,7 @@ from bbfit.exporting.drawing import draw_cards
 from bbfit.exporting.lod import LodLevel
 from bbfit.files import write_bytes
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import encode_png, over_colour, to_bytes
+from bbfit.images import encode_png, over_color, to_bytes
 from bbfit.views import ViewSet
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def comparison_picture(cloud: BillboardCloud, views: ViewSet, path: str | Path, 
     """Write a PNG of some views, a row each: target, result, and the perceived difference.
 
     Pictures are shown over white, pixel for pixel. The difference is the FLIP map (:func:`bbfit.evaluation.metrics.flip_map`) in the
-    colours of magma: black is no difference. Under each row stand the view's name, azimuth, PSNR and SSIM over white and mean FLIP.
+    colors of magma: black is no difference. Under each row stand the view's name, azimuth, PSNR and SSIM over white and mean FLIP.
 
     Parameters
     ----------
@@ -80,11 +80,11 @@ def comparison_picture(cloud: BillboardCloud, views: ViewSet, path: str | Path, 
     ):
         draw.text((x, head - text * 3 // 2), name, INK, bold)
         draw.text((x + bold.getlength(name + "  "), head - text * 3 // 2), note, FAINT, font)
-    _colour_bar(sheet, draw, font, left[2] + cell, head - text * 3 // 2, text)
+    _color_bar(sheet, draw, font, left[2] + cell, head - text * 3 // 2, text)
 
     for number, index in enumerate(rows):
         top = head + number * row + text // 4
-        target, result = (over_colour(picture) for picture in held_out(cloud, views, index))
+        target, result = (over_color(picture) for picture in held_out(cloud, views, index))
         pair = target.numpy(), result.numpy()
         error = metrics.flip_map(*pair)
         for x, picture in zip(left, (to_bytes(target), to_bytes(result), magma(error)), strict=True):
@@ -165,11 +165,11 @@ def draw_losses(axes: Axes, losses: Sequence[float], label: str) -> None:
     shown = np.where(np.isfinite(values) & (values > 0), values, np.nan)
     steps = np.arange(1, len(shown) + 1)
     window = max(len(shown) // 50, 1)
-    colour, raw = "#1f5f8b", "#a9c6da"
-    axes.plot(steps, shown, color=raw if window > 1 else colour, linewidth=0.8, marker="o" if len(steps) == 1 else None, label="each step")
+    color, raw = "#1f5f8b", "#a9c6da"
+    axes.plot(steps, shown, color=raw if window > 1 else color, linewidth=0.8, marker="o" if len(steps) == 1 else None, label="each step")
     if window > 1:
         mean = running_mean(shown, window)
-        axes.plot(steps, mean, color=colour, linewidth=2, label=f"mean of {window} steps")
+        axes.plot(steps, mean, color=color, linewidth=2, label=f"mean of {window} steps")
         axes.legend(frameon=False)
     if np.isfinite(shown).any():  # a logarithmic axis needs something positive
         axes.set_yscale("log")
@@ -214,7 +214,7 @@ def _draw_front(axes: Any, choice: Choice, cost: Cost) -> None:
     """One panel of :func:`pareto_plot`."""
     from matplotlib.ticker import FixedLocator, LogLocator, NullLocator, StrMethodFormatter
 
-    trials, colour = choice.trials, "#1f5f8b"
+    trials, color = choice.trials, "#1f5f8b"
     points = [(float(getattr(trial, cost)), trial.psnr) for trial in trials]
     xs, ys = zip(*(points[index] for index in pareto_front(points)), strict=True)
     axes.plot(xs, ys, color="#a9c6da", linewidth=2, zorder=1, label="best for its cost")
@@ -223,8 +223,8 @@ def _draw_front(axes: Any, choice: Choice, cost: Cost) -> None:
             own = [point for point, trial in zip(points, trials, strict=True) if (trial.placement, trial.sides) == (placement, sides)]
             if own:
                 xs, ys = zip(*own, strict=True)
-                face = colour if sides == "one" else "white"
-                axes.scatter(xs, ys, s=36, marker=marker, facecolor=face, edgecolor=colour, zorder=2, label=f"{where}, {many}")
+                face = color if sides == "one" else "white"
+                axes.scatter(xs, ys, s=36, marker=marker, facecolor=face, edgecolor=color, zorder=2, label=f"{where}, {many}")
     axes.scatter(*points[choice.chosen], s=220, facecolor="none", edgecolor="#c8501e", linewidth=2.5, zorder=3, label="chosen")
     for point, trial in zip(points, trials, strict=True):
         axes.annotate(str(trial.billboards), point, (0, 8), textcoords="offset points", ha="center", fontsize=8, color="#70767e")
@@ -260,13 +260,13 @@ def lod_picture(levels: Sequence[tuple[LodLevel, Cards]], views: ViewSet, path: 
         draw.text((left, gap // 2), level.name, INK, bold)
         draw.text((left, gap // 2 + text * 5 // 4), f"the tree is {tall * share:.0f} pixels high", FAINT, font)
         for row, picture in enumerate((target, image)):
-            pixels = Image.fromarray(to_bytes(over_colour(picture))).resize((side, side * height // width), Image.Resampling.NEAREST)
+            pixels = Image.fromarray(to_bytes(over_color(picture))).resize((side, side * height // width), Image.Resampling.NEAREST)
             sheet.paste(pixels, (left, 3 * text + gap + row * (side + gap)))
     write_bytes(path, encode_png(np.asarray(sheet)))
 
 
 def running_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
-    """Centred mean over ``window`` values, shorter at the ends, same length; NaN counts for nothing, and gives NaN where alone."""
+    """Centerd mean over ``window`` values, shorter at the ends, same length; NaN counts for nothing, and gives NaN where alone."""
     valid = np.isfinite(values)
     sums, counts = (np.concatenate([[0.0], np.cumsum(part)]) for part in (np.where(valid, values, 0.0), valid))
     index = np.arange(len(values))
@@ -282,7 +282,7 @@ def magma(error: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(colormaps["magma"](error, bytes=True)[..., :3])
 
 
-def _colour_bar(sheet: Any, draw: ImageDraw, font: FreeTypeFont, right: int, top: int, text: int) -> None:
+def _color_bar(sheet: Any, draw: ImageDraw, font: FreeTypeFont, right: int, top: int, text: int) -> None:
     """The scale of the difference, ending at ``right``."""
     from PIL import Image
 

@@ -10,7 +10,7 @@ from bbfit.files import write_bytes
 from bbfit.reporting.sweep_tables import BILLBOARDS, HONEST, SweepRow, label_names
 
 _MEASURES = (HONEST[0], HONEST[2])
-# A loss, or another label, has a line style; everything else has a colour.
+# A loss, or another label, has a line style; everything else has a color.
 _STYLES = ("-", "--", ":", "-.")
 
 
@@ -30,7 +30,7 @@ def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
     counted = len({row.labels.get(BILLBOARDS) for row in done}) > 1
     figure = Figure(figsize=(1.5 + 3.4 * len(trees), 6.6), layout="constrained")
     axes = figure.subplots(len(_MEASURES), len(trees), squeeze=False, sharex=True)
-    colours = {key: f"C{number}" for number, key in enumerate(dict.fromkeys(_key(row, names, dashed) for row in done))}
+    colors = {key: f"C{number}" for number, key in enumerate(dict.fromkeys(_key(row, names, dashed) for row in done))}
     styles = {value: _STYLES[number % 4] for number, value in enumerate(dict.fromkeys(row.labels.get(dashed or "") for row in done))}
     for (line, measure), (column, tree) in ((a, b) for a in enumerate(_MEASURES) for b in enumerate(trees)):
         axis = axes[line][column]
@@ -39,7 +39,7 @@ def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
             points.sort(key=lambda point: int(point[0] or 0))
             label = ", ".join(filter(None, (key, style)))
             where = [point[0] for point in points] if counted else [label or "runs"] * len(points)
-            axis.plot(where, [point[1] for point in points], styles[style], color=colours[key], marker="o", markersize=3, label=label)
+            axis.plot(where, [point[1] for point in points], styles[style], color=colors[key], marker="o", markersize=3, label=label)
         axis.grid(alpha=0.3)
         if line == 0:
             axis.set_title(tree)
@@ -57,7 +57,7 @@ def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
 
 
 def _key(row: SweepRow, names: Sequence[str], dashed: str | None) -> str:
-    """What gives a run its colour."""
+    """What gives a run its color."""
     return ", ".join(row.labels.get(name, "") for name in names if name != dashed)
 
 

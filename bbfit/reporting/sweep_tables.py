@@ -24,7 +24,7 @@ class SweepRow:
     labels: Mapping[str, str]
     """What sets its configuration apart: names and values in the order of the grid."""
     steps: int
-    """Optimiser steps."""
+    """Optimizer steps."""
     facts: Mapping[str, Any] | None
     """What was found: ``report`` (:meth:`bbfit.evaluation.report.Report.to_json` without views and rings), ``billboards`` and ``texels``;
     ``None`` if it failed."""
@@ -226,7 +226,7 @@ class Effect:
 
 
 def effects(rows: Sequence[SweepRow]) -> list[Effect]:
-    """Mean differences between runs that differ in one label alone: between neighbouring numbers of billboards, and from the first value
+    """Mean differences between runs that differ in one label alone: between neighboring numbers of billboards, and from the first value
     of any other label to each of its others."""
     found = []
     (psnr, ssim, flip), thesis_psnr = HONEST[:3], THESIS_SCALE[2]

@@ -109,7 +109,7 @@ def lod_table(levels: Sequence[LodLevel]) -> Table:
             planes,
             _count(level.vertices),
             _count(level.bytes),
-            f"{level.distance_metres:.1f}",
+            f"{level.distance_meters:.1f}",
             below,
             *errors,
         )

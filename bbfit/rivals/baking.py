@@ -22,7 +22,7 @@ from bbfit.checks import check_range, check_shape, fail
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera, orthographic_intrinsics
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import bleed_colour, read_rgba
+from bbfit.images import bleed_color, read_rgba
 
 # Endings of Y-up files whose triangles are read as they stand; others go through Blender.
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
@@ -36,8 +36,8 @@ _TENSORS = ("centers", "rights", "ups", "half_extents", "depths")
 class BakeConfig:
     """How fine the textures are and in what light they are rendered."""
 
-    texels_a_metre: float
-    """Texels along a metre of every rectangle."""
+    texels_a_meter: float
+    """Texels along a meter of every rectangle."""
     two_sided: bool = False
     """Whether a rectangle has a back texture, rendered from behind; else it shows what is seen from the front from both sides."""
     alpha: AlphaMode = field(default_factory=AlphaMode)
@@ -46,7 +46,7 @@ class BakeConfig:
     """Light, samples, denoising, device, workers and seed, which should be those of the views to compare with; the rest is not used."""
 
     def __post_init__(self) -> None:
-        check_range("texels_a_metre", self.texels_a_metre, 0, math.inf, open_low=True)
+        check_range("texels_a_meter", self.texels_a_meter, 0, math.inf, open_low=True)
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,15 @@ class Slabs:
     """N rectangles, and how far from their planes the tree is shown on them."""
 
     centers: Tensor
-    """Rectangle centres in metres, [N, 3] float64."""
+    """Rectangle centers in meters, [N, 3] float64."""
     rights: Tensor
     """Unit vectors to the right, seen from the front, [N, 3]."""
     ups: Tensor
     """Unit vectors upwards, perpendicular to ``rights``, [N, 3]."""
     half_extents: Tensor
-    """Half width and half height in metres, [N, 2]."""
+    """Half width and half height in meters, [N, 2]."""
     depths: Tensor
-    """Least and greatest signed distance from the plane of what is shown, along the normal ``right x up``, in metres, [N, 2]."""
+    """Least and greatest signed distance from the plane of what is shown, along the normal ``right x up``, in meters, [N, 2]."""
 
     def __post_init__(self) -> None:
         n = len(self.centers)
@@ -92,13 +92,13 @@ def bake(
     """Render what lies within each slab onto its rectangle, in parallel projection along the normal.
 
     Texture and picture have the same texels; rectangles are cut to whole texels, to what their textures show. What is cut away by a
-    slab still casts its shadow. Transparent texels take the colour of the nearest visible one, as straight alpha is filtered.
+    slab still casts its shadow. Transparent texels take the color of the nearest visible one, as straight alpha is filtered.
 
     Parameters
     ----------
     tree : as for :func:`~bbfit.blender.views_folder.render_views`.
     slabs : N rectangles. Their sides should leave nothing out that is to be seen; a margin for the renderer's filter is added.
-    fill_cuts : give texels that show the dark inside of a stem, cut open by the slab, the colour of the nearest lit texel. The inside is
+    fill_cuts : give texels that show the dark inside of a stem, cut open by the slab, the color of the nearest lit texel. The inside is
         told by reflecting less than 3% of ``config.views.ambient_strength``, in sunlight or not.
     folder : where the pictures are kept, so that a broken off start can go on (:func:`~bbfit.blender.pictures.render_pictures`); nowhere
         when left out.
@@ -120,12 +120,12 @@ def bake(
             return bake(tree, slabs, config, fill_cuts=fill_cuts, folder=scratch, on_progress=on_progress)
     if not len(slabs):
         fail("slabs", "there is none to bake")
-    # Texels from a rectangle's centre to its sides; the centre lies on the corner of a texel.
-    reach = _whole_texels(slabs.half_extents * config.texels_a_metre) + int(FILTER_REACH)
+    # Texels from a rectangle's center to its sides; the center lies on the corner of a texel.
+    reach = _whole_texels(slabs.half_extents * config.texels_a_meter) + int(FILTER_REACH)
     size = 2 * int(reach.max())
-    cameras, clips = _facing(slabs, size, config.texels_a_metre)
+    cameras, clips = _facing(slabs, size, config.texels_a_meter)
     if config.two_sided:
-        back, behind = _facing(_turned(slabs), size, config.texels_a_metre)
+        back, behind = _facing(_turned(slabs), size, config.texels_a_meter)
         cameras = Camera(torch.cat([cameras.world_to_camera, back.world_to_camera]), cameras.intrinsics.repeat(2, 1, 1), size, size, True)
         clips += behind
     paths = render_pictures(tree, cameras, folder, config.views, clips=clips, on_progress=on_progress)
@@ -143,7 +143,7 @@ def bake(
 
 
 def tree_triangles(tree: str | Path) -> NDArray[np.float64]:
-    """Corners of all triangles of a tree in the world of its views, [T, 3, 3] in metres.
+    """Corners of all triangles of a tree in the world of its views, [T, 3, 3] in meters.
 
     Raises
     ------
@@ -169,16 +169,16 @@ def _turned(slabs: Slabs) -> Slabs:
     return Slabs(slabs.centers, -slabs.rights, slabs.ups, slabs.half_extents, -slabs.depths.flip(-1))
 
 
-def _facing(slabs: Slabs, size: int, texels_a_metre: float) -> tuple[Camera, list[tuple[float, float]]]:
-    """Parallel cameras in front of rectangles, with square pictures about their centres, and clip distances of the slabs."""
+def _facing(slabs: Slabs, size: int, texels_a_meter: float) -> tuple[Camera, list[tuple[float, float]]]:
+    """Parallel cameras in front of rectangles, with square pictures about their centers, and clip distances of the slabs."""
     slabs = Slabs(*(getattr(slabs, name).double() for name in _TENSORS))
     normals = torch.linalg.cross(slabs.rights, slabs.ups)
     rotation = torch.stack([slabs.rights, -slabs.ups, -normals], -2)
-    distance = slabs.depths[:, 1] + size / texels_a_metre  # of the camera from the plane: far enough for a nearest distance above 0
+    distance = slabs.depths[:, 1] + size / texels_a_meter  # of the camera from the plane: far enough for a nearest distance above 0
     transform = torch.eye(4, dtype=torch.float64).repeat(len(slabs), 1, 1)
     transform[:, :3, :3] = rotation
     transform[:, :3, 3:] = -(rotation @ (slabs.centers + distance[:, None] * normals)[..., None])
-    intrinsics = orthographic_intrinsics(size / texels_a_metre, size, size).repeat(len(slabs), 1, 1)
+    intrinsics = orthographic_intrinsics(size / texels_a_meter, size, size).repeat(len(slabs), 1, 1)
     near, far = distance - slabs.depths[:, 1], distance - slabs.depths[:, 0]
     return Camera(transform, intrinsics, size, size, True), list(zip(near.tolist(), far.tolist(), strict=True))
 
@@ -205,11 +205,11 @@ def _displayed(linear: float) -> float:
 
 
 def _bled(texture: Tensor, dark: float) -> Tensor:
-    """A texture [h, w, 4], uint8, whose transparent texels, and visible ones below ``dark``, have the colour of the nearest other one."""
+    """A texture [h, w, 4], uint8, whose transparent texels, and visible ones below ``dark``, have the color of the nearest other one."""
     lit = texture[..., :3].amax(-1) >= dark
     if not (lit & (texture[..., 3] > 0)).any():
-        return bleed_colour(texture)
-    bled = bleed_colour(torch.where(lit[..., None], texture, 0))
+        return bleed_color(texture)
+    bled = bleed_color(torch.where(lit[..., None], texture, 0))
     return torch.cat([bled[..., :3], texture[..., 3:]], -1)
 
 
@@ -217,7 +217,7 @@ def _assembled(slabs: Slabs, shown: list[tuple[int, Tensor, Tensor]], config: Ba
     kept = [n for n, _, _ in shown]
     rights, ups = slabs.rights[kept], slabs.ups[kept]
     edges = torch.stack([edges for _, _, edges in shown]) if shown else torch.zeros(0, 4, dtype=torch.float64)
-    left, right, top, bottom = (edges / config.texels_a_metre).split(1, -1)
+    left, right, top, bottom = (edges / config.texels_a_meter).split(1, -1)
     centers = slabs.centers[kept] + (left + right) / 2 * rights - (top + bottom) / 2 * ups
     sizes = [list(texture.shape[1:3]) for _, texture, _ in shown]
     texels = [texture.reshape(-1, 4) for _, texture, _ in shown]

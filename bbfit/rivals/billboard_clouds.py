@@ -1,6 +1,6 @@
 """Billboard clouds (Décoret, Durand, Sillion and Dorsey 2003, "Billboard Clouds for Extreme Model Simplification", SIGGRAPH).
 
-Taken from the paper, as its abstract and accounts of it have it (its full text was not at hand): planes are sought in a discretised
+Taken from the paper, as its abstract and accounts of it have it (its full text was not at hand): planes are sought in a discretized
 plane space of a direction (theta, phi) and a distance rho from the origin; a face is valid for a plane if all its corners lie within
 epsilon of it; a plane's density is the area of the faces that are valid for it (coverage), each as large as it is in projection onto
 the plane; the densest plane is chosen, refined in finer plane space and its faces are removed, until none is left; and a face shows on
@@ -8,7 +8,7 @@ every plane that it is valid for, which closes cracks.
 
 Other than there: the paper is given epsilon and finds the number of planes, here epsilon is found for a number of planes by bisection,
 such that they hold a share of the area. Planes are chosen on random triangles, as a tree has millions. Each chosen plane is moved to
-the least-squares plane of its faces' corners where all of them stay valid. What makes the paper favour
+the least-squares plane of its faces' corners where all of them stay valid. What makes the paper favor
 planes that are nearly tangent to the surface, a penalty, is left out, as scattered leaves have no such surface. Fuhrmann, Umlauf and
 Mantler 2005 ("Extreme Model Simplification for Forest Rendering") make 15 to 50 billboards of a tree in this way; what they change for
 trees was not at hand.
@@ -29,7 +29,7 @@ from bbfit.checks import check_count, check_range, check_shape, fail
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rivals.baking import BakeConfig, Slabs, bake, tree_triangles
 
-# Degrees between neighbouring directions of plane space, and how often the step is halved around the densest plane.
+# Degrees between neighboring directions of plane space, and how often the step is halved around the densest plane.
 _STEP, _HALVINGS = 9.0, 4
 # Bins of rho to an epsilon, and in all at most.
 _BINS, _MOST_BINS = 4, 2000
@@ -54,11 +54,11 @@ class PlaneChoice:
     normals: Array
     """Unit normals, [N, 3]."""
     distances: Array
-    """Distances of the planes from the origin along their normals in metres, [N]."""
+    """Distances of the planes from the origin along their normals in meters, [N]."""
     members: tuple[NDArray[np.int64], ...]
     """Indices of the triangles that each plane was chosen for, N arrays; each triangle is in one at most."""
     epsilon: float
-    """How far at most a plane's triangles lie from it, in metres."""
+    """How far at most a plane's triangles lie from it, in meters."""
     share: float
     """Share of the triangles' area that some plane was chosen for."""
 
@@ -76,7 +76,7 @@ def billboard_cloud(
     """Choose planes for a tree's triangles and bake onto each all that lies within epsilon of it.
 
     A rectangle holds the triangles that its plane was chosen for; there it shows whatever of the tree is within epsilon, parts of
-    triangles that are not valid included, and the inside of stems that are cut open in the bark's colour. What is not said here is as
+    triangles that are not valid included, and the inside of stems that are cut open in the bark's color. What is not said here is as
     for :func:`~bbfit.rivals.baking.bake`.
 
     Parameters
@@ -100,7 +100,7 @@ def choose_planes(triangles: Array, count: int, *, areas: Array | None = None, s
 
     Parameters
     ----------
-    triangles : corners, [T, 3, 3] in metres.
+    triangles : corners, [T, 3, 3] in meters.
     count : N >= 1.
     areas : how much each triangle counts, [T]; its area when left out.
     share : in (0, 1].
@@ -206,7 +206,7 @@ class _PlaneSpace:
         return (2 * (index + 0.5) / bins - 1) * self.radius
 
     def _slopes(self, directions: Array, faces: NDArray[np.int64], epsilon: float, bins: int) -> Array:
-        """Differences along rho of the density at the bins' centres, [K, bins + 1], of some faces."""
+        """Differences along rho of the density at the bins' centers, [K, bins + 1], of some faces."""
         found = np.zeros((len(directions), bins + 1))
         corners, normals, areas = self.triangles[faces], self.normals[faces], self.areas[faces]
         for start in range(0, len(directions), _TOGETHER):

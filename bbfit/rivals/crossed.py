@@ -56,7 +56,7 @@ def upright_slabs(points: NDArray[np.floating], axis: Tensor, azimuth_degrees: f
 
     Parameters
     ----------
-    points : [P, 3] in metres.
+    points : [P, 3] in meters.
     axis : [3] where azimuths are counted from; it fixes no more than which way is the front.
     azimuth_degrees : direction of the normal: 0 is +Z, 90 is +X, as in :class:`~bbfit.geometry.orbit.Orbit`.
     """

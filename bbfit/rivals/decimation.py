@@ -45,7 +45,7 @@ class DecimatedTree:
 class _Part:
     """Triangles of one material."""
 
-    points: NDArray[np.float64]  # [P, 3] metres, the file's axes
+    points: NDArray[np.float64]  # [P, 3] meters, the file's axes
     faces: NDArray[np.int64]  # [F, 3]
     uv: NDArray[np.float64] | None  # [P, 2]
     material: Any

@@ -22,7 +22,7 @@ class DracoSize:
     bytes: int
     """Compressed meshes, textures as they are, and an estimate of the JSON about them."""
     vertices: int
-    """That come out of it; quantisation may have merged some."""
+    """That come out of it; quantization may have merged some."""
 
 
 def draco_size(tree: str | Path, *, position_bits: int = 14) -> DracoSize:

@@ -3,7 +3,7 @@
 In the spirit of "Appearance-Driven Automatic 3D Model Simplification" (Hasselgren et al. 2021, with opacity in the texture, as for its
 foliage) and "Extracting Triangular 3D Models, Materials, and Lighting From Images" (Munkberg et al. 2022), without their
 normal maps, materials and lights: the texture is shown as it is. The start is the visual hull (:mod:`bbfit.rivals.mesh_hull`), not a
-tetrahedral grid, and the renderer a ray caster on the CPU (:mod:`bbfit.rivals.mesh_rays`), not a rasteriser on a GPU.
+tetrahedral grid, and the renderer a ray caster on the CPU (:mod:`bbfit.rivals.mesh_rays`), not a rasterizer on a GPU.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch.nn import functional
 
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.geometry.camera import Camera
-from bbfit.images import bleed_colour, to_bytes
+from bbfit.images import bleed_color, to_bytes
 from bbfit.rivals.mesh_charts import unfold
 from bbfit.rivals.mesh_hull import hull_surface
 from bbfit.rivals.mesh_rays import RayCaster, pixel_rays
@@ -30,7 +30,7 @@ from bbfit.rivals.mesh_silhouettes import Surface, boundary_gradient
 from bbfit.views import ViewSet
 
 DRAW_GRID = 4
-"""Samples along a pixel's side when a mesh is drawn: 16 a pixel, at the centres of a regular grid's cells."""
+"""Samples along a pixel's side when a mesh is drawn: 16 a pixel, at the centers of a regular grid's cells."""
 FIT_GRID = 2
 """The same while a mesh is learned, each at a random place in its cell."""
 VERTEX_RATE = 0.012
@@ -44,7 +44,7 @@ class LearnedMesh:
     """A triangle mesh with one RGBA texture, shown unlit and blended from both sides."""
 
     vertices: Tensor
-    """Positions in metres, Y up, float32 [P, 3]; those on a seam of the texture occur once for each of its sides."""
+    """Positions in meters, Y up, float32 [P, 3]; those on a seam of the texture occur once for each of its sides."""
     faces: Tensor
     """Vertices of each triangle, counter-clockwise from outside, int64 [F, 3]."""
     uvs: Tensor
@@ -74,9 +74,9 @@ class LearnedMesh:
             fail("camera", "expected one camera, got a batch", "draw its cameras one by one")
         caster = RayCaster(self.faces, self.uvs)
         caster.move(self.vertices)
-        centre = torch.full((camera.height * camera.width * DRAW_GRID**2, 2), 0.5)
-        colours = caster.colours(*pixel_rays(camera, centre, DRAW_GRID), self.texture.float() / 255)
-        return colours.reshape(camera.height, camera.width, -1, 4).mean(2)
+        center = torch.full((camera.height * camera.width * DRAW_GRID**2, 2), 0.5)
+        colors = caster.colors(*pixel_rays(camera, center, DRAW_GRID), self.texture.float() / 255)
+        return colors.reshape(camera.height, camera.width, -1, 4).mean(2)
 
 
 def learn_mesh(
@@ -112,12 +112,12 @@ def learn_mesh(
 
 
 def mesh_glb(mesh: LearnedMesh) -> bytes:
-    """The mesh as a GLB file: unlit, blended, both sides shown, its texture a PNG whose unseen texels have their neighbours' colours."""
+    """The mesh as a GLB file: unlit, blended, both sides shown, its texture a PNG whose unseen texels have their neighbors' colors."""
     import trimesh
     from PIL import Image
 
     material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(bleed_colour(mesh.texture).numpy()), alphaMode="BLEND", doubleSided=True, metallicFactor=0.0
+        baseColorTexture=Image.fromarray(bleed_color(mesh.texture).numpy()), alphaMode="BLEND", doubleSided=True, metallicFactor=0.0
     )
     uv = mesh.uvs.numpy() * [1, -1] + [0, 1]  # trimesh counts from below
     visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
@@ -202,7 +202,7 @@ def _refined(start: LearnedMesh, views: ViewSet, steps: int, size: int, seed: in
         rays = pixel_rays(camera, places, FIT_GRID)
         slope, moved, painted = caster.gradients(*rays, texture, FIT_GRID**2, error)
         inner = torch.zeros_like(points).index_add_(0, surface.source, moved)
-        outer = boundary_gradient(surface, points, camera, slope, partial(caster.colours, texture=texture), random)
+        outer = boundary_gradient(surface, points, camera, slope, partial(caster.colors, texture=texture), random)
         rate = 0.5 * (1 + math.cos(math.pi * step / steps))
         latent = by_vertex.step(latent, surface.smoothed(inner + outer), vertex_rate * rate)
         texture = by_texel.step(texture, painted, TEXTURE_RATE * rate).clamp_(0, 1)

@@ -24,11 +24,11 @@ def unfold(points: Floats, faces: Integers, texels: int) -> tuple[Integers, Inte
     """Cut a mesh into charts and lay them out on a square texture.
 
     A chart grows from the largest triangle that is left, over shared edges, as long as the next triangle faces the chart's direction and
-    its projection overlaps none of the chart's. All charts have the same number of texels a metre.
+    its projection overlaps none of the chart's. All charts have the same number of texels a meter.
 
     Parameters
     ----------
-    points, faces : vertices in metres [P, 3] and triangles [F, 3].
+    points, faces : vertices in meters [P, 3] and triangles [F, 3].
     texels : width and height of the texture, enough for a margin around each chart.
 
     Returns
@@ -62,7 +62,7 @@ def _grow(points: Floats, faces: Integers) -> list[tuple[Integers, Floats]]:
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     areas = np.linalg.norm(normals, axis=1)
     normals = normals / np.maximum(areas, 1e-30)[:, None]
-    neighbours = _neighbours(faces)
+    neighbors = _neighbors(faces)
     free = np.ones(len(faces), dtype=bool)
     charts = []
     for seed in np.argsort(-areas, kind="stable"):
@@ -70,7 +70,7 @@ def _grow(points: Floats, faces: Integers) -> list[tuple[Integers, Floats]]:
             continue
         axes = _axes(normals[seed])
         flat = triangles @ axes.T
-        members, waiting, tried = [int(seed)], deque(neighbours[seed]), set(neighbours[seed])
+        members, waiting, tried = [int(seed)], deque(neighbors[seed]), set(neighbors[seed])
         free[seed] = False
         while waiting:
             face = waiting.popleft()
@@ -78,14 +78,14 @@ def _grow(points: Floats, faces: Integers) -> list[tuple[Integers, Floats]]:
                 continue
             members.append(face)
             free[face] = False
-            fresh = [other for other in neighbours[face] if other not in tried]
+            fresh = [other for other in neighbors[face] if other not in tried]
             tried.update(fresh)
             waiting.extend(fresh)
         charts.append((np.array(members), axes))
     return charts
 
 
-def _neighbours(faces: Integers) -> list[list[int]]:
+def _neighbors(faces: Integers) -> list[list[int]]:
     """The triangles that share an edge with each triangle."""
     around: dict[tuple[int, int], list[int]] = {}
     for face, corners in enumerate(faces.tolist()):
@@ -118,7 +118,7 @@ def _overlaps(triangle: Floats, others: Floats) -> bool:
 
 
 def _pack(extents: Floats, texels: int) -> tuple[float, Floats]:
-    """The largest scale in texels a metre at which shelves hold rectangles [R, 2] metres, found by halving, and their corners."""
+    """The largest scale in texels a meter at which shelves hold rectangles [R, 2] meters, found by halving, and their corners."""
     low, high = 0.0, texels / max(float(extents.max()), 1e-12)
     best = _shelves(extents * low, texels)
     for _ in range(24):

@@ -28,15 +28,15 @@ def hull_surface(views: ViewSet) -> tuple[NDArray[np.float64], NDArray[np.int64]
 
     Returns
     -------
-    Vertices in metres [P, 3] and triangles [F, 3] of a closed surface, counter-clockwise from outside (Lorensen and Cline 1987).
+    Vertices in meters [P, 3] and triangles [F, 3] of a closed surface, counter-clockwise from outside (Lorensen and Cline 1987).
 
     Raises
     ------
     InputError
         if no point lies inside the silhouettes of all views.
     """
-    centre, half = _reach(views.cameras)
-    low, high = centre - half, centre + half
+    center, half = _reach(views.cameras)
+    low, high = center - half, center + half
     for cells in (COARSE, FINE):
         side = float((high - low).max()) / cells
         counts = np.maximum(np.ceil((high - low) / side), 1).astype(int) + 2
@@ -57,26 +57,26 @@ def hull_surface(views: ViewSet) -> tuple[NDArray[np.float64], NDArray[np.int64]
 
 def _reach(cameras: Camera) -> tuple[NDArray[np.float64], float]:
     """The middle of what the cameras see, and half a side of a cube that holds all that every one of them sees."""
-    centre = convergence_point(cameras)
-    distance = (cameras.position - centre).norm(dim=-1)
+    center = convergence_point(cameras)
+    distance = (cameras.position - center).norm(dim=-1)
     scale = 1 if cameras.orthographic else distance
     half = scale * max(cameras.width, cameras.height) / cameras.intrinsics[:, 0, 0] / 2
-    return centre.numpy(), float(half.max()) * 1.5  # the tree may stand out of the middle
+    return center.numpy(), float(half.max()) * 1.5  # the tree may stand out of the middle
 
 
 def _carve(views: ViewSet, start: NDArray[np.float64], side: float, counts: NDArray[np.int64]) -> NDArray[np.float32]:
     """Least opacity over all views of each cell's picture, 0 where a view does not show it, [x, y, z]."""
     axes = [torch.from_numpy(start[axis] + side * np.arange(counts[axis])) for axis in range(3)]
-    centres = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    kept, left = torch.ones(len(centres)), torch.arange(len(centres))
+    centers = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    kept, left = torch.ones(len(centers)), torch.arange(len(centers))
     for index in range(len(views)):
         camera = views.cameras[index]
         alpha = views.image(index)[..., 3].float() / 255
-        distance = 1.0 if camera.orthographic else float((camera.position - centres.mean(0)).norm())
+        distance = 1.0 if camera.orthographic else float((camera.position - centers.mean(0)).norm())
         footprint = max(1, round(side * float(camera.intrinsics[0, 0]) / distance) | 1)
         for window in ((footprint, 1), (1, footprint)):
             alpha = torch.nn.functional.max_pool2d(alpha[None], window, 1, (window[0] // 2, window[1] // 2))[0]
-        kept[left] = torch.minimum(kept[left], _looked_up(alpha, camera.project(centres[left])))
+        kept[left] = torch.minimum(kept[left], _looked_up(alpha, camera.project(centers[left])))
         left = left[kept[left] > 0]
     return kept.reshape(*counts.tolist()).numpy()
 

@@ -1,8 +1,8 @@
 """Casting rays at a textured triangle mesh on the CPU, with gradients, by Mitsuba's ray tracer (Embree) and Dr.Jit (LLVM).
 
 Mitsuba is used for what is general in it: the scene with its search tree, and arrays that are compiled and differentiated. Its integrators
-are not: its emitters know no opacity. Colours are blended along each ray instead, surface by surface, which is the depth peeling of
-Hasselgren et al. 2021 without its sorting by rasteriser passes.
+are not: its emitters know no opacity. Colors are blended along each ray instead, surface by surface, which is the depth peeling of
+Hasselgren et al. 2021 without its sorting by rasterizer passes.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ def pixel_rays(camera: Camera, places: Tensor, grid: int) -> tuple[Tensor, Tenso
 
     Returns
     -------
-    Origins in metres and unit directions, float32 [H·W·grid², 3] each.
+    Origins in meters and unit directions, float32 [H·W·grid², 3] each.
     """
     rows, columns = torch.arange(camera.height * grid), torch.arange(camera.width * grid)
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     cells = torch.stack([x, y], -1).reshape(camera.height, grid, camera.width, grid, 2).transpose(1, 2).reshape(-1, 2)
-    return rays_through(camera, (cells + places) / grid - 0.5)  # a pixel spans half a pixel to either side of its centre
+    return rays_through(camera, (cells + places) / grid - 0.5)  # a pixel spans half a pixel to either side of its center
 
 
 def rays_through(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -92,14 +92,14 @@ class RayCaster:
         self._vertices, self._step = mi.Float(0), mi.Float(0)
 
     def move(self, vertices: Tensor) -> None:
-        """Give the vertices their places in metres, [P, 3]."""
+        """Give the vertices their places in meters, [P, 3]."""
         mi, dr = _libraries()
         self._vertices = mi.Float(_flat(vertices))
         self._step = dr.opaque(mi.Float, float(np.ptp(vertices.detach().numpy(), axis=0).max()) * STEP_ON)
         self._parameters["mesh.vertex_positions"] = self._vertices
         self._parameters.update()
 
-    def colours(self, origins: Tensor, directions: Tensor, texture: Tensor) -> Tensor:
+    def colors(self, origins: Tensor, directions: Tensor, texture: Tensor) -> Tensor:
         """What rays see: premultiplied RGBA, float32 [S, 4].
 
         Parameters
@@ -119,7 +119,7 @@ class RayCaster:
 
         Parameters
         ----------
-        origins, directions, texture : as :meth:`colours`, S = pixels · ``samples``.
+        origins, directions, texture : as :meth:`colors`, S = pixels · ``samples``.
         loss : from the pixels, [S / ``samples``, 4], to its derivative by them.
 
         Returns

@@ -16,11 +16,11 @@ SMOOTHING = 0.3
 BOUNDARY_SAMPLES = 0.25
 """Points on the silhouettes for each pixel of the picture."""
 BOUNDARY_PIXELS = 0.02
-"""How far on either side of a silhouette its two colours are looked up, in pixels."""
+"""How far on either side of a silhouette its two colors are looked up, in pixels."""
 
 
 class Surface:
-    """The triangles between a mesh's distinct points, and the map between points and the latents that are optimised.
+    """The triangles between a mesh's distinct points, and the map between points and the latents that are optimized.
 
     The latents are u = (I + λ L) v with the combinatorial Laplacian L: a step along the gradient by u spreads over the surface
     (Nicolet et al. 2021, "Large Steps in Inverse Rendering of Geometry").
@@ -55,7 +55,7 @@ class Surface:
         return (self._forward @ places.double()).float()
 
     def points(self, latent: Tensor) -> Tensor:
-        """Points in metres of latents, both [points, 3]."""
+        """Points in meters of latents, both [points, 3]."""
         return self._inverse @ latent
 
     def smoothed(self, gradient: Tensor) -> Tensor:
@@ -72,7 +72,7 @@ class Surface:
 
 
 def boundary_gradient(
-    surface: Surface, points: Tensor, camera: Camera, slope: Tensor, colours: Callable[[Tensor, Tensor], Tensor], random: torch.Generator
+    surface: Surface, points: Tensor, camera: Camera, slope: Tensor, colors: Callable[[Tensor, Tensor], Tensor], random: torch.Generator
 ) -> Tensor:
     """Gradient of a loss by what silhouettes cover and uncover as they move: an integral along them, by sampling.
 
@@ -81,7 +81,7 @@ def boundary_gradient(
     surface, points : the mesh and its points, [points, 3].
     camera : one camera.
     slope : derivative of the loss by the premultiplied RGBA of each pixel, [H·W, 4].
-    colours : what rays of given origins and directions see, premultiplied RGBA: :meth:`bbfit.rivals.mesh_rays.RayCaster.colours`.
+    colors : what rays of given origins and directions see, premultiplied RGBA: :meth:`bbfit.rivals.mesh_rays.RayCaster.colors`.
     random : chooses the samples.
 
     Returns
@@ -100,7 +100,7 @@ def boundary_gradient(
     places = ends[chosen, 0] * (1 - part) + ends[chosen, 1] * part
     normals = torch.stack([-along[chosen, 1], along[chosen, 0]], -1) / lengths[chosen, None]
     sides = torch.cat([places.detach() - BOUNDARY_PIXELS * normals, places.detach() + BOUNDARY_PIXELS * normals])
-    behind, ahead = colours(*rays_through(camera, sides)).chunk(2)
+    behind, ahead = colors(*rays_through(camera, sides)).chunk(2)
     column, row = places.detach().round().long().unbind(-1)
     inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
     pixel = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)

@@ -54,7 +54,7 @@ class Slicings:
     def weights(self, camera: Camera) -> list[tuple[int, float]]:
         """The two slicings nearest to a single camera's direction, seen from above, and how much each counts; weights add up to 1.
 
-        A parallel camera's direction is its own, a pinhole's that of its centre. Of one straight above it is azimuth 0.
+        A parallel camera's direction is its own, a pinhole's that of its center. Of one straight above it is azimuth 0.
         """
         towards = -camera.forward if camera.orthographic else camera.position - self.axis.to(camera.position)
         azimuth = float(torch.atan2(towards[0], towards[2])) * 180 / np.pi if float(towards[::2].norm()) > 1e-9 else 0.0

@@ -25,7 +25,7 @@ Files = dict[str, bytes]
 _QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "include_dashboard": False}
 
 
-_COLOURS = re.compile("\x1b\\[[0-9;]*m")  # Ray's messages are made for terminals
+_COLORS = re.compile("\x1b\\[[0-9;]*m")  # Ray's messages are made for terminals
 
 
 class RayWorkers:
@@ -90,7 +90,7 @@ class RayWorkers:
         try:
             outcome, files = self._ray.get(reference)
         except self._ray.exceptions.RayError as error:
-            told = " ".join(_COLOURS.sub("", str(error)).split())
+            told = " ".join(_COLORS.sub("", str(error)).split())
             return task, Outcome(None, f"{type(error).__name__}: {told[:300]}", "a node of the cluster that is gone")
         place_files(files, task.folder)
         return task, outcome

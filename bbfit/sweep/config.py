@@ -23,7 +23,7 @@ class SweepConfig:
     variants: tuple[str, ...] = ()
     """Which of the grid's variants; all if left out."""
     steps: int | None = None
-    """Optimiser steps of every run, in place of the preset's."""
+    """Optimizer steps of every run, in place of the preset's."""
     retry_failed: bool = False
     """Try again what failed in an earlier start; otherwise its failure stands."""
     workers: int | None = None

@@ -35,7 +35,7 @@ def grow(
 
     Returns
     -------
-    A mesh for the bark and one for each leaf tone; Y up, metres, the foot of the trunk at the origin, unit normals, texture coordinates,
+    A mesh for the bark and one for each leaf tone; Y up, meters, the foot of the trunk at the origin, unit normals, texture coordinates,
     plain materials of which the leaves' are double-sided.
 
     Raises

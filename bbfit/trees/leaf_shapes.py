@@ -36,7 +36,7 @@ _HALVES: tuple[tuple[tuple[float, float], ...], ...] = (
     ((0.0, 0.0), (0.5, 0.0), (0.25, 0.5), (0.0, 1.0)),  # triangle
 )
 # What all triangles of a leaf meet at: a point on the midrib that sees the whole outline.
-_CENTRES = (0.5, 0.4, 0.5, 0.42, 0.44, 0.42, 0.5, 0.55, 0.5, 0.5, 0.35)
+_CENTERS = (0.5, 0.4, 0.5, 0.42, 0.44, 0.42, 0.5, 0.55, 0.5, 0.5, 0.35)
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def leaf_shape(number: int) -> LeafShape:
     right = np.array(_HALVES[number])
     left = right[-2:0:-1] * [-1, 1]
     outline = np.concatenate([right, left])
-    points = np.concatenate([[[0, _CENTRES[number]]], outline])
+    points = np.concatenate([[[0, _CENTERS[number]]], outline])
     corner = np.arange(1, len(points))
     faces = np.stack([np.zeros_like(corner), corner, np.roll(corner, -1)], -1).astype(np.int32)
     size = np.ptp(outline, axis=0)

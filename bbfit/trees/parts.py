@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Material:
-    """A plain surface: colour and roughness, no texture."""
+    """A plain surface: color and roughness, no texture."""
 
     name: str
     """Name in the file, such as ``bark`` or ``leaf_0``."""
@@ -24,7 +24,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Part:
-    """The triangles of one material; Y up, metres, the foot of the trunk at the origin."""
+    """The triangles of one material; Y up, meters, the foot of the trunk at the origin."""
 
     material: Material
     vertices: NDArray[np.float32]

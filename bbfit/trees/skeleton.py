@@ -1,6 +1,6 @@
 """A grown tree before it has a surface: stems as curves, leaves as frames.
 
-Here z is up and lengths are metres; an array of frames [..., 3, 3] holds local axes in its columns, the third of which runs along the stem
+Here z is up and lengths are meters; an array of frames [..., 3, 3] holds local axes in its columns, the third of which runs along the stem
 or leaf. Nothing here knows of triangles: how finely stems are drawn changes nothing about the tree.
 """
 
@@ -30,9 +30,9 @@ class Stems:
     first: Indices
     """The node that a stem begins at, [S]; 0 but for clones."""
     length: Array
-    """Metres from node 0 to the tip, [S]."""
+    """Meters from node 0 to the tip, [S]."""
     radius: Array
-    """Radius at node 0 without flare and lobes, metres, [S]."""
+    """Radius at node 0 without flare and lobes, meters, [S]."""
     parent: Indices
     """The stem that it grows from, [S]: one of the level before, or for a clone one of its own level; -1 for the trunk."""
     offset: Array
@@ -76,7 +76,7 @@ class Leaves:
     frames: Array
     """Local axes, [L, 3, 3]: across the blade, its upper side's normal, from the stalk to the tip."""
     length: float
-    """From stalk to tip, metres."""
+    """From stalk to tip, meters."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Skeleton:
 
     species: Species
     scale: float
-    """The tree's own Scale ± ScaleV, metres (section 4.3)."""
+    """The tree's own Scale ± ScaleV, meters (section 4.3)."""
     levels: tuple[Stems, ...]
     """Trunk, branches, twigs: as many as the species has Levels."""
     leaves: Leaves

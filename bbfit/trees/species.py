@@ -46,9 +46,9 @@ class Species:
     """How the branches' length changes up the tree, 0 to 8 (4.3): 0 conical, 1 spherical, 2 hemispherical, 3 cylindrical, 4 tapered
     cylindrical, 5 flame, 6 inverse conical, 7 tend flame, 8 as the pruning envelope."""
     scale: float
-    """Size of the tree in metres, in [0.1, 1000]: a trunk of length 1 is as long (4.3)."""
+    """Size of the tree in meters, in [0.1, 1000]: a trunk of length 1 is as long (4.3)."""
     scale_v: float
-    """Metres, in [0, scale)."""
+    """Meters, in [0, scale)."""
     levels: int
     """Levels of stems, 1 to 4; leaves sit on the last (section 3)."""
     ratio: float
@@ -110,7 +110,7 @@ class Species:
     """0 default, 1 ovate, 2 linear, 3 cordate, 4 maple, 5 palmate, 6 spiky oak, 7 rounded oak, 8 elliptic, 9 rectangle, 10 triangle
     (tree-gen)."""
     leaf_scale: float
-    """Length of a leaf in metres, in [0.01, 10] (4.5)."""
+    """Length of a leaf in meters, in [0.01, 10] (4.5)."""
     leaf_scale_x: float
     """Width of a leaf over its length, in [0.05, 10] (4.5)."""
     leaf_bend: float
@@ -219,7 +219,7 @@ def _read(key: str, field: Field[Any], value: Any) -> Any:
     if field.type in ("int", "float"):
         return _number(key, field, value)
     if field.name == "leaf_colors":
-        colors = _items(key, value, range(1, _MOST_COLORS + 1), "colours")
+        colors = _items(key, value, range(1, _MOST_COLORS + 1), "colors")
         return tuple(tuple(_numbers(f"{key}[{index}]", field, color, 3)) for index, color in enumerate(colors))
     return tuple(_numbers(key, field, value, LEVELS if key[0] == "n" else 3))
 

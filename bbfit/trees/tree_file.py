@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import trimesh
 
 _COLOR = "base_color"
-"""Key of a geometry's metadata for its linear colour, of which trimesh's material keeps 8 bits."""
+"""Key of a geometry's metadata for its linear color, of which trimesh's material keeps 8 bits."""
 _GLB_LIMIT = 2**32 - 2**20
 """Bytes of vertices and triangles in a GLB, whose header counts all bytes in 32 bits (glTF 2.0 specification, section 4.4)."""
 _VERTEX_BYTES, _TRIANGLE_BYTES = 32, 12
@@ -29,7 +29,7 @@ _ROWS = 1 << 16
 def scene_of(parts: Sequence[Part], *, name: str) -> trimesh.Scene:
     """The tree as one geometry for each part that has triangles, called as its material is; ``name`` is that of the whole.
 
-    Vertices, triangles and their order stay as they are; trimesh holds them in 64 bits. A material's colour stands in full in the
+    Vertices, triangles and their order stay as they are; trimesh holds them in 64 bits. A material's color stands in full in the
     geometry's ``metadata["base_color"]``, beside the 8 bits that trimesh's material has for it.
     """
     import trimesh
@@ -60,12 +60,12 @@ def scene_of(parts: Sequence[Part], *, name: str) -> trimesh.Scene:
 
 
 def write_tree(scene: trimesh.Scene, path: str | Path) -> list[Path]:
-    """Write a tree as GLB (one file) or as OBJ with an MTL of the same stem, by the ending of ``path``; Y up, metres.
+    """Write a tree as GLB (one file) or as OBJ with an MTL of the same stem, by the ending of ``path``; Y up, meters.
 
     A GLB holds the numbers of the parts bit for bit, but v, which glTF counts downwards and which is rounded to float32 as 1 - v. An
     OBJ has nine digits, which give every float32 back. The same scene gives the same bytes.
 
-    An MTL holds the linear colour as Kd: neither Wavefront's description nor Blender converts it. Its other figures are those for which
+    An MTL holds the linear color as Kd: neither Wavefront's description nor Blender converts it. Its other figures are those for which
     Blender's importer sets up the very surface that it makes of the GLB.
 
     Returns
@@ -104,7 +104,7 @@ def _check(scene: trimesh.Scene) -> None:
 
 
 def _base_color(mesh: Any) -> list[float]:
-    """Linear RGBA: in full where the material still has the colour that the tree was grown with, otherwise the material's."""
+    """Linear RGBA: in full where the material still has the color that the tree was grown with, otherwise the material's."""
     factor = mesh.visual.material.baseColorFactor
     shown = [1.0] * 4 if factor is None else (np.asarray(factor) / 255).tolist()
     full = mesh.metadata.get(_COLOR, shown[:3])
@@ -113,7 +113,7 @@ def _base_color(mesh: Any) -> list[float]:
 
 
 def _complete(tree: dict[str, Any], scene: trimesh.Scene) -> None:
-    """Give the glTF the scene's name and its colours in full."""
+    """Give the glTF the scene's name and its colors in full."""
     (stage,) = tree["scenes"]
     extras = stage.pop("extras", {})
     if "name" in extras:
@@ -151,7 +151,7 @@ def _mtl(scene: trimesh.Scene) -> str:
 
 def _obj(scene: trimesh.Scene, library: str) -> Iterator[bytes]:
     """The OBJ in pieces: one object for each node, at its place in the scene."""
-    yield f"# {generator()}, metres, Y up\nmtllib {library}\n".encode()
+    yield f"# {generator()}, meters, Y up\nmtllib {library}\n".encode()
     first = 1
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]

@@ -12,7 +12,7 @@ from bbfit.checks import check_count, check_range
 
 MOST = 10_000
 """Trees in a field at most."""
-# Distance of neighbours as a share of the tree's width; how far a tree may be off its place, as a share of that; the range of sizes.
+# Distance of neighbors as a share of the tree's width; how far a tree may be off its place, as a share of that; the range of sizes.
 _APART, _OFF, _SIZES = 1.05, 0.35, (0.7, 1.3)
 
 
@@ -21,13 +21,13 @@ class Field:
     """N trees."""
 
     positions: NDArray[np.float32]
-    """Where each tree's own origin goes, in metres, [N, 3]; the first tree stands in the middle."""
+    """Where each tree's own origin goes, in meters, [N, 3]; the first tree stands in the middle."""
     wxyzs: NDArray[np.float32]
     """Rotations about the vertical as quaternions, [N, 4]."""
     scales: NDArray[np.float32]
     """Sizes, 1 as large as the tree itself, [N]."""
     side: float
-    """Width of the field in metres."""
+    """Width of the field in meters."""
 
     def __len__(self) -> int:
         return len(self.scales)
@@ -39,7 +39,7 @@ def plant(count: int, bounds: NDArray[np.float64], *, seed: int = 0) -> Field:
     Parameters
     ----------
     count : 1 to :data:`MOST`.
-    bounds : the tree's lowest and highest corner in metres, [2, 3]; it stands on its lowest height.
+    bounds : the tree's lowest and highest corner in meters, [2, 3]; it stands on its lowest height.
     seed : of the places, turns and sizes; the same seed gives the same field.
     """
     check_count("trees", count)

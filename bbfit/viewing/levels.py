@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import LodConfig
-from bbfit.fitting.initialize import pixels_a_metre
+from bbfit.fitting.initialize import pixels_a_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.views import ViewSet
 
@@ -28,7 +28,7 @@ class Level:
     cloud: BillboardCloud | None
     """Its billboards; ``None`` for the tree itself."""
     scale: float | None
-    """Pixels a metre on the screen below which it is shown: infinity for the finest level, ``None`` if that is not known."""
+    """Pixels a meter on the screen below which it is shown: infinity for the finest level, ``None`` if that is not known."""
     halvings: int = 0
     """How often the sides of its textures are halved."""
     mark: int = field(default_factory=lambda: next(_MARKS), compare=False)
@@ -42,12 +42,12 @@ class Level:
         return f"{len(self.cloud)} billboard{'s' if len(self.cloud) > 1 else ''}"
 
     def distance(self, focal: float) -> float | None:
-        """Distance in metres from which on it is shown by a camera of a focal length in pixels; ``None`` if that is not known."""
+        """Distance in meters from which on it is shown by a camera of a focal length in pixels; ``None`` if that is not known."""
         return None if self.scale is None else focal / self.scale
 
 
 def choose_level(levels: Sequence[Level], scale: float) -> int:
-    """Which level is shown at so many pixels a metre: the coarsest that may be; those not known are passed over.
+    """Which level is shown at so many pixels a meter: the coarsest that may be; those not known are passed over.
 
     ``levels`` stand finest first.
     """
@@ -55,7 +55,7 @@ def choose_level(levels: Sequence[Level], scale: float) -> int:
 
 
 def choose_levels(levels: Sequence[Level], scales: NDArray[np.floating]) -> NDArray[np.int64]:
-    """:func:`choose_level` for many trees at once: pixels a metre [N] to indices [N]."""
+    """:func:`choose_level` for many trees at once: pixels a meter [N] to indices [N]."""
     chosen = np.zeros(len(scales), np.int64)
     for index, level in enumerate(levels):
         if level.scale is not None:
@@ -82,9 +82,9 @@ def field_levels(levels: Sequence[Level]) -> tuple[Level, ...]:
 
 
 def takes_over(cloud: BillboardCloud, views: ViewSet, stop: Callable[[], bool] = lambda: False) -> float:
-    """Pixels a metre below which a cloud's silhouette is off by less than a pixel in the training view in which it is worst.
+    """Pixels a meter below which a cloud's silhouette is off by less than a pixel in the training view in which it is worst.
 
     Never more than in the views: larger than that it was not measured. Once ``stop`` says so, no more views are looked at.
     """
-    scale = float(pixels_a_metre(views.cameras))
+    scale = float(pixels_a_meter(views.cameras))
     return min(scale, scale_within(worst_silhouette(cloud, views, stop=stop) / scale, LodConfig().error_pixels))

@@ -23,7 +23,7 @@ class Original:
     """The tree that was compressed."""
 
     glb: bytes | None
-    """A GLB file, Y up in metres; ``None`` if it cannot be shown."""
+    """A GLB file, Y up in meters; ``None`` if it cannot be shown."""
     note: str
     """Why it cannot be shown, or what was done to it; empty if it is the file as it is."""
     vertices: int | None = None

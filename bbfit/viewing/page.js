@@ -1,4 +1,4 @@
-// What runs in the page besides viser's own client: it draws the scene once for each pane, with colours as they are in the models,
+// What runs in the page besides viser's own client: it draws the scene once for each pane, with colors as they are in the models,
 // writes the labels over it, and measures how long a frame takes. The server sends the state with `window.bbfit.set`.
 window.bbfit ??= (() => {
   document.title = "bbfit";
@@ -35,7 +35,7 @@ window.bbfit ??= (() => {
     const nodes = [LEFT, RIGHT, FIELD].map((name) => [name, viser().nodeRefFromName[name]]).filter(([, node]) => node);
     const kept = nodes.map(([, node]) => node.visible), aspect = camera.aspect, whole = size();
     calls = triangles = 0;
-    renderer.toneMapping = 0; // none: a billboard's colour is final, and so is that of the light on the original
+    renderer.toneMapping = 0; // none: a billboard's color is final, and so is that of the light on the original
     renderer.setScissorTest(true);
     panes().forEach((pane, index) => {
       for (const [name, node] of nodes) node.visible = name === shown(index);

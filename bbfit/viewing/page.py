@@ -28,7 +28,7 @@ from bbfit.views import ViewDataset
 HOST, PORT = "127.0.0.1", 8080
 """Where a page listens if nothing else is said."""
 _SCRIPT = Path(__file__).with_name("page.js")
-# Shares of the sky's and of the sun's light that reach a leaf among others, in place of shadows: by the mean colour of two trees' views.
+# Shares of the sky's and of the sun's light that reach a leaf among others, in place of shadows: by the mean color of two trees' views.
 _SKY, _SUN = 0.5, 0.85
 
 

@@ -11,7 +11,7 @@ from bbfit.geometry.alpha import AlphaKind
 from bbfit.viewing.field import MOST
 from bbfit.viewing.levels import choose_level
 from bbfit.viewing.models import Look
-from bbfit.viewing.panes import STEPS, Picture, Reach, metres
+from bbfit.viewing.panes import STEPS, Picture, Reach, meters
 from bbfit.viewing.subject import Subject
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ _SAME = 2e-3
 
 
 class Panel:
-    """Controls, and what they say; every change calls one of three functions. ``height`` is the tree's, in metres."""
+    """Controls, and what they say; every change calls one of three functions. ``height`` is the tree's, in meters."""
 
     def __init__(
         self,
@@ -56,9 +56,9 @@ class Panel:
         self.level: Any = gui.add_dropdown(
             "level", (BY_DISTANCE,), hint="level of detail: a fixed one, or the one that the distance allows"
         )
-        marks = tuple((step, metres(reach.distance(step))) for step in (0, STEPS // 2, STEPS))
+        marks = tuple((step, meters(reach.distance(step))) for step in (0, STEPS // 2, STEPS))
         self.slider: Any = gui.add_slider("distance", 0, STEPS, 1, 0, marks=marks, hint="equal steps are equal factors")
-        self.metres: Any = gui.add_number("metres", 1.0, min=1e-3, step=0.1, hint="from the camera to the tree's middle")
+        self.meters: Any = gui.add_number("meters", 1.0, min=1e-3, step=0.1, hint="from the camera to the tree's middle")
         self.readout = gui.add_markdown("")
         with gui.add_folder("Plant a field"):
             self.trees: Any = gui.add_number("trees", 1000, min=1, max=MOST, step=1)
@@ -67,7 +67,7 @@ class Panel:
         for handle in (self.show, self.outlines, self.alpha, self.split, self.level):
             handle.on_update(lambda _: on_change())
         self.slider.on_update(lambda _: self._ask(self.reach.distance(self.slider.value), step=True))
-        self.metres.on_update(lambda _: self._ask(float(self.metres.value), step=False))
+        self.meters.on_update(lambda _: self._ask(float(self.meters.value), step=False))
         self.plant.on_click(lambda _: on_plant())
 
     def fit(self, subject: Subject, *, first: bool) -> None:
@@ -89,30 +89,30 @@ class Panel:
         return Look(self.alpha.value, bool(self.split.value) and self.alpha.value == "blend")
 
     def chosen(self, subject: Subject, scale: float) -> int:
-        """Which level is to be shown at so many pixels a metre."""
+        """Which level is to be shown at so many pixels a meter."""
         if self.level.value == BY_DISTANCE:
             return choose_level(subject.levels, scale)
         names = [level.name for level in subject.levels]
         return names.index(self.level.value) if self.level.value in names else len(names) - len(subject.clouds)
 
     def tell_distance(self, distance: float) -> None:
-        """Set slider and number to where the camera is, in metres."""
+        """Set slider and number to where the camera is, in meters."""
         self._distance = distance
         if time.monotonic() - self._slid > HELD:
             self.slider.value = self.reach.step(distance)
-        if abs(self.metres.value / distance - 1) > _SAME / 2:
-            self.metres.value = float(f"{distance:.4g}")
+        if abs(self.meters.value / distance - 1) > _SAME / 2:
+            self.meters.value = float(f"{distance:.4g}")
 
     def tell_levels(self, subject: Subject, picture: Picture, chosen: int) -> None:
         """Say how large the tree is on the screen, and from where on each level is shown."""
-        scale, focal = picture.pixels_a_metre(self._distance), picture.pixels_a_metre(1.0)
-        lines = [f"{metres(self._distance)} away the tree is **{scale * subject.size[1]:,.0f} pixels** tall."]
+        scale, focal = picture.pixels_a_meter(self._distance), picture.pixels_a_meter(1.0)
+        lines = [f"{meters(self._distance)} away the tree is **{scale * subject.size[1]:,.0f} pixels** tall."]
         for index, level in enumerate(subject.levels) if len(subject.levels) > 1 else ():
             distance = level.distance(focal)
             if distance is None:
                 where = "not known: " + ("the fit is not done" if subject.live else "being measured" if subject.views else "no views")
             else:
-                where = f"may be shown from {metres(distance)} on" if distance else "from 0 m on"
+                where = f"may be shown from {meters(distance)} on" if distance else "from 0 m on"
             lines.append(f"- {'**' if index == chosen else ''}{level.name}{'**' if index == chosen else ''}: {where}")
         self.readout.content = "\n".join([lines[0], "", *lines[1:]])
 

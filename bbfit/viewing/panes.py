@@ -1,4 +1,4 @@
-"""The page's picture: how it is shared out between two trees, how large a metre is in it, and the slider of distances."""
+"""The page's picture: how it is shared out between two trees, how large a meter is in it, and the slider of distances."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class Picture:
             return self.width, self.height
         return (self.width / 2, self.height) if self.width >= self.height else (self.width, self.height / 2)
 
-    def pixels_a_metre(self, distance: float) -> float:
-        """Pixels that a metre takes up at a distance in metres along the viewing direction."""
+    def pixels_a_meter(self, distance: float) -> float:
+        """Pixels that a meter takes up at a distance in meters along the viewing direction."""
         return self.pane[1] / 2 / math.tan(self.fov / 2) / distance
 
     def distance_to_fit(self, width: float, height: float) -> float:
-        """Distance in metres from which something of a width and height in metres fills most of a pane."""
+        """Distance in meters from which something of a width and height in meters fills most of a pane."""
         across, up = self.pane
         return max(height, width * up / max(across, 1.0)) / (2 * _FILLED * math.tan(self.fov / 2))
 
@@ -46,20 +46,20 @@ class Reach:
     """The slider of distances: equal steps of it are equal factors."""
 
     nearest: float
-    """Distance in metres at the slider's start."""
+    """Distance in meters at the slider's start."""
     farthest: float
-    """Distance in metres at its end."""
+    """Distance in meters at its end."""
 
     def distance(self, step: float) -> float:
-        """Distance in metres at a step, 0 to :data:`STEPS`."""
+        """Distance in meters at a step, 0 to :data:`STEPS`."""
         return self.nearest * (self.farthest / self.nearest) ** (step / STEPS)
 
     def step(self, distance: float) -> int:
-        """The step next to a distance in metres; the first or last one for those beyond."""
+        """The step next to a distance in meters; the first or last one for those beyond."""
         share = math.log(max(distance, self.nearest) / self.nearest) / math.log(self.farthest / self.nearest)
         return min(STEPS, round(share * STEPS))
 
 
-def metres(distance: float) -> str:
+def meters(distance: float) -> str:
     """A distance as text of about three digits."""
     return f"{distance:.3g} m" if distance < 1000 else f"{distance:,.0f} m"

@@ -42,7 +42,7 @@ class Planted:
 
         Parameters
         ----------
-        eye : the camera's place in metres, [3].
+        eye : the camera's place in meters, [3].
         focal : its focal length in pixels.
         """
         field = self._field

@@ -38,7 +38,7 @@ class Subject:
     export: ExportConfig
     """How the run's models are written; the textures are PNG, which the page reads."""
     bounds: NDArray[np.float64]
-    """Lowest and highest corner of what the billboards show in metres, [2, 3]."""
+    """Lowest and highest corner of what the billboards show in meters, [2, 3]."""
     light: ViewsConfig
     """How the tree was lit in the views, as far as that is known."""
     views: Path | None = None
@@ -55,13 +55,13 @@ class Subject:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Width, the larger one of that along x and that along z, and height in metres."""
+        """Width, the larger one of that along x and that along z, and height in meters."""
         low, high = self.bounds
         return float(max(high[0] - low[0], high[2] - low[2])), float(high[1] - low[1])
 
     @property
     def middle(self) -> NDArray[np.float64]:
-        """The middle of the bounds in metres, [3]."""
+        """The middle of the bounds in meters, [3]."""
         middle: NDArray[np.float64] = self.bounds.mean(0)
         return middle
 
@@ -116,7 +116,7 @@ def live_subject(cloud: BillboardCloud, name: str, original: Original, light: Vi
 
 
 def outlines(cloud: BillboardCloud) -> NDArray[np.float32]:
-    """The edges of a cloud's rectangles as line segments, [4 N, 2, 3] in metres."""
+    """The edges of a cloud's rectangles as line segments, [4 N, 2, 3] in meters."""
     around = corners(cloud).numpy()
     return np.stack([around, np.roll(around, -1, 1)], 2).reshape(-1, 2, 3).astype(np.float32)
 
@@ -184,7 +184,7 @@ def _open_lod(folder: Path, original_bytes: int) -> Subject:
         config = told["config"]
         focal = config["screen_height"] / 2 / math.tan(math.radians(config["screen_fov_degrees"]) / 2)
         for index, level in enumerate(told["levels"]):
-            scale = focal / level["distance_metres"] if index and level["distance_metres"] else math.inf
+            scale = focal / level["distance_meters"] if index and level["distance_meters"] else math.inf
             if level["planes"] is None:
                 with_tree = True
                 continue

@@ -115,7 +115,7 @@ class Visitor:
 
     @property
     def distance(self) -> float:
-        """Metres between the camera and the tree's middle."""
+        """Meters between the camera and the tree's middle."""
         assert self._subject is not None
         return max(float(np.linalg.norm(self.client.camera.position - self._subject.middle)), 1e-6)
 
@@ -132,7 +132,7 @@ class Visitor:
         self._fitted, self._arrived = (self.picture, eye), False
 
     def go(self, distance: float) -> None:
-        """Move the camera to a distance in metres from the tree's middle, on the line between them."""
+        """Move the camera to a distance in meters from the tree's middle, on the line between them."""
         with self._lock:
             if self._subject is not None and not self._gone:
                 self._fitted = None
@@ -171,7 +171,7 @@ class Visitor:
             subject, mode = self._subject, self.panel.show.value
             if mode != self._mode:
                 self._change_mode(mode)
-            chosen = self.panel.chosen(subject, self.picture.pixels_a_metre(self.distance))
+            chosen = self.panel.chosen(subject, self.picture.pixels_a_meter(self.distance))
             self.panel.tell_alpha(subject)
             if mode == FIELD:
                 self._apply_field()
@@ -252,11 +252,11 @@ class Visitor:
             assert level.cloud is not None
             segments = outlines(level.cloud)
             hues = np.arange(len(level.cloud)) / len(level.cloud)
-            colours = np.array([[round(255 * c) for c in colorsys.hsv_to_rgb(hue, 0.9, 0.8)] for hue in hues], np.uint8)
+            colors = np.array([[round(255 * c) for c in colorsys.hsv_to_rgb(hue, 0.9, 0.8)] for hue in hues], np.uint8)
             self._lines = self.client.scene.add_line_segments(
                 f"{ROOTS[BILLBOARDS]}/outlines-{next(_NUMBERS)}",
                 segments,
-                np.repeat(np.repeat(colours, 4, 0)[:, None], 2, 1),
+                np.repeat(np.repeat(colors, 4, 0)[:, None], 2, 1),
                 thickness=2.0,
                 thickness_units="screen",
             )
@@ -294,7 +294,7 @@ class Visitor:
             self._background.start(lambda: self._catch_up(now), after=_ROUND)
             return
         self._rounded = now
-        self._planted.share_out(self.client.camera.position, self.picture.pixels_a_metre(1.0))
+        self._planted.share_out(self.client.camera.position, self.picture.pixels_a_meter(1.0))
 
     def _catch_up(self, since: float) -> None:
         with self._lock:
@@ -323,7 +323,7 @@ class Visitor:
         """Labels and readouts; for so many seconds the page is to measure frames."""
         assert self._subject is not None and self._models is not None
         subject, look = self._subject, self.panel.look
-        chosen = self.panel.chosen(subject, self.picture.pixels_a_metre(self.distance))
+        chosen = self.panel.chosen(subject, self.picture.pixels_a_meter(self.distance))
         self.panel.tell_levels(subject, self.picture, chosen)
         level = subject.levels[chosen]
         busy = "making the model … " if self._making else ""

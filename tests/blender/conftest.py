@@ -64,10 +64,10 @@ def run_in_blender(script: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def box(low: tuple[float, float, float], high: tuple[float, float, float], colour: tuple[int, int, int]) -> trimesh.Trimesh:
-    """A box between two corners in one matt colour."""
+def box(low: tuple[float, float, float], high: tuple[float, float, float], color: tuple[int, int, int]) -> trimesh.Trimesh:
+    """A box between two corners in one matt color."""
     mesh = trimesh.creation.box(bounds=[low, high])
-    material = PBRMaterial(name=str(colour), baseColorFactor=[*colour, 255], metallicFactor=0.0, roughnessFactor=1.0)
+    material = PBRMaterial(name=str(color), baseColorFactor=[*color, 255], metallicFactor=0.0, roughnessFactor=1.0)
     mesh.visual = trimesh.visual.TextureVisuals(material=material)
     return mesh
 
@@ -82,7 +82,7 @@ def thing() -> list[trimesh.Trimesh]:
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
-    """Vertex colours of a PLY, which are sRGB, for a glTF's factors, which are linear; both 0..255."""
+    """Vertex colors of a PLY, which are sRGB, for a glTF's factors, which are linear; both 0..255."""
     value = np.asarray(linear) / 255
     return np.rint(255 * np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)).astype(np.uint8)
 

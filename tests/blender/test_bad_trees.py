@@ -249,7 +249,7 @@ def test_importing_loads_no_blender() -> None:
         ({"device": "gpu"}, "device: expected one of cpu, cuda"),
         ({"workers": 0}, "workers: expected at least 1"),
         ({"seed": -1}, "seed: expected at least 0"),
-        ({"axis": "trunk"}, "axis: expected one of auto, origin, centre"),
+        ({"axis": "trunk"}, "axis: expected one of auto, origin, center"),
     ],
 )
 def test_settings_are_checked(setting: dict[str, Any], said: str) -> None:

@@ -106,14 +106,14 @@ def test_everything_stays_where_and_how_large_it_is(things: Path, tmp_path: Path
     assert complaints(out) == set()
 
 
-def test_colours_of_materials_are_kept(thing_glb: Path, tmp_path: Path) -> None:
+def test_colors_of_materials_are_kept(thing_glb: Path, tmp_path: Path) -> None:
     tree, _ = parts(tree_as_glb(thing_glb, tmp_path / "thing.glb"))
     factors = sorted(material["pbrMetallicRoughness"]["baseColorFactor"] for material in tree["materials"])
     expected = sorted([*(np.array(part.visual.material.baseColorFactor) / 255)] for part in thing())
     np.testing.assert_allclose(factors, expected, atol=1e-6)
 
 
-def test_vertex_colours_take_the_place_of_materials(things: Path, tmp_path: Path) -> None:
+def test_vertex_colors_take_the_place_of_materials(things: Path, tmp_path: Path) -> None:
     tree, contents = split_glb(tree_as_glb(things / "thing.ply", tmp_path / "thing.glb").read_bytes())
     (material,) = tree["materials"]
     assert material["pbrMetallicRoughness"].get("baseColorFactor", [1, 1, 1, 1]) == [1, 1, 1, 1]
@@ -121,13 +121,13 @@ def test_vertex_colours_take_the_place_of_materials(things: Path, tmp_path: Path
     (primitive,) = tree["meshes"][0]["primitives"]
     accessor = tree["accessors"][primitive["attributes"]["COLOR_0"]]
     assert accessor["componentType"] == 5126
-    colours = np.frombuffer(contents[accessor["bufferView"]], "<f4").reshape(accessor["count"], -1)
+    colors = np.frombuffer(contents[accessor["bufferView"]], "<f4").reshape(accessor["count"], -1)
     expected = np.array([part.visual.material.baseColorFactor for part in thing()])[:, :3] / 255
-    errors = np.abs(colours[:, None, :3] - expected).max(-1).min(1)
+    errors = np.abs(colors[:, None, :3] - expected).max(-1).min(1)
     assert errors.max() < 0.003  # measured 0.0008: the PLY has 8 bits of sRGB
 
 
-def test_without_materials_and_colours_a_tree_is_matt_grey(things: Path, tmp_path: Path) -> None:
+def test_without_materials_and_colors_a_tree_is_matt_gray(things: Path, tmp_path: Path) -> None:
     tree, _ = parts(tree_as_glb(things / "thing.stl", tmp_path / "thing.glb"))
     (material,) = tree["materials"]
     np.testing.assert_allclose(material["pbrMetallicRoughness"]["baseColorFactor"], [0.5, 0.5, 0.5, 1])
@@ -210,7 +210,7 @@ def painted(name):
     made = bpy.data.materials.new(name)
     made.use_nodes = True
     return made
-cube.data.materials.append(painted("grey"))
+cube.data.materials.append(painted("gray"))
 other = another("red", Matrix.Translation((0, 0, 9)))
 other.material_slots[0].link = "OBJECT"
 other.material_slots[0].material = painted("red")
@@ -244,8 +244,8 @@ def test_instances_are_shared_and_modifiers_curves_mirrors_and_shears_applied(tm
     nodes = {node["name"]: node for node in tree["nodes"]}
     assert set(nodes) == {"Cube", "red", "moved", "mirrored", "sheared", "modified", "curve"}
     assert nodes["Cube"]["mesh"] == nodes["moved"]["mesh"] == nodes["mirrored"]["mesh"] != nodes["sheared"]["mesh"]
-    red, grey = (tree["meshes"][nodes[name]["mesh"]]["primitives"][0]["material"] for name in ("red", "Cube"))
-    assert (tree["materials"][red]["name"], tree["materials"][grey]["name"]) == ("red", "grey")
+    red, gray = (tree["meshes"][nodes[name]["mesh"]]["primitives"][0]["material"] for name in ("red", "Cube"))
+    assert (tree["materials"][red]["name"], tree["materials"][gray]["name"]) == ("red", "gray")
     scene = trimesh.load(out, process=False)
     bounds = {}
     for name in nodes:

@@ -20,7 +20,7 @@ CONFIG = RunConfig(
     species="acer",
     grow=GrowConfig(seed=3, detail=0.3, leaves=0.1),
     views=ViewsConfig(count=8, size=48, samples=1, denoise=False),
-    fit=FitConfig(billboards=2, candidates=2, revisions=0, steps=2),
+    fit=FitConfig(billboards=2, candidates=2, refinement_rounds=0, steps=2),
 )
 
 

@@ -27,7 +27,7 @@ from bbfit.pipeline import RunConfig
 from bbfit.views import ViewDataset
 
 TREE = Path(__file__).resolve().parents[2] / "data" / "tree.glb"
-SMALL = RunConfig(views=ViewsConfig(count=12, size=64, samples=4), fit=FitConfig(steps=40, candidates=2, revisions=1, searches=1))
+SMALL = RunConfig(views=ViewsConfig(count=12, size=64, samples=4), fit=FitConfig(steps=40, candidates=2, refinement_rounds=1, restarts=1))
 LEVELS = LodConfig(planes=(4, 2), error_pixels=0.5)
 
 
@@ -50,11 +50,11 @@ def test_the_file_has_the_tree_and_the_clouds(built: LodResult) -> None:
     assert glb_counts(built.path.read_bytes()) == together
     extras = tree["nodes"][root]["extras"]
     assert extras["MSFT_screencoverage"] == [level.screen_coverage for level in built.levels]
-    assert extras["lod_distances"] == [level.distance_metres for level in built.levels]
+    assert extras["lod_distances"] == [level.distance_meters for level in built.levels]
 
 
 def test_levels_take_over_where_their_error_is_within_the_bound(built: LodResult) -> None:
-    """By the tree's own geometry: distance times pixels a metre is the screen's focal length, coverage that of the bounding sphere."""
+    """By the tree's own geometry: distance times pixels a meter is the screen's focal length, coverage that of the bounding sphere."""
     views = ViewDataset.load(built.folder / "views")
     focal = 1080 / 2 / np.tan(np.radians(25))
     points = trimesh.load(TREE, force="mesh").vertices
@@ -63,21 +63,21 @@ def test_levels_take_over_where_their_error_is_within_the_bound(built: LodResult
     axis = views.request["camera"]["distance"]
     scale = float(views.train.cameras.intrinsics[0, 0, 0]) / axis
     before: LodLevel = built.levels[0]
-    assert before.distance_metres == before.error_metres == 0 and before.tree_pixels is None
+    assert before.distance_meters == before.error_meters == 0 and before.tree_pixels is None
     for level in built.levels[1:]:
         cloud = BillboardCloud.load(built.folder / str(level.planes) / "cloud.safetensors")
         worst = [
             max(silhouette_distance(*(picture.numpy() for picture in held_out(cloud, split, index))) for index in range(len(split)))
             for split in (views.train, views.test)
         ]
-        assert level.error_metres == pytest.approx(worst[0] / scale, rel=1e-3) and worst[0] > 0
-        pixels_a_metre = focal / level.distance_metres
-        assert level.error_pixels == pytest.approx(level.error_metres * pixels_a_metre)
-        assert level.held_out_error_pixels == pytest.approx(worst[1] / scale * pixels_a_metre, rel=1e-3)
+        assert level.error_meters == pytest.approx(worst[0] / scale, rel=1e-3) and worst[0] > 0
+        pixels_a_meter = focal / level.distance_meters
+        assert level.error_pixels == pytest.approx(level.error_meters * pixels_a_meter)
+        assert level.held_out_error_pixels == pytest.approx(worst[1] / scale * pixels_a_meter, rel=1e-3)
         assert level.error_pixels <= LEVELS.error_pixels + 1e-9
-        assert level.tree_pixels == pytest.approx(height * pixels_a_metre, rel=1e-3) and level.distance_metres >= before.distance_metres
+        assert level.tree_pixels == pytest.approx(height * pixels_a_meter, rel=1e-3) and level.distance_meters >= before.distance_meters
         # The level before it ends where this one begins.
-        assert before.screen_coverage == pytest.approx(np.pi * (radius * pixels_a_metre) ** 2 / (1920 * 1080), rel=1e-3)
+        assert before.screen_coverage == pytest.approx(np.pi * (radius * pixels_a_meter) ** 2 / (1920 * 1080), rel=1e-3)
         before = level
     assert before.screen_coverage == 0
 
@@ -97,9 +97,9 @@ def test_textures_are_as_fine_as_the_screen_shows(built: LodResult) -> None:
         extent = Image.open(io.BytesIO(views[image["bufferView"]])).size
         points, uvs = (array(primitive["attributes"][name]).reshape(level.planes, 4, -1) for name in ("POSITION", "TEXCOORD_0"))
         sides = [np.linalg.norm(np.diff(values, axis=1), axis=-1) for values in (points, uvs * extent)]
-        texels_a_metre = np.median(sides[1] / sides[0])
-        seen = 1080 / 2 / np.tan(np.radians(25)) / level.distance_metres
-        assert 0.95 < texels_a_metre / seen < 2.05
+        texels_a_meter = np.median(sides[1] / sides[0])
+        seen = 1080 / 2 / np.tan(np.radians(25)) / level.distance_meters
+        assert 0.95 < texels_a_meter / seen < 2.05
 
 
 def test_what_was_measured_is_written_down(built: LodResult) -> None:
@@ -121,8 +121,8 @@ def test_started_again_nothing_is_done_twice(built: LodResult) -> None:
 def test_without_the_tree_the_finest_cloud_is_shown_from_the_start(built: LodResult, tmp_path: Path) -> None:
     config = replace(LEVELS, original=False)
     result = build_lod(TREE, tmp_path / "oak.glb", config, replace(SMALL, export=ExportConfig(textures="png")), work=built.folder)
-    assert [level.planes for level in result.levels] == [4, 2] and result.levels[0].distance_metres == 0
-    assert result.levels[1].distance_metres == built.levels[2].distance_metres
+    assert [level.planes for level in result.levels] == [4, 2] and result.levels[0].distance_meters == 0
+    assert result.levels[1].distance_meters == built.levels[2].distance_meters
     assert result.path.stat().st_size < built.path.stat().st_size - TREE.stat().st_size / 2
 
 

@@ -1,4 +1,4 @@
-"""What the pictures show: cameras, axes of every format, colours, alpha, light."""
+"""What the pictures show: cameras, axes of every format, colors, alpha, light."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def pictures(folder: Path) -> np.ndarray:
     return np.stack([read_rgba(path) for path in sorted((folder / "images").glob("*.png"))]).astype(float)
 
 
-def colour(picture: np.ndarray) -> np.ndarray:
-    """Mean colour of the fully covered pixels, [3]."""
+def color(picture: np.ndarray) -> np.ndarray:
+    """Mean color of the fully covered pixels, [3]."""
     return picture[picture[..., 3] == 255][:, :3].mean(0)
 
 
@@ -40,7 +40,7 @@ def coverage(triangles: np.ndarray, size: int) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "setting",
-    [{"fov_degrees": 50.0}, {"orthographic": True}, {"fov_degrees": 100.0, "axis": "centre"}],
+    [{"fov_degrees": 50.0}, {"orthographic": True}, {"fov_degrees": 100.0, "axis": "center"}],
     ids=["pinhole", "orthographic", "wide"],
 )
 def test_projected_vertices_are_where_the_picture_is(thing_glb: Path, tmp_path: Path, setting: dict) -> None:
@@ -75,7 +75,7 @@ def test_whole_frame_is_used(unbroken: Path) -> None:
 
 @pytest.mark.parametrize("ending", FORMATS)
 def test_every_format_gives_the_same_pictures(things: Path, unbroken: Path, tmp_path: Path, ending: str) -> None:
-    """Silhouettes agree to 2/255; colours, where the format has them, to 3/255; a .blend's light, world and scripts have no effect."""
+    """Silhouettes agree to 2/255; colors, where the format has them, to 3/255; a .blend's light, world and scripts have no effect."""
     out = render_views(things / f"thing{ending}", tmp_path / "views", ViewsConfig(**SMALL | {"workers": 1}))
     got, expected = pictures(out), pictures(unbroken)
     assert abs(got[..., 3] - expected[..., 3]).max() <= 2
@@ -106,15 +106,15 @@ def test_what_stands_in_views_json(unbroken: Path, thing_glb: Path) -> None:
 
 def test_matt_white_in_even_light_is_white_and_grey_keeps_its_value(tmp_path: Path) -> None:
     """Linear 0.5 is 188 in sRGB under view transform Standard; allowed 3/255 for noise and the dielectric's sheen."""
-    for name, value, expected in (("white", 255, 255), ("grey", 128, 188)):
+    for name, value, expected in (("white", 255, 255), ("gray", 128, 188)):
         trimesh.Scene([box((-1, 0, -1), (1, 2, 1), (value, value, value))]).export(str(tmp_path / f"{name}.glb"))
         config = ViewsConfig(**SMALL | {"count": 2, "samples": 16, "sun_strength": 0.0})
-        seen = colour(pictures(render_views(tmp_path / f"{name}.glb", tmp_path / name, config)))
+        seen = color(pictures(render_views(tmp_path / f"{name}.glb", tmp_path / name, config)))
         np.testing.assert_allclose(seen, expected, atol=3)
 
 
 def test_alpha_is_straight(tmp_path: Path) -> None:
-    """Half-covered pixels at the edge keep the surface's colour: a white ball is white there too (premultiplied would be grey)."""
+    """Half-covered pixels at the edge keep the surface's color: a white ball is white there too (premultiplied would be gray)."""
     ball = trimesh.creation.icosphere(2)
     ball.visual = box((0, 0, 0), (1, 1, 1), (255, 255, 255)).visual
     ball.export(str(tmp_path / "white.glb"))
@@ -131,7 +131,7 @@ def test_sun_stands_where_it_was_put(thing_glb: Path, tmp_path: Path) -> None:
     for azimuth in (90.0, 180.0):
         config = ViewsConfig(**SMALL | {"ambient_strength": 0.05, "sun_azimuth": azimuth, "sun_elevation": 20.0})
         seen = pictures(render_views(thing_glb, tmp_path / f"{azimuth}", config))
-        brightness = [colour(picture).mean() for picture in seen]
+        brightness = [color(picture).mean() for picture in seen]
         assert np.argmax(brightness) == azimuth / 90
         assert max(brightness) > 2 * brightness[(int(azimuth / 90) + 2) % 4]
 
@@ -141,14 +141,14 @@ def test_panorama_lights_the_tree(tmp_path: Path) -> None:
     trimesh.Scene([box((-1, 0, -1), (1, 2, 1), (255, 255, 255))]).export(str(tmp_path / "white.glb"))
     cv2.imwrite(str(tmp_path / "sky.hdr"), np.full((8, 16, 3), (1.0, 0.0, 0.0), np.float32))
     config = ViewsConfig(**SMALL | {"count": 2, "samples": 16, "sun_strength": 0.0, "hdri": tmp_path / "sky.hdr"})
-    seen = colour(pictures(render_views(tmp_path / "white.glb", tmp_path / "views", config)))
+    seen = color(pictures(render_views(tmp_path / "white.glb", tmp_path / "views", config)))
     np.testing.assert_allclose(seen, [0, 0, 255], atol=3)
 
 
-def test_surface_without_material_is_grey(tmp_path: Path) -> None:
+def test_surface_without_material_is_gray(tmp_path: Path) -> None:
     trimesh.creation.box(bounds=[(-1, -1, 0), (1, 1, 2)]).export(str(tmp_path / "plain.stl"))
     config = ViewsConfig(**SMALL | {"count": 2, "sun_strength": 0.0})
-    np.testing.assert_allclose(colour(pictures(render_views(tmp_path / "plain.stl", tmp_path / "views", config))), 188, atol=3)
+    np.testing.assert_allclose(color(pictures(render_views(tmp_path / "plain.stl", tmp_path / "views", config))), 188, atol=3)
 
 
 def test_what_a_blend_makes_at_render_time_is_measured(tmp_path: Path) -> None:

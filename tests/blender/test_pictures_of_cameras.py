@@ -25,14 +25,14 @@ CONFIG = ViewsConfig(**SMALL)
 
 
 def above(extent: float, height: float, size: int = 32) -> Camera:
-    """A parallel camera that looks straight down from a height, on ``extent`` metres about the origin."""
+    """A parallel camera that looks straight down from a height, on ``extent`` meters about the origin."""
     position = torch.tensor([[0.0, height, 0.0]], dtype=torch.float64)
     intrinsics = orthographic_intrinsics(extent, size, size)[None]
     return Camera(look_at(position, torch.zeros(3, dtype=torch.float64)), intrinsics, size, size, True)
 
 
 def front(count: int = 1, size: int = 32) -> Camera:
-    """Parallel cameras at z = 5, looking along -Z at 3 metres about (0.5, 1)."""
+    """Parallel cameras at z = 5, looking along -Z at 3 meters about (0.5, 1)."""
     position = torch.tensor([[0.5, 1.0, 5.0]], dtype=torch.float64).repeat(count, 1)
     target = torch.tensor([0.5, 1.0, 0.0], dtype=torch.float64)
     intrinsics = orthographic_intrinsics(3.0, size, size).repeat(count, 1, 1)
@@ -57,14 +57,14 @@ def test_clip_distances_show_a_slab(thing_glb: Path, tmp_path: Path) -> None:
     foot, arm, nothing = (read_rgba(path) for path in render_pictures(thing_glb, front(3), tmp_path, CONFIG, clips=clips))
 
     def bounds(picture: np.ndarray) -> list[float]:
-        """Of what is half opaque: left, right, bottom and top in metres."""
+        """Of what is half opaque: left, right, bottom and top in meters."""
         rows, columns = np.nonzero(picture[..., 3] > 127)
-        metres = 3.0 / 32
+        meters = 3.0 / 32
         return [
-            0.5 + (columns.min() - 16) * metres,
-            0.5 + (columns.max() - 15) * metres,
-            1.0 + (15 - rows.max()) * metres,
-            1.0 + (16 - rows.min()) * metres,
+            0.5 + (columns.min() - 16) * meters,
+            0.5 + (columns.max() - 15) * meters,
+            1.0 + (15 - rows.max()) * meters,
+            1.0 + (16 - rows.min()) * meters,
         ]
 
     np.testing.assert_allclose(bounds(foot), [-0.1, 0.1, 0.0, 0.3], atol=3 / 32)
@@ -118,7 +118,7 @@ def test_finished_pictures_are_kept_and_missing_or_damaged_ones_rendered(
         raise AssertionError("Blender was started")
 
     monkeypatch.setattr(pictures, "BlenderPool", no_blender)
-    other = replace(CONFIG, count=50, size=64, elevations=(10.0,), fov_degrees=20.0, orthographic=True, axis="centre")
+    other = replace(CONFIG, count=50, size=64, elevations=(10.0,), fov_degrees=20.0, orthographic=True, axis="center")
     assert render_pictures(thing_glb, front(3), tmp_path, other) == paths
 
 
@@ -202,7 +202,7 @@ def test_a_single_pinhole_camera_of_any_field_of_view(thing_glb: Path, tmp_path:
     ("low", "axis", "expected"),
     [
         ([-1.0, 0.0, -2.0], "auto", [0.0, 2.0, 0.0]),
-        ([-1.0, 0.0, -2.0], "centre", [0.5, 2.0, 1.0]),
+        ([-1.0, 0.0, -2.0], "center", [0.5, 2.0, 1.0]),
         ([1.0, 0.0, -2.0], "auto", [1.5, 2.0, 1.0]),
         ([1.0, 0.0, -2.0], "origin", [0.0, 2.0, 0.0]),
     ],

@@ -545,7 +545,7 @@ def test_a_trial_is_a_short_fit_measured_on_views_it_has_not_seen(views: ViewDat
 
 def test_what_is_asked_for_is_kept(views: ViewDataset, fits: Fits) -> None:
     """In the trials, steps included, and in the fit, which is not short unless it was asked to be."""
-    asked = FitConfig(steps=7, views_per_step=3, searches=2, candidates=5, loss="l1", texel_density=0.7, orientation="free")
+    asked = FitConfig(steps=7, views_per_step=3, restarts=2, candidates=5, loss="l1", texel_density=0.7, orientation="free")
     found = choose(views, asked, BudgetConfig(vertices=4))
     assert fits.asked[0][1] == dataclasses.replace(asked, billboards=1, placement="clusters")
     trial = found.trials[found.chosen]
@@ -655,7 +655,7 @@ def sealed(folder: Path) -> ViewDataset:
     return dataclasses.replace(views, test=dataclasses.replace(views.test, _cache=Sealed()))
 
 
-QUICK = FitConfig(candidates=2, revisions=0, steps=4, views_per_step=1)
+QUICK = FitConfig(candidates=2, refinement_rounds=0, steps=4, views_per_step=1)
 
 
 def test_a_choice_on_real_views(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -672,7 +672,7 @@ def test_a_choice_on_real_views(monkeypatch: pytest.MonkeyPatch) -> None:
     held = [index for index in range(len(views.train)) if index % 5 == 2]
     assert found.validation == tuple(views.train.names[index] for index in held) and len(held) == 4
     rest = dataclasses.replace(views, train=views.train.take([index for index in range(len(views.train)) if index not in held]))
-    cloud = fit(rest, dataclasses.replace(found.config, searches=1)).cloud
+    cloud = fit(rest, dataclasses.replace(found.config, restarts=1)).cloud
     assert (best.vertices, best.texels, best.bytes) == (cloud.vertex_count, len(cloud.texels), model_bytes(cloud, ExportConfig()))
     assert best.psnr == pytest.approx(mean_psnr(cloud, views.train.take(held)), abs=6e-4)
 

@@ -20,9 +20,9 @@ def pair() -> tuple[np.ndarray, np.ndarray]:
     return target, np.clip(target + rng.normal(0, 0.1, target.shape), 0, 1)
 
 
-def rgba(alpha: np.ndarray, colour: float = 0.5) -> np.ndarray:
-    """Premultiplied picture of one grey, [H, W, 4]."""
-    return np.concatenate([np.repeat(alpha[..., None] * colour, 3, -1), alpha[..., None]], -1)
+def rgba(alpha: np.ndarray, color: float = 0.5) -> np.ndarray:
+    """Premultiplied picture of one gray, [H, W, 4]."""
+    return np.concatenate([np.repeat(alpha[..., None] * color, 3, -1), alpha[..., None]], -1)
 
 
 def test_constant_offset() -> None:
@@ -83,7 +83,7 @@ def test_flip(pair: tuple[np.ndarray, np.ndarray], capfd: pytest.CaptureFixture[
 
 
 def test_flip_black_on_white() -> None:
-    """Without edges only the colour difference counts, the same everywhere; measured 0.967 (saturated green on black has 0.997)."""
+    """Without edges only the color difference counts, the same everywhere; measured 0.967 (saturated green on black has 0.997)."""
     error = metrics.flip_map(np.ones((16, 16, 3)), np.zeros((16, 16, 3)))
     assert np.ptp(error) < 1e-5
     assert error.mean() == pytest.approx(0.967, abs=1e-3)
@@ -112,7 +112,7 @@ def test_sharpness(pair: tuple[np.ndarray, np.ndarray]) -> None:
     assert metrics.sharpness(target, 0.25 + 0.5 * target) == pytest.approx(0.5, rel=1e-12)
     assert metrics.sharpness(target, np.ones_like(target)) == 0
     assert metrics.sharpness(np.ones_like(target), target) is None
-    # A ramp rises by 1/16 between neighbours along rows only, a checkerboard changes by 1 between all neighbours.
+    # A ramp rises by 1/16 between neighbors along rows only, a checkerboard changes by 1 between all neighbors.
     ramp, board = np.zeros((16, 17, 3)), np.zeros((16, 17, 3))
     ramp += np.linspace(0, 1, 17)[None, :, None]
     board[::2, ::2] = board[1::2, 1::2] = 1

@@ -17,7 +17,7 @@ from bbfit.evaluation.scoring import OriginalTree, evaluate, held_out, measure, 
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.geometry.orbit import Orbit
-from bbfit.images import over_colour
+from bbfit.images import over_color
 from bbfit.views import ViewDataset
 
 
@@ -58,7 +58,7 @@ def test_nothing_drawn(views: ViewDataset) -> None:
     parts = {name: getattr(cloud, name)[:0] for name in TENSORS}
     report = evaluate(BillboardCloud(**parts), views.test)
     assert report.mean.rgba.iou == report.mean.sharpness == report.mean.brightness == 0
-    target = over_colour(views.test.targets([2], torch.float64)[0]).numpy()
+    target = over_color(views.test.targets([2], torch.float64)[0]).numpy()
     assert report.views[2].measures.over_white.psnr == pytest.approx(metrics.psnr(target, np.ones_like(target)), abs=1e-9)
     json.dumps(report.to_json(), allow_nan=False)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from bbfit.checks import InputError
 from bbfit.evaluation.sizes import score_sizes, shrunk
 from bbfit.geometry.camera import Camera
-from bbfit.images import over_colour
+from bbfit.images import over_color
 from bbfit.rendering.dispatch import render
 from bbfit.views import ViewDataset, ViewSet
 
@@ -90,7 +90,7 @@ def test_measures_are_those_of_known_differences(views: ViewSet) -> None:
     """Nothing at all, and white of alpha 1/4 everywhere, at half the size."""
     targets = torch.stack([averaged(views, index, 49, 35) for index in range(4)])
     nothing = score_sizes(lambda camera: plain(camera, 0.0), views, 1)[1]
-    errors = (over_colour(targets) - 1).square().mean((1, 2, 3))
+    errors = (over_color(targets) - 1).square().mean((1, 2, 3))
     assert nothing.coverage == 0 and nothing.alpha == pytest.approx(float(targets[..., 3].square().mean().sqrt()))
     assert nothing.psnr == pytest.approx(float((-10 * errors.log10()).mean()))
     haze = score_sizes(lambda camera: plain(camera, 0.25), views, 1)[1]

@@ -54,5 +54,5 @@ def crossed() -> BillboardCloud:
     )
     y, x = torch.meshgrid(torch.linspace(-1, 1, 36), torch.linspace(-1, 1, 30), indexing="ij")
     alpha = (1.6 * (1 - (x**2 + y**2).sqrt() / 0.8)).clamp(0, 1).flatten().repeat(2)
-    colour = torch.rand(len(alpha), 3, generator=torch.Generator().manual_seed(0))
-    return planes.with_texels(torch.cat([colour, alpha[:, None]], -1))
+    color = torch.rand(len(alpha), 3, generator=torch.Generator().manual_seed(0))
+    return planes.with_texels(torch.cat([color, alpha[:, None]], -1))

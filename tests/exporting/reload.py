@@ -19,7 +19,7 @@ def rebuild(corners: NDArray[np.float64], uvs: NDArray[np.float64], culled: NDAr
     quad = 0
     while quad < len(corners):
         points = corners[quad]
-        # The texel coordinates of glTF's and OBJ's corners: texel centres at halves.
+        # The texel coordinates of glTF's and OBJ's corners: texel centers at halves.
         low, high = (uvs[quad] * [width, height]).min(0), (uvs[quad] * [width, height]).max(0)
         size = np.rint(high - low).astype(int) - 1
         textures = []

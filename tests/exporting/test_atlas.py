@@ -1,4 +1,4 @@
-"""The atlas: every texture whole and apart, no foreign colour within reach of a filter."""
+"""The atlas: every texture whole and apart, no foreign color within reach of a filter."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_waste_is_small() -> None:
         assert max(atlas.image.shape) <= 4096
 
 
-def test_transparent_texels_take_the_nearest_opaque_colour() -> None:
+def test_transparent_texels_take_the_nearest_opaque_color() -> None:
     (texture,) = noise([(11, 14)])
     generator = np.random.default_rng(1)
     texture[..., 3] = generator.choice(np.array([0, 0, 0, 60, 130, 255], np.uint8), (11, 14))
@@ -68,7 +68,7 @@ def test_transparent_texels_take_the_nearest_opaque_colour() -> None:
         distance = ((opaque - [row - y, column - x]) ** 2).sum(-1)
         nearest = opaque[distance == distance.min()]
         ring = not (0 <= row - y < 11 and 0 <= column - x < 14) and -1 <= row - y <= 11 and -1 <= column - x <= 14
-        if ring:  # fades out in the colour of the rim
+        if ring:  # fades out in the color of the rim
             rim = atlas.image[min(max(row, y), y + 10), min(max(column, x), x + 13), :3]
             np.testing.assert_array_equal(atlas.image[row, column, :3], rim)
         elif atlas.image[row, column, 3] == 0:
@@ -78,7 +78,7 @@ def test_transparent_texels_take_the_nearest_opaque_colour() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 1, 2, 3])
-def test_filtering_finds_no_foreign_colour(level: int) -> None:
+def test_filtering_finds_no_foreign_color(level: int) -> None:
     """A leaf-green texture with black behind its holes among bright red ones: samples stay green up to a texel and a half outside."""
     green, red = (40, 160, 20), (255, 0, 0)
     textures = [np.full((h, w, 4), (*red, 255), np.uint8) for h, w in [(33, 17)] * 5]
@@ -94,7 +94,7 @@ def test_filtering_finds_no_foreign_colour(level: int) -> None:
     (x, y), (w, h) = atlas.corners[2].tolist(), atlas.sizes[2].tolist()
     columns, rows = (
         np.linspace(start - 1.5, start + count + 1.5, 401) / 2**level - 0.5 for start, count in ((x, w), (y, h))
-    )  # in texels of the level, centres at integers; a quad reaches half a texel outside
+    )  # in texels of the level, centers at integers; a quad reaches half a texel outside
     for row in (np.floor(rows), np.floor(rows) + 1):
         for column in (np.floor(columns), np.floor(columns) + 1):
             taps = image[row.astype(int)][:, column.astype(int), :3]

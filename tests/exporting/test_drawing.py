@@ -29,7 +29,7 @@ KINDS = ("one", "two", "mixed")
 
 
 def parallel(camera: Camera) -> Camera:
-    """Cameras at the same places that see 3.5 metres in parallel projection."""
+    """Cameras at the same places that see 3.5 meters in parallel projection."""
     intrinsics = orthographic_intrinsics(3.5, camera.width, camera.height).expand(len(camera), 3, 3)
     return Camera(camera.world_to_camera, intrinsics, camera.width, camera.height, True)
 
@@ -53,7 +53,7 @@ def inside(camera: Camera) -> Camera:
     ids=[*KINDS, "parallel", "inside", "parallel from inside"],
 )
 def test_without_mip_levels_it_is_the_reference(kind: str, seen: object, clouds: dict[str, BillboardCloud], orbit: Camera) -> None:
-    """Up to the rounding to 8 bits of three layers' colour and alpha; measured 0.6 / 255."""
+    """Up to the rounding to 8 bits of three layers' color and alpha; measured 0.6 / 255."""
     cameras = seen(orbit)  # type: ignore[operator]
     expected = render_reference(clouds[kind], cameras).float()
     assert expected[..., 3].amax((1, 2)).min() > 0.5, "an empty view shows nothing"
@@ -74,7 +74,7 @@ def test_tests_of_alpha_are_those_of_the_reference(mode: AlphaMode, clouds: dict
 
 
 def test_polygons_and_pieces_show_what_the_rectangles_do(crossed: BillboardCloud, orbit: Camera) -> None:
-    """Hulls leave out what is transparent; halves that share an edge, which runs through pixels' centres, show each pixel once."""
+    """Hulls leave out what is transparent; halves that share an edge, which runs through pixels' centers, show each pixel once."""
     cards = cloud_cards(crossed, 4)
     whole = draw_cards(cards, orbit)
     hulls = with_hulls(cards, 8, 0)
@@ -106,7 +106,7 @@ def halves(card: Card) -> list[Card]:
 
 
 def plate(size: int, levels: int) -> Cards:
-    """A square of two metres whose texture fills an atlas, and mip levels that are each of one colour and alpha: 250 - 20 * level."""
+    """A square of two meters whose texture fills an atlas, and mip levels that are each of one color and alpha: 250 - 20 * level."""
     chain = [np.full((size >> n, size >> n, 4), 250 - 20 * n, np.uint8) for n in range(levels)]
     corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     uvs = np.array([[0.0, 1], [1, 1], [1, 0], [0, 0]])
@@ -120,7 +120,7 @@ def facing(pixels_a_texel: float, size: int) -> Camera:
     return Camera(pose, orthographic_intrinsics(9 / pixels_a_texel * 2 / size, 9, 9), 9, 9, True)
 
 
-def test_a_card_shows_in_the_pixels_whose_centres_it_holds() -> None:
+def test_a_card_shows_in_the_pixels_whose_centers_it_holds() -> None:
     """A plate of 5.2 x 5.2 pixels around each of some places, opaque up to its edges."""
     cards = plate(128, 1)
     camera = facing(5.2 / 128, 128)

@@ -171,7 +171,7 @@ def test_lossless_webp_keeps_every_texel_also_the_transparent_ones(tmp_path: Pat
     np.testing.assert_array_equal(read_rgba(tmp_path / "noise.webp"), noise)
 
 
-def test_lossy_webp_keeps_alpha_and_nearly_the_colours(levels: list[NDArray[np.uint8]]) -> None:
+def test_lossy_webp_keeps_alpha_and_nearly_the_colors(levels: list[NDArray[np.uint8]]) -> None:
     """Measured: 2.2 of 255 off on average, 3.3 where transparent; that would be 17 if transparent texels were free to change."""
     image = levels[0]
     data = encode_webp(image, lossless=False)

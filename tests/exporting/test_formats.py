@@ -64,7 +64,7 @@ def test_other_textures_stand_beside_png_or_in_its_place(
     assert image["mimeType"] == f"image/{textures}" and len(tree["images"]) == 1 + fallback
     atlas = shipped_cards(crossed, config).atlas.image
     if textures == "webp":
-        np.testing.assert_array_equal(np.array(Image.open(io.BytesIO(data))), atlas)  # colours of transparent texels as well
+        np.testing.assert_array_equal(np.array(Image.open(io.BytesIO(data))), atlas)  # colors of transparent texels as well
     else:
         assert data.startswith(b"\xabKTX 20\xbb\r\n\x1a\n")
     # Mip levels are asked for where the file brings them.
@@ -76,7 +76,7 @@ def test_other_textures_stand_beside_png_or_in_its_place(
     assert codes <= ({"VALUE_NOT_IN_LIST", "IMAGE_UNRECOGNIZED_FORMAT"} if textures == "ktx2" else set())
 
 
-def test_split_nodes_stand_at_their_origins_and_their_bounds_are_centred_there(crossed: BillboardCloud, tmp_path: Path) -> None:
+def test_split_nodes_stand_at_their_origins_and_their_bounds_are_centerd_there(crossed: BillboardCloud, tmp_path: Path) -> None:
     config = ExportConfig(alpha="blend", split=True)
     (path,) = export(crossed, tmp_path / "model.glb", config)
     tree, _ = tree_of(path)

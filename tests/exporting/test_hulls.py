@@ -26,7 +26,7 @@ LEASTS = (0.0, 1 / 255, 0.5, 1.0)
 
 
 def cards_of(*alphas: NDArray[np.float64], two_sided: bool = False) -> Cards:
-    """A tilted card for each alpha picture, or with both sides one for every two, noise for colours."""
+    """A tilted card for each alpha picture, or with both sides one for every two, noise for colors."""
     generator = torch.Generator().manual_seed(1)
     count = len(alphas) // (1 + two_sided)
     frames, _ = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))
@@ -55,8 +55,8 @@ def blobs(seed: int) -> NDArray[np.float64]:
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0:23, 0:31]
     made = np.zeros((23, 31))
-    for centre, radius, alpha in zip(rng.random((4, 2)) * [23, 31], 3 * rng.random(4), rng.random(4), strict=True):
-        made = np.maximum(made, alpha * (np.hypot(y - centre[0], x - centre[1]) < radius))
+    for center, radius, alpha in zip(rng.random((4, 2)) * [23, 31], 3 * rng.random(4), rng.random(4), strict=True):
+        made = np.maximum(made, alpha * (np.hypot(y - center[0], x - center[1]) < radius))
     made[tuple(rng.integers(0, [23, 31]))] = 1
     return made
 
@@ -80,7 +80,7 @@ def pictured(name: str) -> Cards:
 
 
 def texels(cards: Cards, card: Card) -> NDArray[np.float64]:
-    """Corners with the top-left texel's centre at (0, 0), [K, 2]."""
+    """Corners with the top-left texel's center at (0, 0), [K, 2]."""
     return card.uvs * np.array(cards.atlas.image.shape[1::-1]) - 0.5 - cards.atlas.corners[card.rectangle]
 
 
@@ -98,7 +98,7 @@ def outside(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> NDArra
 
 
 def showing(cards: Cards, card: Card, least: float, each: int = 6) -> NDArray[np.float64]:
-    """Points, texel centres among them, where the atlas's bilinear alpha reaches ``least``; 0 asks for more than nothing, [N, 2]."""
+    """Points, texel centers among them, where the atlas's bilinear alpha reaches ``least``; 0 asks for more than nothing, [N, 2]."""
     (left, top), (width, height) = cards.atlas.corners[card.rectangle], cards.atlas.sizes[card.rectangle]
     alpha = cards.atlas.image[top - 1 : top + height + 1, left - 1 : left + width + 1, 3] / 255.0
     x, y = np.meshgrid(np.arange((width + 1) * each + 1) / each, np.arange((height + 1) * each + 1) / each)
@@ -144,7 +144,7 @@ def test_the_polygon_is_as_small_as_a_search_finds() -> None:
     cards = cards_of((np.hypot(x, y) < 40).astype(np.float64))
     area = {k: doubled_area(texels(cards, with_hulls(cards, k, 1.0).cards[0])) / 2 for k in (4, 6, 8)}
     for k in area:
-        # Texel centres within 40 texels reach a little less far than that in most directions: measured 0.976 to 0.981.
+        # Texel centers within 40 texels reach a little less far than that in most directions: measured 0.976 to 0.981.
         assert 0.96 < area[k] / (k * np.tan(np.pi / k) * 40**2) < 1
 
 

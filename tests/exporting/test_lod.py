@@ -27,7 +27,7 @@ CONFIGS = (ExportConfig(alpha="blend", split=True), ExportConfig(textures="webp"
 
 @pytest.fixture(scope="module")
 def tree() -> bytes:
-    """A textured box and a ball with a colour of its own, under nodes that move them."""
+    """A textured box and a ball with a color of its own, under nodes that move them."""
     scene = trimesh.Scene()
     box = trimesh.creation.box((0.2, 1.0, 0.2))
     picture = Image.fromarray(np.random.default_rng(0).integers(0, 256, (8, 8, 4), np.uint8))
@@ -41,7 +41,7 @@ def tree() -> bytes:
 def levels_of(models: list[bytes]) -> list[LodLevel]:
     coverages = [*(0.5**number for number in range(len(models) - 1)), 0.0]
     return [
-        replace(BLANK, name=f"oak_LOD{number}", screen_coverage=coverage, distance_metres=9.5 * number)
+        replace(BLANK, name=f"oak_LOD{number}", screen_coverage=coverage, distance_meters=9.5 * number)
         for number, coverage in enumerate(coverages)
     ]
 

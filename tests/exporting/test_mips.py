@@ -1,4 +1,4 @@
-"""Mip levels: areas and colours are means over what a texel covers, and a texture's coverage at the cutoff stays as it is."""
+"""Mip levels: areas and colors are means over what a texel covers, and a texture's coverage at the cutoff stays as it is."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WHOLE = np.array([[0.0, 0.0], [1.0, 1.0]])
 
 
 def picture(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
-    """Noise of which a quarter is transparent in blocks of 4 x 4 texels, in colours of its own."""
+    """Noise of which a quarter is transparent in blocks of 4 x 4 texels, in colors of its own."""
     generator = np.random.default_rng(seed)
     image = generator.integers(0, 256, (height, width, 4), dtype=np.uint8)
     holes = generator.random((-(-height // 4), -(-width // 4))) < 0.25
@@ -78,10 +78,10 @@ def test_every_level_has_half_the_sides_down_to_one_texel(sides: tuple[int, int]
 def test_levels_are_means_by_area_and_alpha_in_linear_light(sides: tuple[int, int]) -> None:
     """Against means in double precision; they are rounded to 8 bits, and a mean near a half may be rounded the other way: measured 0."""
     image = picture(*sides)
-    alpha, colour = image[..., 3:] / 255, srgb_to_linear(image[..., :3] / 255)
+    alpha, color = image[..., 3:] / 255, srgb_to_linear(image[..., :3] / 255)
     seen = 0
     for level in mip_chain(alone(image), None)[1:]:
-        mean, plain, weighted = (area_mean(values, *level.shape[:2]) for values in (alpha, colour, colour * alpha))
+        mean, plain, weighted = (area_mean(values, *level.shape[:2]) for values in (alpha, color, color * alpha))
         expected = 255 * linear_to_srgb(np.where(mean > 0, weighted / np.maximum(mean, 1e-9), plain))
         assert np.abs(level[..., 3:] - 255 * mean).max() <= 0.501
         assert np.abs(level[..., :3] - expected).max() <= 0.501
@@ -105,8 +105,8 @@ def test_what_is_transparent_does_not_darken_a_leaf() -> None:
     assert [level[0, 0, 3] for level in mip_chain(alone(image), None)] == [255, 64, 64, 64]
 
 
-def test_no_level_up_to_the_padding_has_a_foreign_colour() -> None:
-    """A green texture with holes among red ones; what lies around it in the atlas is its own colour too."""
+def test_no_level_up_to_the_padding_has_a_foreign_color() -> None:
+    """A green texture with holes among red ones; what lies around it in the atlas is its own color too."""
     textures = [np.full((33, 17, 4), (255, 0, 0, 255), np.uint8) for _ in range(5)]
     textures[2][:] = (40, 160, 20, 255)
     textures[2][np.random.default_rng(0).random((33, 17)) < 0.5] = 0
@@ -180,7 +180,7 @@ def test_what_never_reaches_the_cutoff_is_not_drawn_at_any_level() -> None:
         np.testing.assert_array_equal(level, mean)
 
 
-def test_a_neighbour_whose_alpha_reaches_in_is_borne() -> None:
+def test_a_neighbor_whose_alpha_reaches_in_is_borne() -> None:
     """An empty texture right beside an opaque one: at level 2 the filter makes more of it visible than any factor can take away."""
     image = np.zeros((4, 8, 4), np.uint8)
     image[:, 4:] = 255

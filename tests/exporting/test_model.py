@@ -24,10 +24,10 @@ from bbfit.rendering.reference import render_reference
 
 KINDS = ("one", "two", "mixed")
 
-# Rounding to 8 bits moves straight colour and alpha by at most 0.5 / 255 each. A layer's share of a pixel is
-# colour * alpha + (1 - alpha) * behind, so a pixel moves by at most 1 / 255 a layer, alpha by half of that; three layers here. Vertices
+# Rounding to 8 bits moves straight color and alpha by at most 0.5 / 255 each. A layer's share of a pixel is
+# color * alpha + (1 - alpha) * behind, so a pixel moves by at most 1 / 255 a layer, alpha by half of that; three layers here. Vertices
 # are float32, which moves a picture by far less.
-ALLOWED_COLOUR, ALLOWED_ALPHA = 3 / 255, 1.5 / 255
+ALLOWED_COLOR, ALLOWED_ALPHA = 3 / 255, 1.5 / 255
 
 
 def load_glb(path: Path) -> BillboardCloud:
@@ -68,7 +68,7 @@ def assert_same(original: BillboardCloud, reloaded: BillboardCloud, camera: Came
     assert torch.equal(reloaded.two_sided, original.two_sided)
     assert (reloaded.texels - original.texels).abs().max() <= 0.5 / 255 + 1e-9
     difference = (render_reference(reloaded, camera) - render_reference(original, camera)).abs()
-    assert difference[..., :3].max() <= ALLOWED_COLOUR  # measured 0.6 / 255
+    assert difference[..., :3].max() <= ALLOWED_COLOR  # measured 0.6 / 255
     assert difference[..., 3].max() <= ALLOWED_ALPHA  # measured 0.5 / 255
 
 
@@ -93,12 +93,12 @@ def test_a_viewer_shows_the_render(kind: str, clouds: dict[str, BillboardCloud],
     assert expected[..., 3].max(axis=(1, 2)).min() > 0.5, "an empty view shows nothing"
     for index in range(len(orbit)):
         difference = abs(view_glb(path, orbit[index]) - expected[index])
-        assert difference[..., :3].max() <= ALLOWED_COLOUR  # measured 0.6 / 255
+        assert difference[..., :3].max() <= ALLOWED_COLOR  # measured 0.6 / 255
         assert difference[..., 3].max() <= ALLOWED_ALPHA  # measured 0.5 / 255
 
 
-def test_transparent_texels_change_colour_only_at_the_silhouette(crossed: BillboardCloud, orbit: Camera, tmp_path: Path) -> None:
-    """Hidden colours are replaced: alpha stays, colour moves by at most u (1 - u) <= 1/4 a layer, u being the hidden texels' weight."""
+def test_transparent_texels_change_color_only_at_the_silhouette(crossed: BillboardCloud, orbit: Camera, tmp_path: Path) -> None:
+    """Hidden colors are replaced: alpha stays, color moves by at most u (1 - u) <= 1/4 a layer, u being the hidden texels' weight."""
     hidden = crossed.texels[:, 3] * 255 < 0.5
     assert 0.2 < hidden.float().mean() < 0.8
     (path,) = export(crossed, tmp_path / "model.glb")
@@ -121,7 +121,7 @@ def test_mask_cuts_where_alpha_reaches_the_cutoff(kind: str, clouds: dict[str, B
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_quads_are_the_rectangles(kind: str, clouds: dict[str, BillboardCloud], tmp_path: Path) -> None:
-    """Corners half a texel outside the rectangles, in the cloud's own metres; winding and normals agree; nothing merged or split."""
+    """Corners half a texel outside the rectangles, in the cloud's own meters; winding and normals agree; nothing merged or split."""
     cloud = in_file_order(clouds[kind])
     (path,) = export(clouds[kind], tmp_path / "model.glb")
     tree, primitives, _ = read_glb(path)

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from bbfit.checks import InputError
 from bbfit.exporting.cards import Card, Cards, cloud_cards
 from bbfit.exporting.node_order import Misordered, misordered
-from bbfit.exporting.splitting import centred, split
+from bbfit.exporting.splitting import centerd, split
 from bbfit.geometry.camera import Camera, look_at
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
 
 # Share of the visible picture that split() may leave in the wrong order.
 WRONG = 1e-3
-CENTRE = torch.tensor([0.2, 1.0, -0.1], dtype=torch.float64)
+CENTER = torch.tensor([0.2, 1.0, -0.1], dtype=torch.float64)
 UNIT = torch.eye(3, dtype=torch.float64)
 
 
@@ -31,20 +31,20 @@ def planes(rights: torch.Tensor, ups: torch.Tensor, shift: float = 0.0, two_side
     count = len(rights)
     y, x = torch.meshgrid(*[torch.linspace(-1, 1, size, dtype=torch.float64)] * 2, indexing="ij")
     alpha = (2.5 * (1.05 - torch.maximum(x.abs(), y.abs()))).clamp(0, 0.9).flatten().repeat(count * (1 + two_sided))
-    colour = torch.rand(len(alpha), 3, generator=generator, dtype=torch.float64)
+    color = torch.rand(len(alpha), 3, generator=generator, dtype=torch.float64)
     return BillboardCloud(
-        centers=CENTRE + shift * torch.randn(count, 3, generator=generator, dtype=torch.float64),
+        centers=CENTER + shift * torch.randn(count, 3, generator=generator, dtype=torch.float64),
         rights=rights,
         ups=ups,
         half_extents=torch.tensor([[0.8, 1.0]], dtype=torch.float64).repeat(count, 1),
         texture_sizes=torch.full((count, 2), size),
         two_sided=torch.full((count,), two_sided),
-        texels=torch.cat([colour, alpha[:, None]], -1),
+        texels=torch.cat([color, alpha[:, None]], -1),
     )
 
 
 def upright(count: int, two_sided: bool = False) -> BillboardCloud:
-    even = even_upright(count, axis=CENTRE, half_extents=torch.ones(2, dtype=torch.float64), texture_sizes=torch.tensor([1, 1]))
+    even = even_upright(count, axis=CENTER, half_extents=torch.ones(2, dtype=torch.float64), texture_sizes=torch.tensor([1, 1]))
     return planes(even.rights, even.ups, two_sided=two_sided)
 
 
@@ -74,8 +74,8 @@ def cameras() -> Camera:
     orbit = Orbit(18, (-7.0, 24.0, 53.0))
     distance = torch.tensor([2.2, 3.1, 5.0], dtype=torch.float64).repeat(6)[:, None] * 1.3
     intrinsics = Orbit(1).frame(np.eye(3), target=torch.zeros(3, dtype=torch.float64), width=44, height=44, fov_x_degrees=50.0).intrinsics
-    position = CENTRE + distance * orbit.directions
-    return Camera(look_at(position, CENTRE), intrinsics.repeat(18, 1, 1), 44, 44)
+    position = CENTER + distance * orbit.directions
+    return Camera(look_at(position, CENTER), intrinsics.repeat(18, 1, 1), 44, 44)
 
 
 def layers(cards: Cards, camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -141,7 +141,7 @@ def area(card: Card) -> float:
 
 
 def pierces(a: Card, b: Card, slack: float) -> bool:
-    """Whether card a, on both sides of b's plane, meets it somewhere at least ``slack`` metres inside of b."""
+    """Whether card a, on both sides of b's plane, meets it somewhere at least ``slack`` meters inside of b."""
     height = (a.corners - b.corners[0]) @ b.normal
     if min(height.max(), -height.min()) <= slack:
         return False
@@ -193,7 +193,7 @@ def test_no_two_pieces_cross(name: str) -> None:
 def test_pieces_drawn_one_after_another_give_the_picture_sorted_at_every_pixel(name: str, key: str) -> None:
     cards, pieces = scene(name)
     assert difference(cards, cards, key) > 0.02
-    # What is wrong in order is a tenth of that in colour here. Measured 0.0003 for the leaning cards, 0.00014 for the mutually crossing.
+    # What is wrong in order is a tenth of that in color here. Measured 0.0003 for the leaning cards, 0.00014 for the mutually crossing.
     assert difference(cards, pieces, key) < 5e-4
 
 
@@ -208,7 +208,7 @@ def test_the_wrong_share_is_kept(name: str) -> None:
 def test_four_planes_about_an_axis_become_eight_halves_at_one_radius() -> None:
     _, pieces = scene("four about an axis")
     assert len(pieces.cards) == 8
-    away = np.stack([piece.origin - CENTRE.numpy() for piece in pieces.cards if piece.origin is not None])
+    away = np.stack([piece.origin - CENTER.numpy() for piece in pieces.cards if piece.origin is not None])
     radius = np.hypot(away[:, 0], away[:, 2])
     np.testing.assert_allclose(radius, radius.mean(), rtol=1e-3)
     np.testing.assert_allclose(away[:, 1], 0, atol=1e-3)
@@ -235,7 +235,7 @@ def test_what_shows_nothing_is_dropped() -> None:
 
 def test_cards_that_do_not_cross_stay_whole() -> None:
     cloud = planes(UNIT[[0, 0, 0]], UNIT[[1, 1, 1]])
-    cloud = replace(cloud, centers=CENTRE + torch.arange(3, dtype=torch.float64)[:, None] * torch.tensor([0.0, 0.0, 0.3]))
+    cloud = replace(cloud, centers=CENTER + torch.arange(3, dtype=torch.float64)[:, None] * torch.tensor([0.0, 0.0, 0.3]))
     cards = cloud_cards(cloud, 2)
     pieces = split(cards)
     assert [len(piece.corners) for piece in pieces.cards] == [4, 4, 4]
@@ -253,13 +253,13 @@ def test_the_wrong_share_tells_right_from_wrong() -> None:
     """Two parallel cards of alpha 0.9: the wrong way round, 0.81 of 0.99 are wrong where both are seen."""
     cloud = planes(UNIT[[0, 0]], UNIT[[1, 1]])
     cloud = cloud.with_texels(torch.cat([cloud.texels[:, :3], torch.full_like(cloud.texels[:, 3:], 0.9)], -1))
-    cloud = replace(cloud, centers=CENTRE + torch.tensor([[0.0, 0.0, -0.05], [0.0, 0.0, 0.05]], dtype=torch.float64))
+    cloud = replace(cloud, centers=CENTER + torch.tensor([[0.0, 0.0, -0.05], [0.0, 0.0, 0.05]], dtype=torch.float64))
     back, front = cloud_cards(cloud, 2).cards
     assert front.corners[:, 2].mean() > back.corners[:, 2].mean()
     cards = cloud_cards(cloud, 2)
     right = cards.with_cards([replace(c, origin=c.corners.mean(0)) for c in (back, front)])
     swapped = cards.with_cards([replace(back, origin=front.corners.mean(0)), replace(front, origin=back.corners.mean(0))])
-    facing = Camera(look_at(CENTRE[None] + torch.tensor([[0.0, 0.0, 9.0]]), CENTRE), torch.eye(3)[None].double(), 8, 8)
+    facing = Camera(look_at(CENTER[None] + torch.tensor([[0.0, 0.0, 9.0]]), CENTER), torch.eye(3)[None].double(), 8, 8)
     assert misordered(right, facing) == Misordered(0.0, 0.0)
     wrong = misordered(swapped, facing)
     assert wrong.depth == wrong.distance
@@ -268,15 +268,15 @@ def test_the_wrong_share_tells_right_from_wrong() -> None:
     assert misordered(cards.with_cards([front]), facing) == Misordered(0.0, 0.0)
     # From behind, culled cards are not seen, so they are not in the wrong order either.
     culled = cards.with_cards([replace(card, culled=True) for card in swapped.cards])
-    behind = Camera(look_at(CENTRE[None] - torch.tensor([[0.0, 0.0, 9.0]]), CENTRE), facing.intrinsics, 8, 8)
+    behind = Camera(look_at(CENTER[None] - torch.tensor([[0.0, 0.0, 9.0]]), CENTER), facing.intrinsics, 8, 8)
     assert misordered(culled, behind) == Misordered(0.0, 0.0)
     assert misordered(swapped, behind).depth > 0.75 and misordered(culled, facing) == wrong
 
 
 @pytest.mark.parametrize("name", ["four about an axis", "leaning"])
-def test_bounds_are_centred_on_the_origin_without_other_triangles(name: str) -> None:
+def test_bounds_are_centerd_on_the_origin_without_other_triangles(name: str) -> None:
     for piece in scene(name)[1].cards:
-        points = centred(piece)
+        points = centerd(piece)
         np.testing.assert_array_equal(points[: len(piece.corners)], piece.corners)
         assert len(points) == len(piece.corners) + 2
         low, high = points.min(0), points.max(0)

@@ -152,7 +152,7 @@ def test_crispness_is_a_gradient_of_alphas_that_are_not_zero() -> None:
         woken = (gradient.view(-1, BLOCK, 4) != 0).flatten(1).any(-1) | (step - plain.last <= REST_AFTER)
         plain.gradient[:40, 3] += torch.where((alpha > 0) & woken.repeat_interleave(BLOCK), 0.3 * (1 - 2 * alpha), 0)
         plain.update(step, 0.05, BETAS)
-        crisp.update(step, 0.05, BETAS, crispness=0.3)
+        crisp.update(step, 0.05, BETAS, binarization=0.3)
     torch.testing.assert_close(crisp.texels, plain.texels, atol=1e-6, rtol=0)
     untouched = AdamState.start(padded(texels))
     for step in range(1, 4):

@@ -124,7 +124,7 @@ def test_pairs_stand_a_hair_apart_along_the_normal(views: ViewDataset) -> None:
 
 
 def painted(height: int, width: int, *opaque: tuple[int, int], sides: str = "one", alpha: float = 0.35) -> BillboardCloud:
-    """A billboard with texels of a tenth of a metre, transparent but for some at (column, row); of two sides they take turns."""
+    """A billboard with texels of a tenth of a meter, transparent but for some at (column, row); of two sides they take turns."""
     half = torch.tensor([width, height]) * 0.05
     cloud = even_upright(1, axis=torch.tensor([0.3, 1.0, 2.0]), half_extents=half, texture_sizes=torch.tensor([height, width]), sides=sides)
     cloud = cloud.with_texels(torch.full(cloud.texels.shape, 0.25))  # as faint as what counts as nothing
@@ -209,10 +209,10 @@ def test_the_smallest_rectangle_holds_all_points_and_is_turned_if_that_makes_it_
         angle = 2 * math.pi * seed / 30
         c, s = math.cos(angle), math.sin(angle)
         points = points @ torch.tensor([[c, s], [-s, c]], dtype=torch.float64) + torch.tensor([3.0, -2.0])
-        centre, axis, half = smallest_rectangle(points)
-        assert centre.dtype == axis.dtype == half.dtype == torch.float64
+        center, axis, half = smallest_rectangle(points)
+        assert center.dtype == axis.dtype == half.dtype == torch.float64
         assert float(axis.norm()) == pytest.approx(1) and axis[0] > axis[1].abs() - 1e-6  # by 45 degrees at most
-        reach = (points - centre) @ torch.stack([axis, torch.stack([-axis[1], axis[0]])]).mT
+        reach = (points - center) @ torch.stack([axis, torch.stack([-axis[1], axis[0]])]).mT
         assert (reach.abs() < half + 1e-5).all()
         torch.testing.assert_close(reach.amax(0), half, atol=1e-5, rtol=0)
         torch.testing.assert_close(reach.amin(0), -half, atol=1e-5, rtol=0)
@@ -238,8 +238,8 @@ def test_the_smallest_rectangle_holds_all_points_and_is_turned_if_that_makes_it_
 )
 def test_the_smallest_rectangle_of_points_in_a_row_is_turned_by_45_degrees_at_most(points: list[list[float]]) -> None:
     row = torch.tensor(points, dtype=torch.float64)
-    centre, axis, half = smallest_rectangle(row)
-    reach = (row - centre) @ torch.stack([axis, torch.stack([-axis[1], axis[0]])]).mT
+    center, axis, half = smallest_rectangle(row)
+    reach = (row - center) @ torch.stack([axis, torch.stack([-axis[1], axis[0]])]).mT
     assert (reach.abs() < half + 1e-6).all() and float(half.prod()) < 1e-6
     assert axis[0] > axis[1].abs() - 1e-6
     upright = float((row.amax(0) - row.amin(0)).prod()) == 0

@@ -40,7 +40,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def random_planes(count: int, seed: int, *, upright: bool) -> tuple[Tensor, Tensor]:
-    """Normals [K, 3] and offsets [K] of planes through the neighbourhood of the origin."""
+    """Normals [K, 3] and offsets [K] of planes through the neighborhood of the origin."""
     normals = random_points(count, seed)
     if upright:
         normals[:, 1] = 0
@@ -64,7 +64,7 @@ def displacements(points: Tensor, normals: Tensor, offsets: Tensor, camera: Came
 
 
 def cost_of(planes: Planes, points: Tensor, camera: Camera) -> float:
-    """Mean squared displacement of points onto the planes that they are labelled with, as views see it."""
+    """Mean squared displacement of points onto the planes that they are labeled with, as views see it."""
     return float(displacements(points, planes.normals, planes.offsets, camera).gather(1, planes.labels[:, None]).mean())
 
 
@@ -181,7 +181,7 @@ def test_very_few_points(ring: Camera, count: int, upright: bool) -> None:
     torch.testing.assert_close(planes.normals.norm(dim=-1), torch.ones(5, dtype=torch.float64))
     assert planes.offsets.isfinite().all() and (not upright or (planes.normals[:, 1] == 0).all())
     cost = cost_of(planes, points, ring)
-    assert cost <= 0.1 and (count > 3 or cost < 1e-18)  # of points a metre from the middle; up to three need no displacement
+    assert cost <= 0.1 and (count > 3 or cost < 1e-18)  # of points a meter from the middle; up to three need no displacement
     cloud = rectangles(points, planes, DENSITY, MARGIN, two_sided=False)
     assert len(cloud) == 5 and all(tensor.isfinite().all() for tensor in (cloud.centers, cloud.rights, cloud.ups, cloud.half_extents))
 
@@ -202,7 +202,7 @@ def one_plane(normal: Tensor, offset: float, count: int) -> Planes:
 
 
 def on_rectangle(cloud: BillboardCloud, n: int, points: Tensor) -> Tensor:
-    """Coordinates of points along a billboard's axes, in metres from its centre, [P, 2]."""
+    """Coordinates of points along a billboard's axes, in meters from its center, [P, 2]."""
     return (points - cloud.centers[n]) @ torch.stack([cloud.rights[n], cloud.ups[n]], -1)
 
 
@@ -235,7 +235,7 @@ def test_rectangles_hold_their_points_and_the_margin_and_little_more(ring: Camer
     cloud = rectangles(points, planes, DENSITY, MARGIN, two_sided=False)
     for n in range(7):
         reach = on_rectangle(cloud, n, points[planes.labels == n])
-        spare = torch.stack([reach.amin(0) + cloud.half_extents[n], cloud.half_extents[n] - reach.amax(0)])  # metres, at all four sides
+        spare = torch.stack([reach.amin(0) + cloud.half_extents[n], cloud.half_extents[n] - reach.amax(0)])  # meters, at all four sides
         assert (spare > MARGIN - 1e-5).all()  # a turned rectangle is worked out in float32
         assert (spare < MARGIN + 0.5 / DENSITY + 1e-5).all()  # half a texel, since sides are rounded up to whole ones
         foreign = on_rectangle(cloud, n, points[planes.labels != n])
@@ -269,7 +269,7 @@ def flat_points(width: float, height: float, degrees: float) -> Tensor:
 )
 def test_rectangles_stand_upright_unless_a_turned_one_is_a_fifth_smaller(width: float, height: float, degrees: float, turned: bool) -> None:
     points = flat_points(width, height, degrees)
-    fine = 250.0  # texels a metre, so that rounding up adds little
+    fine = 250.0  # texels a meter, so that rounding up adds little
     cloud = rectangles(points, one_plane(torch.tensor([0.0, 0.0, 1.0]).double(), 0.5, len(points)), fine, 0.0, two_sided=False)
     angle = math.radians(degrees if turned else 0.0)
     right = torch.tensor([math.cos(angle), math.sin(angle), 0.0], dtype=torch.float64)
@@ -298,7 +298,7 @@ def test_a_plane_without_points_gets_a_small_rectangle(two_sided: bool) -> None:
 # Texels
 
 
-def bare(*half_extents: tuple[float, float], two_sided: bool = False) -> BillboardCloud:
+def without_textures(*half_extents: tuple[float, float], two_sided: bool = False) -> BillboardCloud:
     """Leaning rectangles in a row, float64, of a texel each."""
     n = len(half_extents)
     frame = torch.linalg.qr(random_points(3, 2)).Q
@@ -317,7 +317,7 @@ def bare(*half_extents: tuple[float, float], two_sided: bool = False) -> Billboa
 
 @pytest.mark.parametrize("two_sided", [False, True])
 def test_sized_rectangles_are_whole_texels_of_the_density(two_sided: bool) -> None:
-    cloud = bare((0.5, 0.8), (0.01, 0.02), (1.234, 0.617), two_sided=two_sided)
+    cloud = without_textures((0.5, 0.8), (0.01, 0.02), (1.234, 0.617), two_sided=two_sided)
     made = sized(cloud, DENSITY)
     assert made.texture_sizes.dtype == torch.int64
     assert made.texture_sizes.tolist() == [[16, 10], [1, 1], [13, 25]]
@@ -329,21 +329,21 @@ def test_sized_rectangles_are_whole_texels_of_the_density(two_sided: bool) -> No
 
 
 def at_texels(cloud: BillboardCloud, n: int, places: list[tuple[float, float]]) -> Tensor:
-    """World points of columns and rows of a billboard's texture, [P, 3]; texel centres lie at whole numbers."""
+    """World points of columns and rows of a billboard's texture, [P, 3]; texel centers lie at whole numbers."""
     homogeneous = torch.tensor([(x, y, 1.0) for x, y in places], dtype=torch.float64)
     return homogeneous @ texel_to_world(cloud)[n, :3].mT
 
 
 @pytest.mark.parametrize("two_sided", [False, True])
-def test_splatted_points_colour_the_texels_that_they_are_over(two_sided: bool) -> None:
+def test_splatted_points_color_the_texels_that_they_are_over(two_sided: bool) -> None:
     """Moved along the normal they are over the same texel; anywhere within a texel they are over it."""
-    cloud = sized(bare((0.2, 0.15), (0.1, 0.1), two_sided=two_sided), DENSITY)  # 3 x 4 and 2 x 2 texels
+    cloud = sized(without_textures((0.2, 0.15), (0.1, 0.1), two_sided=two_sided), DENSITY)  # 3 x 4 and 2 x 2 texels
     red, green, blue = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     places = [(0, 0), (0.45, -0.45), (3, 0), (2.6, 2.4)]  # top left twice, top right, bottom right
     points = torch.cat([at_texels(cloud, 0, places), at_texels(cloud, 1, [(1, 0)])])
     points[[0, 2, 4]] += 0.3 * torch.linalg.cross(cloud.rights, cloud.ups)[0]
-    colours = torch.tensor([red, green, blue, red, green])
-    textures = splatted(cloud, points, colours, torch.tensor([0, 0, 0, 0, 1])).textures()
+    colors = torch.tensor([red, green, blue, red, green])
+    textures = splatted(cloud, points, colors, torch.tensor([0, 0, 0, 0, 1])).textures()
     for side in textures[0]:
         once, twice = 1 - math.exp(-1 / (4 / 3)), 1 - math.exp(-2 / (4 / 3))  # four points on three texels
         torch.testing.assert_close(side[0, 0], torch.tensor([0.5, 0.5, 0.0, twice]))
@@ -351,7 +351,7 @@ def test_splatted_points_colour_the_texels_that_they_are_over(two_sided: bool) -
         torch.testing.assert_close(side[2, 3], torch.tensor([*red, once]))
         empty = torch.ones(3, 4, dtype=torch.bool)
         empty[[0, 0, 2], [0, 3, 3]] = False
-        torch.testing.assert_close(side[empty], torch.tensor([0.5, 0.25, 0.25, 0.0]).expand(9, 4))  # their mean colour
+        torch.testing.assert_close(side[empty], torch.tensor([0.5, 0.25, 0.25, 0.0]).expand(9, 4))  # their mean color
     for side in textures[1]:
         torch.testing.assert_close(side[0, 1], torch.tensor([*green, 1 - math.exp(-1)]))
         assert int((side[..., 3] > 0).sum()) == 1
@@ -359,7 +359,7 @@ def test_splatted_points_colour_the_texels_that_they_are_over(two_sided: bool) -
 
 
 def test_the_more_points_the_more_alpha() -> None:
-    cloud = sized(bare((0.4, 0.05)), DENSITY)  # one row of eight texels
+    cloud = sized(without_textures((0.4, 0.05)), DENSITY)  # one row of eight texels
     places = [(column, 0) for column in range(8) for _ in range(column)]
     points = at_texels(cloud, 0, places)
     texture = splatted(cloud, points, torch.full((len(points), 3), 0.3), torch.zeros(len(points), dtype=torch.int64)).textures()[0]
@@ -370,7 +370,7 @@ def test_the_more_points_the_more_alpha() -> None:
 
 
 def test_points_on_the_edge_and_beyond_count_for_the_border() -> None:
-    cloud = sized(bare((0.1, 0.1)), DENSITY)  # 2 x 2 texels
+    cloud = sized(without_textures((0.1, 0.1)), DENSITY)  # 2 x 2 texels
     points = at_texels(cloud, 0, [(-0.5, -0.5), (1.5, -0.5), (7, 9)])
     texture = splatted(cloud, points, torch.eye(3), torch.zeros(3, dtype=torch.int64)).textures()[0][0]
     torch.testing.assert_close(texture[0, 0, :3], torch.tensor([1.0, 0, 0]))
@@ -381,7 +381,7 @@ def test_points_on_the_edge_and_beyond_count_for_the_border() -> None:
 
 @pytest.mark.parametrize("two_sided", [False, True])
 def test_a_billboard_without_points_is_grey_and_transparent(two_sided: bool) -> None:
-    cloud = sized(bare((0.1, 0.1), (0.2, 0.1), two_sided=two_sided), DENSITY)
+    cloud = sized(without_textures((0.1, 0.1), (0.2, 0.1), two_sided=two_sided), DENSITY)
     points = at_texels(cloud, 0, [(0, 0)])
     made = splatted(cloud, points, torch.tensor([[0.2, 0.4, 0.6]]), torch.tensor([0]))
     assert (made.textures()[1] == torch.tensor([0.5, 0.5, 0.5, 0.0])).all()

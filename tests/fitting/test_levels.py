@@ -1,4 +1,4 @@
-"""Views and textures at a fraction of their resolution: means of premultiplied colours, in the same places as before."""
+"""Views and textures at a fraction of their resolution: means of premultiplied colors, in the same places as before."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_shrunk_views_are_means_of_premultiplied_pixels(halvings: int) -> None:
     exact = premultiply(pictures.double() / 255).view(3, 16 // cell, cell, 40 // cell, cell, 4).mean((2, 4)) * 255
     assert targets.shrunk.shape == exact.shape
     assert (targets.shrunk - exact).abs().max() <= 0.51
-    assert (targets.shrunk[..., :3] <= targets.shrunk[..., 3:]).all()  # still a premultiplied colour
+    assert (targets.shrunk[..., :3] <= targets.shrunk[..., 3:]).all()  # still a premultiplied color
     assert torch.equal(targets.packed([2, 0]), targets.shrunk[[2, 0]])
     assert torch.equal(targets.pictures([2, 0]), targets.shrunk[[2, 0]].float() / 255)
 
@@ -77,7 +77,7 @@ def test_views_at_full_resolution_are_the_views() -> None:
     assert torch.equal(targets.pictures([2, 0]), premultiply(pictures[[2, 0]].float() / 255))
 
 
-def test_the_colour_of_transparent_pixels_does_not_bleed() -> None:
+def test_the_color_of_transparent_pixels_does_not_bleed() -> None:
     pictures = torch.tensor([0, 255, 0, 0], dtype=torch.uint8).repeat(1, 16, 16, 1)
     pictures[:, ::2, 1::2] = torch.tensor([200, 0, 100, 255], dtype=torch.uint8)
     shrunk = Targets.at(viewset(pictures), 1).shrunk
@@ -139,22 +139,22 @@ RESIZES = [((8, 6), (4, 3)), ((8, 6), (16, 12)), ((7, 5), (4, 3)), ((4, 3), (7, 
 @pytest.mark.parametrize(("old", "new"), RESIZES)
 @pytest.mark.parametrize("alpha", [0.0, 0.004, 0.3, 1.0])
 def test_even_textures_stay_even(old: tuple[int, int], new: tuple[int, int], alpha: float) -> None:
-    """On both sides, up and down; of fully transparent ones the colour, too."""
+    """On both sides, up and down; of fully transparent ones the color, too."""
     cloud = flat_cloud(old, old, sides="two")
-    colours = torch.tensor([[0.2, 0.4, 0.9, alpha], [0.7, 0.1, 0.3, alpha], [0.5, 0.6, 0.0, alpha], [1.0, 0.8, 0.35, alpha]])
-    cloud = cloud.with_texels(colours.repeat_interleave(old[0] * old[1], 0))
+    colors = torch.tensor([[0.2, 0.4, 0.9, alpha], [0.7, 0.1, 0.3, alpha], [0.5, 0.6, 0.0, alpha], [1.0, 0.8, 0.35, alpha]])
+    cloud = cloud.with_texels(colors.repeat_interleave(old[0] * old[1], 0))
     sizes = torch.tensor([new, old])
     resized = resize_textures(cloud, sizes)
     assert torch.equal(resized.texture_sizes, sizes)
     for name in ("centers", "rights", "ups", "half_extents", "two_sided"):
         assert torch.equal(getattr(resized, name), getattr(cloud, name))
-    for texture, pair, size in zip(resized.textures(), colours.view(2, 2, 4), (new, old), strict=True):
+    for texture, pair, size in zip(resized.textures(), colors.view(2, 2, 4), (new, old), strict=True):
         assert texture.shape == (2, *size, 4)
         torch.testing.assert_close(texture, pair[:, None, None].expand(texture.shape), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("cell", [2, 4])
-def test_shrinking_keeps_the_mean_of_premultiplied_colours(cell: int) -> None:
+def test_shrinking_keeps_the_mean_of_premultiplied_colors(cell: int) -> None:
     cloud = random_cloud((16, 24), (8, 40), sides="two")
     resized = resize_textures(cloud, shrunk_sizes(cloud, cell // 2))
     for old, new in zip(cloud.textures(), resized.textures(), strict=True):
@@ -164,7 +164,7 @@ def test_shrinking_keeps_the_mean_of_premultiplied_colours(cell: int) -> None:
 
 
 @pytest.mark.parametrize("size", [(3, 4), (12, 16)])
-def test_colour_comes_from_what_is_visible_and_else_from_what_is_there(size: tuple[int, int]) -> None:
+def test_color_comes_from_what_is_visible_and_else_from_what_is_there(size: tuple[int, int]) -> None:
     """Green where transparent must not show in red that is visible, and stays where nothing is."""
     cloud = flat_cloud((6, 8))
     texels = torch.tensor([0.0, 1.0, 0.0, 0.0]).repeat(6, 8, 1)
@@ -178,7 +178,7 @@ def test_colour_comes_from_what_is_visible_and_else_from_what_is_there(size: tup
 
 @pytest.mark.parametrize("height", [1, 2, 5])
 def test_enlarging_a_ramp_gives_the_ramp(height: int) -> None:
-    """Texels lie at their centres: four times as many halve their distance twice, and none is moved."""
+    """Texels lie at their centers: four times as many halve their distance twice, and none is moved."""
     cloud = flat_cloud((height, 6))
     ramp = torch.full((height, 6, 4), 1.0)
     ramp[..., 0] = 0.1 + 0.1 * torch.arange(6)
@@ -232,7 +232,7 @@ def cut(cloud: BillboardCloud, left: int, right: int, bottom: int, top: int) -> 
 
 @pytest.mark.parametrize("sides", ["one", "two"])
 def test_by_whole_texels_smaller_or_larger_every_texel_keeps_its_place(sides: str) -> None:
-    """Left, right, bottom and top by different numbers, cut and grown at once; beyond the border nothing, in the border's colour."""
+    """Left, right, bottom and top by different numbers, cut and grown at once; beyond the border nothing, in the border's color."""
     cloud = random_cloud((9, 12), (7, 8), sides=sides)
     onto = cut(cloud, 2, -3, 1, -2)
     for old, new in zip(cloud.textures(), resampled(cloud, onto, onto.texture_sizes).textures(), strict=True):
@@ -241,7 +241,7 @@ def test_by_whole_texels_smaller_or_larger_every_texel_keeps_its_place(sides: st
         kept, expected = new[:, 2:, : width - 2], old[:, : height - 1, 2:]
         torch.testing.assert_close(kept[..., 3], expected[..., 3], atol=1e-5, rtol=0)
         visible = expected[..., 3] > 1e-2
-        torch.testing.assert_close(kept[visible], expected[visible], atol=1e-3, rtol=0)  # of little alpha, colours are quotients
+        torch.testing.assert_close(kept[visible], expected[visible], atol=1e-3, rtol=0)  # of little alpha, colors are quotients
         assert new[:, :2, :, 3].max() < 1e-5 and new[:, :, width - 2 :, 3].max() < 1e-5
         torch.testing.assert_close(new[:, :2, : width - 2, :3], old[:, :1, 2:, :3].expand(-1, 2, -1, -1), atol=1e-4, rtol=0)
         torch.testing.assert_close(new[:, 2:, width - 2 :, :3], old[:, : height - 1, -1:, :3].expand(-1, -1, 3, -1), atol=1e-4, rtol=0)
@@ -249,8 +249,8 @@ def test_by_whole_texels_smaller_or_larger_every_texel_keeps_its_place(sides: st
 
 def test_a_cut_down_rectangle_shows_the_same_picture(known_cloud: BillboardCloud, ring: Camera) -> None:
     """At the same density, if what is cut off is nothing, as without the haze that bounds ignore. Moved by half a texel it does not."""
-    colours, alpha = known_cloud.texels.split((3, 1), -1)
-    known_cloud = known_cloud.with_texels(torch.cat([colours, torch.where(alpha > 0.3, alpha, 0)], -1))
+    colors, alpha = known_cloud.texels.split((3, 1), -1)
+    known_cloud = known_cloud.with_texels(torch.cat([colors, torch.where(alpha > 0.3, alpha, 0)], -1))
     texel = 2 * known_cloud.half_extents / known_cloud.texture_sizes.flip(-1)
     bounds = opaque_bounds(known_cloud)
     assert (bounds.abs() < known_cloud.half_extents.repeat_interleave(2, -1)).all()  # there is something to be cut off
@@ -275,19 +275,19 @@ def test_a_grown_rectangle_shows_the_same_picture_and_is_transparent_beyond(know
         spare = factor // 2
         beyond[3 * factor - spare : -5 * factor + spare, 4 * factor - spare : -6 * factor + spare] = False
         assert texture[0, beyond][:, 3].max() < 1e-4 and texture[0, ~beyond][:, 3].min() > 0.06  # a quarter in a quarter at corners
-        assert texture[0, beyond][:, :3].any(-1).all()  # in the colour of the border, not in black
+        assert texture[0, beyond][:, :3].any(-1).all()  # in the color of the border, not in black
     before, after = bbfit.render(opaque, ring), bbfit.render(cloud, ring)
     assert float((before - after).square().mean().sqrt()) < (1e-4 if factor == 1 else 0.01)
 
 
 @pytest.mark.parametrize("factor", [1, 2])
-def test_colours_are_filtered_premultiplied_when_rectangles_change(factor: int) -> None:
+def test_colors_are_filtered_premultiplied_when_rectangles_change(factor: int) -> None:
     """Green where transparent must not show in red that is visible, and stays where nothing is."""
     cloud = flat_cloud((6, 8))
     texels = torch.tensor([0.0, 1.0, 0.0, 0.0]).repeat(6, 8, 1)
     texels[:, :4] = torch.tensor([1.0, 0.0, 0.0, 1.0])
     onto = cut(cloud, 1, 1, 0, 1)
-    onto = replace(onto, centers=onto.centers + 0.03 * onto.rights)  # off the grid, so that colours mix
+    onto = replace(onto, centers=onto.centers + 0.03 * onto.rights)  # off the grid, so that colors mix
     texture = resampled(cloud.with_texels(texels.reshape(-1, 4)), onto, onto.texture_sizes * factor).textures()[0][0]
     visible = texture[..., 3] > 0
     assert visible.any() and not visible.all() and (texture[..., 3][visible] < 0.9).any()
@@ -297,7 +297,7 @@ def test_colours_are_filtered_premultiplied_when_rectangles_change(factor: int) 
 
 @pytest.mark.parametrize("moved", [0, 1])
 def test_a_texture_that_shrinks_onto_another_rectangle_keeps_its_mean(moved: int) -> None:
-    """Every other pair of columns is white: a quarter as many texels are grey, however the rectangle has moved."""
+    """Every other pair of columns is white: a quarter as many texels are gray, however the rectangle has moved."""
     cloud = flat_cloud((32, 32))
     stripes = torch.ones(32, 32, 4)
     stripes[:, torch.arange(32) % 4 > 1, :3] = 0

@@ -14,10 +14,10 @@ from bbfit.checks import InputError
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
 from bbfit.fitting.levels import LEAST_SIDE
-from bbfit.fitting.loop import FitResult, Level, Step, draw_views, drawn_as, fit, learning_rate, levels_of
+from bbfit.fitting.loop import FitResult, ResolutionLevel, Step, drawn_as, fit, learning_rate, levels_of, sample_views
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import over_colour
+from bbfit.images import over_color
 from bbfit.rendering.reference import render_reference
 from bbfit.views import ViewDataset, ViewSet
 
@@ -35,7 +35,7 @@ def data_views() -> ViewDataset:
 
 def quick(**fields: object) -> FitConfig:
     """A configuration whose search for a placement is short."""
-    return FitConfig(**{"candidates": 2, "revisions": 2} | fields)  # type: ignore[arg-type]
+    return FitConfig(**{"candidates": 2, "refinement_rounds": 2} | fields)  # type: ignore[arg-type]
 
 
 class Killed(Exception):
@@ -48,7 +48,7 @@ def psnr(cloud: BillboardCloud, views: ViewSet) -> float:
 
 
 def over_white(cloud: BillboardCloud, views: ViewSet) -> float:
-    pictures = (over_colour(render_reference(cloud, views.cameras)), over_colour(views.targets(range(len(views)))))
+    pictures = (over_color(render_reference(cloud, views.cameras)), over_color(views.targets(range(len(views)))))
     return -10 * math.log10((pictures[0] - pictures[1]).square().mean())
 
 
@@ -59,10 +59,17 @@ def same(a: FitResult, b: FitResult) -> bool:
 @pytest.mark.parametrize("loss", ["l1", "l2", "backgrounds"])
 def test_fit_explains_held_out_views_of_a_cloud_it_can_represent(views: ViewDataset, loss: str) -> None:
     config = FitConfig(
-        alpha="blend", billboards=2, placement="even", placement_rate=0, loss=loss, sharpness_weight=0, crispness_weight=0, steps=150
+        alpha="blend",
+        billboards=2,
+        placement="even",
+        placement_learning_rate=0,
+        loss=loss,
+        sharpness_weight=0,
+        binarization_weight=0,
+        steps=150,
     )
     result = fit(views, config)
-    # Measured 37.1 dB (l1) and 34.6 dB (l2) on one thread; an even grey scores 9 dB. The two grids of texels differ, so it is not exact.
+    # Measured 37.1 dB (l1) and 34.6 dB (l2) on one thread; an even gray scores 9 dB. The two grids of texels differ, so it is not exact.
     assert psnr(result.cloud, views.test) > 32
     assert len(result.losses) == 150 and result.losses[-1] < 0.1 * result.losses[0]
     assert result.cloud.texels.min() >= 0 and result.cloud.texels.max() <= 1
@@ -83,7 +90,7 @@ def test_one_thesis_step_is_one_adam_step(views: ViewDataset, backend: str) -> N
     config = FitConfig(preset="thesis", billboards=2, steps=1, backend=backend)
     start = start_cloud(views.train, config)
     texels = start.texels.clone().requires_grad_()
-    chosen = draw_views(config.resolve(), len(views.train), 0)
+    chosen = sample_views(config.resolve(), len(views.train), 0)
     image = render_reference(start.with_texels(texels), views.train.cameras[chosen])
     (image - views.train.targets(chosen)).square().sum(-1).mean().backward()
     assert texels.grad is not None
@@ -145,7 +152,7 @@ def test_a_killed_fit_goes_on_to_the_same_result(views: ViewDataset, tmp_path: P
 
 
 def test_a_snapshot_is_a_copy_of_the_cloud_at_its_level(views: ViewDataset) -> None:
-    config, seen = quick(alpha="blend", billboards=2, placement="even", placement_rate=0, steps=8), []
+    config, seen = quick(alpha="blend", billboards=2, placement="even", placement_learning_rate=0, steps=8), []
     result = fit(views, config, on_step=lambda step: seen.append(step.snapshot()))
     sizes = [tuple(cloud.texture_sizes[0].tolist()) for cloud in seen]
     assert sizes == sorted(sizes) and len(set(sizes)) == len(levels_of(config.resolve(), views.train.cameras)) > 1
@@ -183,9 +190,9 @@ def test_held_out_views_are_not_opened(views_folder: Path) -> None:
 
 def test_batches_deal_every_view_equally_often() -> None:
     config = FitConfig(steps=8, views_per_step=2).resolve()
-    drawn = [view for index in range(8) for view in draw_views(config, 8, index)]
+    drawn = [view for index in range(8) for view in sample_views(config, 8, index)]
     assert sorted(drawn) == sorted([*range(8)] * 2)
-    assert sorted(draw_views(dataclasses.replace(config, views_per_step=9), 3, 0)) == [0, 1, 2]
+    assert sorted(sample_views(dataclasses.replace(config, views_per_step=9), 3, 0)) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -202,8 +209,8 @@ def test_batches_deal_every_view_equally_often() -> None:
         {"texel_density": 0.0},
         {"max_texels": 0},
         {"max_texels": 10.5},
-        {"searches": 0},
-        {"searches": 1.5},
+        {"restarts": 0},
+        {"restarts": 1.5},
     ],
 )
 def test_bad_configurations_are_refused_by_name(fields: dict[str, object]) -> None:
@@ -214,24 +221,27 @@ def test_bad_configurations_are_refused_by_name(fields: dict[str, object]) -> No
 @pytest.mark.parametrize("preset", ["default", "thesis"])
 def test_at_less_than_full_resolution_sharpness_and_crispness_have_no_weight(preset: str) -> None:
     """All else stays, and so does the configuration itself."""
-    config = FitConfig(preset=preset, billboards=5, sharpness_weight=7.0, crispness_weight=0.5, ssim_weight=0.03, seed=4)
+    config = FitConfig(preset=preset, billboards=5, sharpness_weight=7.0, binarization_weight=0.5, ssim_weight=0.03, seed=4)
     coarse = config.coarse()
-    assert (coarse.sharpness_weight, coarse.crispness_weight) == (0.0, 0.0)
-    assert dataclasses.replace(coarse, sharpness_weight=7.0, crispness_weight=0.5) == config
+    assert (coarse.sharpness_weight, coarse.binarization_weight) == (0.0, 0.0)
+    assert dataclasses.replace(coarse, sharpness_weight=7.0, binarization_weight=0.5) == config
     assert config.resolve().coarse() == coarse.resolve() and FitConfig(preset=preset).coarse().resolve().sharpness_weight == 0.0
 
 
-@pytest.mark.parametrize(("billboards", "searches"), [(1, 1), (3, 1), (4, 1), (7, 1), (8, 2), (9, 2), (40, 2), (None, 2)])
-def test_eight_billboards_have_two_searches_and_no_number_has_more(billboards: int | None, searches: int) -> None:
+@pytest.mark.parametrize(("billboards", "restarts"), [(1, 1), (3, 1), (4, 1), (7, 1), (8, 2), (9, 2), (40, 2), (None, 2)])
+def test_eight_billboards_have_two_searches_and_no_number_has_more(billboards: int | None, restarts: int) -> None:
     """Unless their number is asked for."""
-    assert FitConfig(billboards=billboards).searches is None and FitConfig(billboards=billboards).resolve().searches == searches
-    assert FitConfig(billboards=billboards, searches=5).resolve().searches == 5
+    assert FitConfig(billboards=billboards).restarts is None and FitConfig(billboards=billboards).resolve().restarts == restarts
+    assert FitConfig(billboards=billboards, restarts=5).resolve().restarts == 5
 
 
-@pytest.mark.parametrize(("billboards", "revisions"), [(1, 1), (4, 1), (5, 2), (8, 5), (9, 6), (40, 6), (None, 5)])
-def test_more_billboards_are_revised_more_often(billboards: int | None, revisions: int) -> None:
-    assert FitConfig(billboards=billboards).revisions is None and FitConfig(billboards=billboards).resolve().revisions == revisions
-    assert FitConfig(billboards=billboards, revisions=0).resolve().revisions == 0
+@pytest.mark.parametrize(("billboards", "refinement_rounds"), [(1, 1), (4, 1), (5, 2), (8, 5), (9, 6), (40, 6), (None, 5)])
+def test_more_billboards_are_revised_more_often(billboards: int | None, refinement_rounds: int) -> None:
+    assert (
+        FitConfig(billboards=billboards).refinement_rounds is None
+        and FitConfig(billboards=billboards).resolve().refinement_rounds == refinement_rounds
+    )
+    assert FitConfig(billboards=billboards, refinement_rounds=0).resolve().refinement_rounds == 0
 
 
 def test_unknown_device_is_refused(views: ViewDataset) -> None:
@@ -242,7 +252,7 @@ def test_unknown_device_is_refused(views: ViewDataset) -> None:
 @pytest.mark.parametrize("cutoff", [0.3, 0.5])
 def test_a_fit_for_mask_is_better_cut_off_than_one_for_blend(data_views: ViewDataset, cutoff: float) -> None:
     """And covers as much of views that it was not fitted to as the tree does; it is drawn with the texels that 8 bits hold."""
-    config = FitConfig(billboards=4, placement="even", placement_rate=0, alpha_cutoff=cutoff)
+    config = FitConfig(billboards=4, placement="even", placement_learning_rate=0, alpha_cutoff=cutoff)
     masked, blended = (fit(data_views, dataclasses.replace(config, alpha=alpha)).cloud for alpha in ("mask", "blend"))
     assert masked.alpha == AlphaMode("mask", cutoff) and blended.alpha == AlphaMode("blend", cutoff)
     cut = dataclasses.replace(blended, alpha=masked.alpha)
@@ -256,12 +266,12 @@ def test_a_fit_for_mask_is_better_cut_off_than_one_for_blend(data_views: ViewDat
 
 def test_a_mask_hardens_at_full_resolution_only() -> None:
     config = FitConfig(steps=80).resolve()
-    coarse, fine = Level(1, 40, 60), Level(0, 60, 80)
+    coarse, fine = ResolutionLevel(1, 40, 60), ResolutionLevel(0, 60, 80)
     assert all(drawn_as(config, coarse, index) == AlphaMode() for index in range(40, 60))
     modes = [drawn_as(config, fine, index) for index in range(60, 80)]
     hardness = [mode.hardness for mode in modes]
     assert hardness[0] == 2 and hardness == sorted(hardness) and math.isinf(hardness[6]) and math.isinf(hardness[-1])
     assert all(mode.kind == "mask" and mode.cutoff == 0.5 for mode in modes)
-    assert drawn_as(FitConfig(alpha_cutoff=0.1).resolve(), Level(0, 0, 8), 0).hardness == 5
+    assert drawn_as(FitConfig(alpha_cutoff=0.1).resolve(), ResolutionLevel(0, 0, 8), 0).hardness == 5
     for alpha in ("blend", "hash"):
         assert drawn_as(FitConfig(alpha=alpha).resolve(), fine, 79) == AlphaMode()

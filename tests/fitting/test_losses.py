@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bbfit.fitting.losses import image_loss, structural_similarity
-from bbfit.images import over_colour, premultiply
+from bbfit.images import over_color, premultiply
 
 
 def test_l1_and_l2_are_sums_over_channels_averaged_over_pixels() -> None:
@@ -23,7 +23,7 @@ def test_backgrounds_is_the_expected_difference_over_random_opaque_ones() -> Non
     a, b = (premultiply(torch.rand(2, 5, 7, 4, generator=generator, dtype=torch.float64)) for _ in range(2))
 
     def over(background: torch.Tensor | float) -> torch.Tensor:
-        return (over_colour(a, background) - over_colour(b, background)).square().sum(-1).mean()
+        return (over_color(a, background) - over_color(b, background)).square().sum(-1).mean()
 
     stated = image_loss(a, b, "backgrounds", 0.0).item()
     assert stated == pytest.approx(((over(0.0) + 4 * over(0.5) + over(1.0)) / 6).item(), rel=1e-12)

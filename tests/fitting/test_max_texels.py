@@ -22,7 +22,11 @@ EVEN = [
     for sides in ("one", "two", "pair")
 ]
 KINDS = [*(kind for kind in EVEN if kind["sides"] == "one"), {"placement": "even", "sides": "two"}, {"placement": "clusters"}]
-KINDS += [{"placement": "clusters", "sides": "two"}, {"placement": "even", "placement_rate": 0}, {"placement": "clusters", "levels": 1}]
+KINDS += [
+    {"placement": "clusters", "sides": "two"},
+    {"placement": "even", "placement_learning_rate": 0},
+    {"placement": "clusters", "levels": 1},
+]
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +35,7 @@ def views(views_folder: Path) -> ViewDataset:
 
 
 def config(**fields: object) -> FitConfig:
-    return FitConfig(**{"billboards": 2, "texel_density": 1.5, "candidates": 2, "revisions": 0, "steps": 8} | fields)  # type: ignore[arg-type]
+    return FitConfig(**{"billboards": 2, "texel_density": 1.5, "candidates": 2, "refinement_rounds": 0, "steps": 8} | fields)  # type: ignore[arg-type]
 
 
 def rectangles(seed: int) -> BillboardCloud:
@@ -53,7 +57,7 @@ def counted(cloud: BillboardCloud) -> int:
 
 
 def density(cloud: BillboardCloud) -> float:
-    """Texels to the metre, which are the same both ways and for all."""
+    """Texels to the meter, which are the same both ways and for all."""
     each = cloud.texture_sizes.flip(-1) / (2 * cloud.half_extents)
     torch.testing.assert_close(each, each[:1, :1].expand_as(each))
     return float(each[0, 0])
@@ -134,7 +138,7 @@ def test_a_fit_keeps_the_limit_at_every_level_and_in_its_result(
     asked = config(**kind, max_texels=most)
     result = fit(views, asked, on_step=lambda step: seen.append(len(step.snapshot().texels)))
     levels = len(loop.levels_of(asked.resolve(), views.train.cameras))
-    moves = asked.placement_rate is None
+    moves = asked.placement_learning_rate is None
     assert len(starts) == 1 + moves * max(1, levels - 1)  # at the beginning, and after every level in which billboards move
     assert all(0.7 * most < count <= most for count in starts)
     assert len(seen) == 8 and seen[-1] > 0.7 * most and max(seen) <= most

@@ -67,7 +67,7 @@ def test_the_first_three_numbers_are_a_translation_in_multiples_of_reach() -> No
 
 
 @pytest.mark.parametrize("vector", [(0.0, math.pi / 2, 0.0), (0.3, -0.2, 0.9), (-1.5, 2.0, 0.1), (1e-9, 0.0, 0.0)])
-def test_the_next_three_numbers_turn_the_billboard_about_its_centre(vector: tuple[float, float, float]) -> None:
+def test_the_next_three_numbers_turn_the_billboard_about_its_center(vector: tuple[float, float, float]) -> None:
     """By a rotation vector: about its direction, counter-clockwise seen against it, by as many radians as it is long."""
     cloud = leaning_cloud()
     after = moved(cloud, 0, 0, 0, *vector, 0, 0)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from bbfit.checks import InputError, MissingFileError
-from bbfit.fitting.points import hull_points, mesh_points, pixels_of, point_colours
+from bbfit.fitting.points import hull_points, mesh_points, pixels_of, point_colors
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.orbit import Orbit
 from bbfit.views import ViewDataset, ViewSet
@@ -40,7 +40,7 @@ def viewset(pictures: Tensor, cameras: Camera) -> ViewSet:
 
 
 def ring_around_origin(count: int, width: int, height: int, *, elevation: float = 0.0) -> Camera:
-    """Cameras whose pictures hold a cube of two metres around the origin."""
+    """Cameras whose pictures hold a cube of two meters around the origin."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     return Orbit(count, (elevation,)).frame(corners, target=torch.zeros(3, dtype=torch.float64), width=width, height=height)
 
@@ -69,7 +69,7 @@ def hull(views: ViewSet) -> Tensor:
 
 @pytest.fixture(scope="module")
 def anywhere() -> ViewSet:
-    """Views that show something in every pixel, so that any mesh within a metre of the origin agrees with them."""
+    """Views that show something in every pixel, so that any mesh within a meter of the origin agrees with them."""
     return viewset(torch.full((4, 16, 16, 4), 255, dtype=torch.uint8), ring_around_origin(4, 16, 16))
 
 
@@ -85,7 +85,7 @@ def test_points_lie_on_triangles_of_the_mesh(on_mesh: Tensor, tree: trimesh.Trim
     triangles = np.asarray(tree.triangles)
     for point in on_mesh[::500].numpy():
         nearest = trimesh.triangles.closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
-        assert np.linalg.norm(nearest - point, axis=-1).min() < 1e-6  # metres; a triangle's side is about a hundredth
+        assert np.linalg.norm(nearest - point, axis=-1).min() < 1e-6  # meters; a triangle's side is about a hundredth
 
 
 def test_points_are_even_by_area(on_mesh: Tensor, tree: trimesh.Trimesh) -> None:
@@ -280,7 +280,7 @@ def test_the_hull_of_a_ball_is_little_more_than_the_ball(width: int, height: int
     radius = 0.7
     points = hull_points(ball_views(12, width, height, radius), count=4000)
     assert len(points) == 4000
-    pixel = 2 / min(min(width, height), 256)  # metres, of the pictures that are carved from
+    pixel = 2 / min(min(width, height), 256)  # meters, of the pictures that are carved from
     across, up = points[:, ::2].norm(dim=-1), points[:, 1].abs()
     assert radius - 0.05 < across.max() < radius / math.cos(math.pi / 12) + pixel
     assert radius - 0.1 < up.max() < radius * 1.03 + pixel  # a cone around the ball is a little higher above its middle
@@ -336,7 +336,7 @@ def test_silhouettes_that_contradict_each_other_are_refused(monkeypatch: pytest.
         hull_points(viewset(pictures, ring_around_origin(4, 32, 32)))
 
 
-# Colours
+# Colors
 
 
 def square_on(width: int, height: int) -> Camera:
@@ -357,7 +357,7 @@ def test_a_points_pixel_is_the_nearest_counted_row_by_row() -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(5, 3), (3, 5), (1, 1)])
 def test_points_beyond_a_pictures_edges_are_not_in_it(width: int, height: int) -> None:
-    """Pixels reach half a pixel beyond their centres; far away is outside as well."""
+    """Pixels reach half a pixel beyond their centers; far away is outside as well."""
     right, bottom = width - 1, height - 1
     at = {
         (0, 0): True,
@@ -411,29 +411,29 @@ def seen_by(points: Tensor, cameras: Camera) -> list[tuple[Tensor, Tensor]]:
     return [pixels_of(points, cameras[view]) for view in range(len(cameras))]
 
 
-def colour_scene() -> tuple[Tensor, Camera, Tensor]:
+def color_scene() -> tuple[Tensor, Camera, Tensor]:
     """Points one above another on the ring's axis, so that each keeps its row in all four views, the cameras, and pictures with nothing."""
     points = torch.tensor([[0.0, y, 0.0] for y in (-0.6, 0.0, 0.6)], dtype=torch.float64)
     return points, ring_around_origin(4, 32, 24), torch.zeros(4, 24, 32, 4)
 
 
 def paint(pictures: Tensor, camera: Camera, view: int, point: Tensor, straight: tuple[float, float, float], alpha: float) -> None:
-    """Give the pixel of a point a premultiplied colour in one view."""
+    """Give the pixel of a point a premultiplied color in one view."""
     x, y = (camera[view].project(point[None])[0] + 0.5).floor().long().tolist()
     pictures[view, y, x] = torch.tensor([*(alpha * c for c in straight), alpha])
 
 
-def test_a_points_colour_is_the_mean_of_what_the_views_show_weighted_by_alpha() -> None:
-    points, cameras, pictures = colour_scene()
+def test_a_points_color_is_the_mean_of_what_the_views_show_weighted_by_alpha() -> None:
+    points, cameras, pictures = color_scene()
     red, blue = (0.8, 0.1, 0.0), (0.0, 0.3, 0.9)
     for view, alpha in enumerate((1.0, 0.5, 0.25, 0.01)):
         paint(pictures, cameras, view, points[0], red, alpha)
-    for view, colour, alpha in ((0, red, 0.25), (2, blue, 0.75)):  # and background in the other two, which has no say
-        paint(pictures, cameras, view, points[1], colour, alpha)
-    colours = point_colours(seen_by(points, cameras), pictures)
-    assert colours.dtype == torch.float32
+    for view, color, alpha in ((0, red, 0.25), (2, blue, 0.75)):  # and background in the other two, which has no say
+        paint(pictures, cameras, view, points[1], color, alpha)
+    colors = point_colors(seen_by(points, cameras), pictures)
+    assert colors.dtype == torch.float32
     expected = torch.tensor([red, tuple(0.25 * r + 0.75 * b for r, b in zip(red, blue, strict=True)), (0.0, 0.0, 0.0)])
-    torch.testing.assert_close(colours, expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(colors, expected, atol=1e-5, rtol=0)
 
 
 def test_views_that_do_not_see_a_point_have_no_say() -> None:
@@ -443,10 +443,10 @@ def test_views_that_do_not_see_a_point_have_no_say() -> None:
     cameras = Camera(pose, pinhole_intrinsics(40, 16, 16).repeat(3, 1, 1), 16, 16)
     pictures = torch.ones(3, 16, 16, 4) * torch.tensor([[1.0, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]])[:, None, None]
     points = torch.tensor([[0.0, 0, 0], [0, 0, 2], [0, 50, 0]], dtype=torch.float64)  # the second is behind the first camera
-    colours = point_colours(seen_by(points, cameras), pictures)
-    torch.testing.assert_close(colours, torch.tensor([[0.5, 0, 0.5], [0, 0, 1], [0, 0, 0]]), atol=1e-6, rtol=0)
+    colors = point_colors(seen_by(points, cameras), pictures)
+    torch.testing.assert_close(colors, torch.tensor([[0.5, 0, 0.5], [0, 0, 1], [0, 0, 0]]), atol=1e-6, rtol=0)
 
 
 def test_every_view_has_its_own_pixels() -> None:
     with pytest.raises(ValueError, match="zip"):
-        point_colours(seen_by(torch.zeros(1, 3).double(), ring_around_origin(3, 8, 8)), torch.zeros(4, 8, 8, 4))
+        point_colors(seen_by(torch.zeros(1, 3).double(), ring_around_origin(3, 8, 8)), torch.zeros(4, 8, 8, 4))

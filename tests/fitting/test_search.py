@@ -33,7 +33,7 @@ def points(views: ViewDataset) -> torch.Tensor:
 
 
 def config(**asked: object) -> FitConfig:
-    return FitConfig(**{"billboards": 3, "candidates": 3, "revisions": 2} | asked).resolve()  # type: ignore[arg-type]
+    return FitConfig(**{"billboards": 3, "candidates": 3, "refinement_rounds": 2} | asked).resolve()  # type: ignore[arg-type]
 
 
 def loss(cloud: BillboardCloud, views: ViewDataset) -> float:
@@ -55,7 +55,7 @@ def test_it_finds_as_many_billboards_as_asked_near_the_tree(views: ViewDataset, 
 
 
 @pytest.mark.parametrize(
-    ("candidates", "revisions", "expected"),
+    ("candidates", "refinement_rounds", "expected"),
     [
         (7, 3, [7] * 3 + [2] * 2 + [5] * 4 * 3),  # a third of the candidates goes on; revisions compare four ways, and none
         (1, 0, [1] * 3 + [1] * 2),
@@ -63,13 +63,13 @@ def test_it_finds_as_many_billboards_as_asked_near_the_tree(views: ViewDataset, 
     ],
 )
 def test_work_is_told_step_by_step(
-    views: ViewDataset, points: torch.Tensor, monkeypatch: pytest.MonkeyPatch, candidates: int, revisions: int, expected: list[int]
+    views: ViewDataset, points: torch.Tensor, monkeypatch: pytest.MonkeyPatch, candidates: int, refinement_rounds: int, expected: list[int]
 ) -> None:
     """Every step of every candidate counts, all of those that are taken side by side at once; in the end all of it is done."""
     for name, steps in (("_STEPS", 3), ("_MORE_STEPS", 2), ("_MEND_STEPS", 4)):
         monkeypatch.setattr(f"bbfit.fitting.search.{name}", steps)
     told = []
-    asked = config(billboards=2, candidates=candidates, revisions=revisions)
+    asked = config(billboards=2, candidates=candidates, refinement_rounds=refinement_rounds)
     find_placement(views.train, points, asked, lambda done, total: told.append((done, total)))
     assert told == [(done, sum(expected)) for done in accumulate(expected)]
 
@@ -79,7 +79,7 @@ def test_nothing_needs_to_be_told(views: ViewDataset, points: torch.Tensor, monk
     """And whoever is told gets the same, on either backend."""
     for name in ("_STEPS", "_MORE_STEPS", "_MEND_STEPS"):
         monkeypatch.setattr(f"bbfit.fitting.search.{name}", 2)
-    asked = config(billboards=2, candidates=2, revisions=1, backend=backend)
+    asked = config(billboards=2, candidates=2, refinement_rounds=1, backend=backend)
     silent, told = (find_placement(views.train, points, asked, listener) for listener in (None, lambda done, total: None))
     assert same(silent, told) and len(told) == 2
 
@@ -91,28 +91,28 @@ def test_same_seed_same_placement_whatever_the_number_of_threads(views: ViewData
         found = []
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            found.append(find_placement(views.train, points, config(billboards=4, candidates=4, revisions=3)))
+            found.append(find_placement(views.train, points, config(billboards=4, candidates=4, refinement_rounds=3)))
     finally:
         torch.set_num_threads(before)
     assert same(found[0], found[1]) and same(found[0], found[2])
-    assert not same(found[0], find_placement(views.train, points, config(billboards=4, candidates=4, revisions=3, seed=1)))
+    assert not same(found[0], find_placement(views.train, points, config(billboards=4, candidates=4, refinement_rounds=3, seed=1)))
 
 
 def test_more_work_is_never_worse(views: ViewDataset, points: torch.Tensor) -> None:
     """Revisions are kept only if they lower the loss on the training views."""
     fields = {"billboards": 6, "candidates": 1}
-    losses = [loss(find_placement(views.train, points, config(revisions=count, **fields)), views) for count in (0, 2, 12)]
+    losses = [loss(find_placement(views.train, points, config(refinement_rounds=count, **fields)), views) for count in (0, 2, 12)]
     assert losses[0] >= losses[1] >= losses[2] and losses[2] < losses[0]
 
 
 def test_more_candidates_are_never_worse(views: ViewDataset, points: torch.Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each is fitted as if it were alone, and the best goes on, however many do."""
     monkeypatch.setattr("bbfit.fitting.search._MORE_STEPS", 0)
-    found = [find_placement(views.train, points, config(candidates=count, revisions=0)) for count in (1, 3, 8)]
+    found = [find_placement(views.train, points, config(candidates=count, refinement_rounds=0)) for count in (1, 3, 8)]
     losses = [loss(cloud, views) for cloud in found]
     assert losses[0] >= losses[1] >= losses[2] and losses[2] < 0.95 * losses[0]
     monkeypatch.setattr("bbfit.fitting.search._SURVIVORS", 1.0)
-    assert same(find_placement(views.train, points, config(candidates=8, revisions=0)), found[2])
+    assert same(find_placement(views.train, points, config(candidates=8, refinement_rounds=0)), found[2])
 
 
 def test_moving_billboards_explain_the_views_better_than_standing_ones(
@@ -120,8 +120,10 @@ def test_moving_billboards_explain_the_views_better_than_standing_ones(
 ) -> None:
     """By a tenth (measured) after some hundred steps; after a few dozen it is a matter of luck."""
     monkeypatch.setattr("bbfit.fitting.search._MORE_STEPS", 200)
-    asked = {"candidates": 1, "revisions": 0}
-    standing, moving = (loss(find_placement(views.train, points, config(placement_rate=rate, **asked)), views) for rate in (0.0, 0.015))
+    asked = {"candidates": 1, "refinement_rounds": 0}
+    standing, moving = (
+        loss(find_placement(views.train, points, config(placement_learning_rate=rate, **asked)), views) for rate in (0.0, 0.015)
+    )
     assert moving < 0.95 * standing
 
 
@@ -139,9 +141,9 @@ def test_of_several_searches_the_best_one_counts(views: ViewDataset, points: tor
     monkeypatch.setattr(_Search, "_searched", watched)
     better = 0
     for seed in range(3):
-        alone = find_placement(views.train, points, config(billboards=4, searches=1, revisions=0, seed=seed))
+        alone = find_placement(views.train, points, config(billboards=4, restarts=1, refinement_rounds=0, seed=seed))
         assert len(made) == 1
-        found = find_placement(views.train, points, config(billboards=4, searches=3, revisions=0, seed=seed))
+        found = find_placement(views.train, points, config(billboards=4, restarts=3, refinement_rounds=0, seed=seed))
         first, *more = made[1:]
         assert same(alone, first[0]) and made[0][1] == first[1] and len(more) == 2
         assert not any(same(first[0], cloud) for cloud, _ in more) and not same(more[0][0], more[1][0])
@@ -165,24 +167,24 @@ def test_every_search_is_told_of_and_has_its_own_clusterings(
         return original(self, index)
 
     monkeypatch.setattr(_Search, "_clustered", watched)
-    for searches in (1, 3):
+    for restarts in (1, 3):
         told: list[tuple[int, int]] = []
         starts.clear()
-        asked = config(billboards=4, candidates=3, revisions=2, searches=searches)
+        asked = config(billboards=4, candidates=3, refinement_rounds=2, restarts=restarts)
         find_placement(views.train, points, asked, lambda done, total, told=told: told.append((done, total)))  # type: ignore[misc]
         # Candidates, the one that goes on, four alternatives for the billboard that is added; and revisions of the best.
-        assert {total for _, total in told} == {searches * 2 * (3 + 1 + 4) + 2 * 2 * 5} == {told[-1][0]}
-        assert sorted(starts) == list(range(3 * searches))
+        assert {total for _, total in told} == {restarts * 2 * (3 + 1 + 4) + 2 * 2 * 5} == {told[-1][0]}
+        assert sorted(starts) == list(range(3 * restarts))
 
 
 @pytest.mark.parametrize("orientation", ["upright", "free"])
 def test_orientation_is_where_planes_start(views: ViewDataset, points: torch.Tensor, orientation: str) -> None:
-    found = find_placement(views.train, points, config(orientation=orientation, placement_rate=0.0, revisions=0))
+    found = find_placement(views.train, points, config(orientation=orientation, placement_learning_rate=0.0, refinement_rounds=0))
     leaning = found.normals[:, 1].abs()
     assert leaning.max() < 1e-5 if orientation == "upright" else leaning.max() > 0.05
 
 
-@pytest.mark.parametrize("fields", [{"billboards": 1}, {"sides": "two"}, {"candidates": 1, "revisions": 1}])
+@pytest.mark.parametrize("fields", [{"billboards": 1}, {"sides": "two"}, {"candidates": 1, "refinement_rounds": 1}])
 def test_corner_cases(views: ViewDataset, points: torch.Tensor, fields: dict[str, object]) -> None:
     asked = config(**fields)
     found = find_placement(views.train, points, asked)
@@ -271,10 +273,10 @@ def test_revising_changes_no_number(search: _Search, clustered: BillboardCloud, 
 
 
 def test_what_is_revised_for_the_worse_is_not_kept(views: ViewDataset, points: torch.Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = config(billboards=4, revisions=0)
+    asked = config(billboards=4, refinement_rounds=0)
     unrevised = find_placement(views.train, points, asked)
     monkeypatch.setattr(_Search, "_best_of", lambda self, clouds: (clouds[-1], 1.0))
-    search = _Search(views.train, points, config(billboards=4, revisions=3), lambda done, total: None)
+    search = _Search(views.train, points, config(billboards=4, refinement_rounds=3), lambda done, total: None)
     monkeypatch.setattr(_Search, "_searched", lambda self, number: (unrevised, 0.5))
     assert search.best() is unrevised
     monkeypatch.setattr(_Search, "_searched", lambda self, number: (unrevised, 2.0))

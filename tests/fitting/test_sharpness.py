@@ -7,7 +7,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from bbfit.fitting.fused_sharpness import add_sharpness_gradient
-from bbfit.fitting.losses import SHARPNESS_BLOCK, blending, sharpness_difference
+from bbfit.fitting.losses import SHARPNESS_BLOCK, binarization_loss, sharpness_difference
 from bbfit.images import premultiply
 
 
@@ -69,7 +69,7 @@ def test_equal_bytes_whatever_the_number_of_threads() -> None:
 
 def test_blending_has_no_derivative_where_there_is_nothing() -> None:
     texels = torch.tensor([[0.0, 0, 0, 0], [0, 0, 0, 0.25], [0, 0, 0, 1]], requires_grad=True)
-    value = blending(texels)
+    value = binarization_loss(texels)
     value.backward()
     assert value.item() == pytest.approx(0.25 * 0.75)
     assert texels.grad is not None and texels.grad[:, 3].tolist() == pytest.approx([0, 0.5, -1]) and not texels.grad[:, :3].any()

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.levels import Targets, resize_textures
-from bbfit.fitting.losses import blending, image_loss
+from bbfit.fitting.losses import binarization_loss, image_loss
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.steps import FusedStepper, ReferenceStepper, Stepper, make_stepper
 from bbfit.geometry.cloud import BillboardCloud
@@ -24,9 +24,9 @@ from bbfit.views import ViewDataset, ViewSet
 STEPPERS = pytest.mark.parametrize("kind", [ReferenceStepper, FusedStepper])
 PLACEMENT = ("centers", "rights", "ups", "half_extents")
 # The default preset's losses at the levels where billboards move.
-DEFAULT = FitConfig(sharpness_weight=0, crispness_weight=0)
+DEFAULT = FitConfig(sharpness_weight=0, binarization_weight=0)
 CONFIGS = {"thesis": FitConfig(preset="thesis"), "l1": FitConfig(preset="thesis", loss="l1"), "default": DEFAULT}
-# The test clouds' billboards are two metres wide.
+# The test clouds' billboards are two meters wide.
 REACH = 1.0
 
 
@@ -49,17 +49,19 @@ def chosen(index: int, count: int) -> list[int]:
     return [(3 * index + 5 * i) % count for i in range(4)]
 
 
-def advance(stepper: Stepper, views: ViewSet, steps: range, total: int, rate: float = 1e-3, placement_rate: float = 0.02) -> list[Tensor]:
+def advance(
+    stepper: Stepper, views: ViewSet, steps: range, total: int, rate: float = 1e-3, placement_learning_rate: float = 0.02
+) -> list[Tensor]:
     """Steps of a cosine schedule; the losses."""
     losses = []
     for index in steps:
         fall = 0.5 * (1 + math.cos(math.pi * index / total))
-        losses.append(stepper.step(chosen(index, len(views)), rate * fall, placement_rate * fall))
+        losses.append(stepper.step(chosen(index, len(views)), rate * fall, placement_learning_rate * fall))
     return losses
 
 
 def off(cloud: BillboardCloud, truth: BillboardCloud) -> float:
-    """The furthest that a corner is from where it should be, in metres."""
+    """The furthest that a corner is from where it should be, in meters."""
     corners = [
         torch.cat(
             [
@@ -120,7 +122,7 @@ def test_billboards_that_stay_do_not_find_it(
     """The same steps with a rate of 0: the placement is the start's to the bit, and so is what is kept of it; texels move nevertheless."""
     movement = Movement(displaced, REACH)
     stepper = kind(displaced, Targets.at(views, 0), FitConfig(preset="thesis").resolve(), movement)
-    advance(stepper, views, range(10), 10, placement_rate=0.0)
+    advance(stepper, views, range(10), 10, placement_learning_rate=0.0)
     assert not movement.parameters.any() and not stepper.tensors()["movement"].any()
     for name in PLACEMENT:
         assert torch.equal(getattr(stepper.cloud, name), getattr(displaced, name)), name
@@ -135,8 +137,8 @@ def test_without_a_rate_a_movement_makes_no_difference(displaced: BillboardCloud
     config, targets = FitConfig(preset="thesis").resolve(), Targets.at(views, 0)
     with_movement = kind(displaced, targets, config, Movement(displaced, REACH))
     without = kind(displaced, targets, config)
-    advance(with_movement, views, range(5), 5, placement_rate=0.0)
-    advance(without, views, range(5), 5, placement_rate=0.0 if still else 0.1)
+    advance(with_movement, views, range(5), 5, placement_learning_rate=0.0)
+    advance(without, views, range(5), 5, placement_learning_rate=0.0 if still else 0.1)
     assert "movement" not in without.tensors()
     torch.testing.assert_close(with_movement.texels.detach(), without.texels.detach(), atol=1e-6, rtol=0)
     for name in PLACEMENT:
@@ -144,12 +146,12 @@ def test_without_a_rate_a_movement_makes_no_difference(displaced: BillboardCloud
 
 
 @pytest.mark.parametrize(
-    ("kind", "placement_rate"),
+    ("kind", "placement_learning_rate"),
     [(ReferenceStepper, 0.02), (ReferenceStepper, 0.0), (FusedStepper, 0.02), (FusedStepper, 0.0)],
 )
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())
 def test_a_step_tells_the_loss_of_the_cloud_where_it_is(
-    displaced: BillboardCloud, views: ViewSet, kind: type[Stepper], placement_rate: float, config: FitConfig
+    displaced: BillboardCloud, views: ViewSet, kind: type[Stepper], placement_learning_rate: float, config: FitConfig
 ) -> None:
     """Before the step's update, of billboards that have moved, also in a step that does not move them."""
     config, targets = config.resolve(), Targets.at(views, 0)
@@ -162,10 +164,10 @@ def test_a_step_tells_the_loss_of_the_cloud_where_it_is(
     def loss(cloud: BillboardCloud) -> float:
         return float(image_loss(render_reference(cloud, targets.cameras[picked]), targets.pictures(picked), config.loss, *weights))
 
-    told = float(stepper.step(picked, 1e-3, placement_rate))
+    told = float(stepper.step(picked, 1e-3, placement_learning_rate))
     assert told == pytest.approx(loss(cloud), rel=1e-3)
     assert abs(loss(displaced) - told) > 0.05 * told  # where it began is another loss
-    if not placement_rate:
+    if not placement_learning_rate:
         assert all(torch.equal(getattr(stepper.cloud, name), getattr(cloud, name)) for name in PLACEMENT)
 
 
@@ -219,7 +221,7 @@ def test_the_backend_chooses_the_stepper(displaced: BillboardCloud, views: ViewS
 
 
 GROUPED = CONFIGS | {
-    "all weights": FitConfig(ssim_weight=0.05, sharpness_weight=20, crispness_weight=0.1),
+    "all weights": FitConfig(ssim_weight=0.05, sharpness_weight=20, binarization_weight=0.1),
     "only sharpness": FitConfig(preset="thesis", sharpness_weight=20),
 }
 
@@ -258,7 +260,7 @@ def test_clouds_side_by_side_step_as_each_alone(
 ) -> None:
     """To the bit, textures and placement alike; the losses are added up."""
     config, targets = replace(config, backend=backend).resolve(), Targets.at(views, halvings)
-    if config.crispness_weight:  # what no view shows becomes crisp with what it shares a block with
+    if config.binarization_weight:  # what no view shows becomes crisp with what it shares a block with
         several = [several[0], several[2], several[1]]
 
     def fitted(cloud: BillboardCloud, groups: int) -> tuple[BillboardCloud, list[float]]:
@@ -282,12 +284,12 @@ def test_crispness_is_the_same_side_by_side(several: list[BillboardCloud], views
     """It is a sum over texels and no mean over views: beside others a cloud becomes as crisp as alone, and crisper than without."""
     clouds = []
     for weight in (1.0, 0.0):
-        config = FitConfig(preset="thesis", crispness_weight=weight, backend=backend).resolve()
+        config = FitConfig(preset="thesis", binarization_weight=weight, backend=backend).resolve()
         for joined, groups in (([several[2], several[0], several[1]], 3), ([several[2]], 1)):
             stepper = make_stepper(BillboardCloud.joined(joined), Targets.at(views, 0), config, groups=groups)
             advance(stepper, views, range(10), 60, rate=0.02)
             clouds.append(of_group(stepper.cloud, 0))
-    blends = [float(blending(cloud.texels)) for cloud in clouds]
+    blends = [float(binarization_loss(cloud.texels)) for cloud in clouds]
     assert blends[0] == blends[1] < 0.9 * blends[2] and blends[2] == blends[3]
 
 

@@ -61,7 +61,7 @@ def test_nerf_camera_projects_as_the_layout_says() -> None:
         assert projected.isfinite().all() == in_front
         if in_front:
             compared += 1
-            # The layout counts from the corner of the top-left pixel, we from its centre.
+            # The layout counts from the corner of the top-left pixel, we from its center.
             expected = nerf_pixel(pose, point_here, focal, width, height) - 0.5
             assert torch.allclose(projected, expected, rtol=1e-9, atol=1e-9)
     assert compared > 10
@@ -179,7 +179,7 @@ def test_convergence_point_needs_two_directions() -> None:
 @pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize(("width", "height"), [(31, 20), (62, 40), (7, 5), (15, 60), (1, 1)])
 def test_a_resized_camera_covers_the_same_field_of_view(width: int, height: int, single: bool, orthographic: bool) -> None:
-    """Places are shares of the picture from its outer edges, also where the principal point is off the centre."""
+    """Places are shares of the picture from its outer edges, also where the principal point is off the center."""
     intrinsics = pinhole_intrinsics(50, 31, 20).repeat(5, 1, 1) + torch.tensor([[3.0, 0, 2.5], [0, -1, -4], [0, 0, 0]]).double()
     camera: Camera = Camera(random_rigid(5), intrinsics, 31, 20, orthographic)
     camera = camera[2] if single else camera

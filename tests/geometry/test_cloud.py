@@ -67,12 +67,14 @@ def assert_same(a: BillboardCloud, b: BillboardCloud) -> None:
 def test_bare_rectangles_have_transparent_texels_that_take_no_memory(dtype: torch.dtype) -> None:
     cloud = small_cloud(dtype)
     tracked = cloud.with_texels(cloud.texels.clone().requires_grad_())
-    bare = tracked.bare()
-    assert_same(bare, cloud.with_texels(torch.zeros_like(cloud.texels)))
-    assert bare.texels.untyped_storage().nbytes() == 4 * cloud.texels.element_size() and not bare.texels.requires_grad
+    without_textures = tracked.without_textures()
+    assert_same(without_textures, cloud.with_texels(torch.zeros_like(cloud.texels)))
+    assert (
+        without_textures.texels.untyped_storage().nbytes() == 4 * cloud.texels.element_size() and not without_textures.texels.requires_grad
+    )
     with pytest.raises(RuntimeError):
-        bare.texels.add_(1)
-    assert [texture.shape for texture in bare.textures()] == [texture.shape for texture in cloud.textures()]
+        without_textures.texels.add_(1)
+    assert [texture.shape for texture in without_textures.textures()] == [texture.shape for texture in cloud.textures()]
     assert tracked.texels.any()
 
 

@@ -48,7 +48,7 @@ def test_stray_texels_may_be_spared(known_cloud: BillboardCloud) -> None:
 
 
 def test_texel_density(known_cloud: BillboardCloud) -> None:
-    """36 x 30 texels on 2.4 x 2 metres."""
+    """36 x 30 texels on 2.4 x 2 meters."""
     assert known_cloud.texel_density == pytest.approx(15.0)
     assert replace(
         known_cloud.take([0]), two_sided=torch.tensor([True]), texels=torch.zeros(2 * 36 * 30, 4)

@@ -1,4 +1,4 @@
-"""Plane homographies against texel centres placed in space by hand."""
+"""Plane homographies against texel centers placed in space by hand."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def cameras(orthographic: bool) -> Camera:
     return Camera(look_at(position, torch.zeros(3, dtype=torch.float64)), intrinsics.repeat(2, 1, 1), 20, 15, orthographic)
 
 
-def texel_centre(cloud: BillboardCloud, n: int, column: int, row: int) -> torch.Tensor:
-    """The world point of a texel's centre: texels divide the rectangle evenly, row 0 at the top."""
+def texel_center(cloud: BillboardCloud, n: int, column: int, row: int) -> torch.Tensor:
+    """The world point of a texel's center: texels divide the rectangle evenly, row 0 at the top."""
     height, width = cloud.texture_sizes[n].tolist()
     across = cloud.rights[n] * cloud.half_extents[n, 0] * (2 * (column + 0.5) / width - 1)
     down = cloud.ups[n] * cloud.half_extents[n, 1] * (1 - 2 * (row + 0.5) / height)
@@ -49,7 +49,7 @@ def test_texels_land_where_their_points_in_space_project(orthographic: bool) -> 
     for n, (height, width) in enumerate(cloud.texture_sizes.tolist()):
         for column, row in ((0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)):
             texel = torch.tensor([column, row, 1.0], dtype=torch.float64)
-            point = texel_centre(cloud, n, column, row)
+            point = texel_center(cloud, n, column, row)
             assert torch.allclose((places[n] @ texel)[:3], point)
             for v in range(2):
                 pixel = matrices[v, n] @ texel

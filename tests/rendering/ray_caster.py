@@ -20,19 +20,19 @@ def cast(cloud: BillboardCloud, camera: Camera) -> NDArray[np.float64]:
         starts, rays = np.concatenate([flat, zeros], -1), np.concatenate([flat * 0, ones], -1)
     else:
         starts, rays = np.zeros((*flat.shape[:2], 3)), np.concatenate([flat, ones], -1)
-    starts, rays = (starts - translation) @ rotation, rays @ rotation  # the world's axes; one unit along a ray is one metre of depth
+    starts, rays = (starts - translation) @ rotation, rays @ rotation  # the world's axes; one unit along a ray is one meter of depth
     eye = -rotation.T @ translation
 
     layers, depths = [], []
     for n, texture in enumerate(cloud.textures()):
-        centre, right, up = (t[n].detach().double().numpy() for t in (cloud.centers, cloud.rights, cloud.ups))
+        center, right, up = (t[n].detach().double().numpy() for t in (cloud.centers, cloud.rights, cloud.ups))
         normal = np.cross(right, up)
-        facing = -rotation[2] @ normal if camera.orthographic else (eye - centre) @ normal
+        facing = -rotation[2] @ normal if camera.orthographic else (eye - center) @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
-            depth = (centre - starts) @ normal / (rays @ normal)
+            depth = (center - starts) @ normal / (rays @ normal)
         met = (depth > 0) & np.isfinite(depth) & (abs(facing) > 1e-9)
         depth = np.where(met, depth, np.inf)
-        hit = starts + rays * np.where(met, depth, 0)[..., None] - centre
+        hit = starts + rays * np.where(met, depth, 0)[..., None] - center
         height, width = texture.shape[1:3]
         half_width, half_height = cloud.half_extents[n].tolist()
         column = (hit @ right / half_width + 1) * width / 2 - 0.5
@@ -53,14 +53,14 @@ def cast(cloud: BillboardCloud, camera: Camera) -> NDArray[np.float64]:
 
 
 def _bilinear(texture: NDArray[np.float64], column: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Straight colour clamped at the border, alpha fading to zero beyond it; premultiplied after filtering."""
+    """Straight color clamped at the border, alpha fading to zero beyond it; premultiplied after filtering."""
     height, width = texture.shape[:2]
     left, top = np.floor(column), np.floor(row)
-    colour, alpha = np.zeros((*column.shape, 3)), np.zeros(column.shape)
+    color, alpha = np.zeros((*column.shape, 3)), np.zeros(column.shape)
     for x, y in ((left, top), (left + 1, top), (left, top + 1), (left + 1, top + 1)):
         weight = (1 - abs(column - x)) * (1 - abs(row - y))
         tap = texture[np.clip(y, 0, height - 1).astype(int), np.clip(x, 0, width - 1).astype(int)]
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        colour += weight[..., None] * tap[..., :3]
+        color += weight[..., None] * tap[..., :3]
         alpha += weight * inside * tap[..., 3]
-    return np.concatenate([colour * alpha[..., None], alpha[..., None]], -1)
+    return np.concatenate([color * alpha[..., None], alpha[..., None]], -1)

@@ -15,7 +15,7 @@ from bbfit.geometry.orbit import Orbit
 
 PLACEMENT = ("centers", "rights", "ups", "half_extents")
 CORNERS = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).numpy()
-"""Of a cube of two metres around the origin."""
+"""Of a cube of two meters around the origin."""
 
 
 def cloud_of(
@@ -80,7 +80,7 @@ def tracked(cloud: BillboardCloud) -> tuple[BillboardCloud, dict[str, Tensor]]:
 
 
 def placement_of(cloud: BillboardCloud) -> Tensor:
-    """Centres, rights, ups and half extents side by side, float64 [N, 11]."""
+    """Centers, rights, ups and half extents side by side, float64 [N, 11]."""
     return torch.cat([getattr(cloud, name) for name in PLACEMENT], -1).double()
 
 

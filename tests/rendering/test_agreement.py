@@ -48,7 +48,7 @@ def test_float32_agrees_with_float64(count: int) -> None:
 
 @pytest.mark.parametrize("scale", [1e-3, 1e4])
 def test_units_do_not_matter(scale: float) -> None:
-    """A tree in millimetres or in kilometres is the same picture."""
+    """A tree in millimeters or in kilometers is the same picture."""
     for seed in range(8):
         cloud, camera = random_scene(seed, 3, orthographic=False)
         pose = camera.world_to_camera.clone()
@@ -78,10 +78,10 @@ def test_one_texel_a_pixel_is_the_texture_itself(dtype: torch.dtype, allowed: fl
     assert (render_reference(moved, camera) - expected).abs().max() < 4 * allowed
 
 
-def test_half_a_texel_beyond_the_outermost_centre_half_is_left() -> None:
-    """The margin: alpha fades to nothing over one texel while the colour stays, so nothing dark is mixed in."""
+def test_half_a_texel_beyond_the_outermost_center_half_is_left() -> None:
+    """The margin: alpha fades to nothing over one texel while the color stays, so nothing dark is mixed in."""
     cloud = facing_cloud([2.0], [(4, 4)]).with_texels(torch.tensor([0.2, 0.4, 0.8, 1.0]).double().expand(16, 4))
-    camera = camera_on_z(6, 6, fov=None, extent=3.0)  # half a metre a pixel and a texel, so the rectangle's edge is at pixel 0.5
+    camera = camera_on_z(6, 6, fov=None, extent=3.0)  # half a meter a pixel and a texel, so the rectangle's edge is at pixel 0.5
     image = render_reference(replace(cloud, centers=cloud.centers + torch.tensor([0.25, 0, 0])), camera)
     assert torch.allclose(image[2, :, 3], torch.tensor([0, 0.5, 1, 1, 1, 0.5]).double())
     assert torch.allclose(image[2, 1:, :3] / image[2, 1:, 3:], torch.tensor([0.2, 0.4, 0.8]).double())
@@ -95,7 +95,7 @@ def test_crossing_planes_swap_order_within_a_picture() -> None:
     camera = Camera(look_at(position, torch.zeros(3).double())[0], pinhole_intrinsics(30, 16, 5), 16, 5)
     assert difference(cloud, camera) < FLOAT64
     row = render_reference(cloud, camera)[2]
-    # Only the red plane's middle texel is opaque, so compare which colour leads on either side of the crossing.
+    # Only the red plane's middle texel is opaque, so compare which color leads on either side of the crossing.
     assert row[6, 2] != row[6, 0] and (row[6, 2] > row[6, 0]) != (row[9, 2] > row[9, 0])
 
 
@@ -123,10 +123,10 @@ def test_a_two_sided_billboard_shows_each_texture_to_its_own_side() -> None:
     intrinsics = pinhole_intrinsics(37, 2, 2).repeat(2, 1, 1)  # the rectangle fills the picture
     camera = Camera(look_at(position, torch.zeros(3).double()), intrinsics, 2, 2)
     image = render_reference(cloud, camera)
-    colour = image[..., :3] / image[..., 3:]
-    assert torch.allclose(colour[0, 0], front[:, :3], atol=0.02)
+    color = image[..., :3] / image[..., 3:]
+    assert torch.allclose(color[0, 0], front[:, :3], atol=0.02)
     # Both textures are stored as seen from the front, so from behind they appear mirrored.
-    assert torch.allclose(colour[1, 0], back.flip(0)[:, :3], atol=0.02)
+    assert torch.allclose(color[1, 0], back.flip(0)[:, :3], atol=0.02)
     for v in range(2):
         assert np.abs(image[v].double().numpy() - cast(cloud.to(torch.float64), camera[v])).max() < FLOAT32
 
@@ -183,7 +183,7 @@ def test_a_floor_that_runs_under_the_camera_is_drawn_ahead_of_it_only() -> None:
         assert (image[: height // 2] == 0).all() and (image[-1] == 1).all()
 
 
-def test_horizons_that_run_through_pixel_centres() -> None:
+def test_horizons_that_run_through_pixel_centers() -> None:
     """kornia divides by zero there; planes beside the optical axis and parallel to it, as pairs seen end-on in odd pictures are."""
     cloud = even_upright(
         2, axis=torch.tensor([0.0, 0, -6]).double(), half_extents=torch.full((2,), 2.0).double(),

@@ -62,7 +62,7 @@ def test_a_hashed_picture_has_no_gradient_in_alpha() -> None:
 
 @pytest.mark.parametrize("draw", [render_reference, render_fused])
 def test_a_mask_shows_the_nearest_that_reaches_the_cutoff(draw: object) -> None:
-    """Three planes one behind the other, alpha below, at and above the cutoff: the second is seen, in its full colour."""
+    """Three planes one behind the other, alpha below, at and above the cutoff: the second is seen, in its full color."""
     cloud = facing_cloud([2.0, 3.0, 4.0], [(2, 2)] * 3, (2.0, 2.0)).to(torch.float32)
     texels = torch.tensor([[1.0, 0, 0, 0.2499], [0, 1, 0, 0.25], [0, 0, 1, 1]]).repeat_interleave(4, 0)
     image = draw(replace(cloud, texels=texels, alpha=AlphaMode("mask", 0.25)), camera_on_z(5, 5, fov=30))  # type: ignore[operator]
@@ -80,7 +80,7 @@ def test_a_hash_is_a_blend_on_average() -> None:
     assert float((hashed - blended)[inside].abs().mean()) > 0.1
 
 
-def test_thresholds_are_even_and_unlike_their_neighbours() -> None:
+def test_thresholds_are_even_and_unlike_their_neighbors() -> None:
     y, x = torch.meshgrid(torch.arange(256), torch.arange(256), indexing="ij")
     values = thresholds(x, y, 12345)
     assert 0 < float(values.min()) and float(values.max()) < 1
@@ -109,7 +109,13 @@ def test_the_mode_stays_with_the_cloud(known_cloud: BillboardCloud, tmp_path: ob
     path = f"{tmp_path}/cloud.safetensors"
     masked.save(path)
     assert BillboardCloud.load(path).alpha == AlphaMode("mask", 0.3)
-    for other in (masked.to(torch.float64), masked.take([1]), masked.bare(), BillboardCloud.joined([masked, masked]), masked.parts(2)[1]):
+    for other in (
+        masked.to(torch.float64),
+        masked.take([1]),
+        masked.without_textures(),
+        BillboardCloud.joined([masked, masked]),
+        masked.parts(2)[1],
+    ):
         assert other.alpha == masked.alpha
     assert known_cloud.alpha == AlphaMode("blend")
 

@@ -125,7 +125,7 @@ def turned(sine: float) -> BillboardCloud:
 
 
 def floor_and_ceiling(sizes: list[tuple[int, int]], heights: list[float]) -> BillboardCloud:
-    """Level planes that run below and above ``camera_on_z``, at an angle to it, each about a centre of its own."""
+    """Level planes that run below and above ``camera_on_z``, at an angle to it, each about a center of its own."""
     n, turn = len(sizes), torch.tensor(0.7)
     right = torch.stack([turn.cos(), torch.zeros(()), turn.sin()])
     up = torch.stack([-turn.sin(), torch.zeros(()), turn.cos()])
@@ -171,9 +171,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "opaque behind transparent": lambda: Scene(
         with_alpha(facing_cloud([4.0, 3.0, 5.0], [(4, 4), (3, 6), (5, 5)]), [1, 0, 0.5]), aside(16, 12)
     ),
-    "crossing at pixel centres": lambda: Scene(crossing(5), camera_on_z(33, 17, fov=40.0)),
-    "many crossing at pixel centres": lambda: Scene(crossing(16), camera_on_z(65, 5, fov=40.0)),
-    "crossing at pixel centres, parallel": lambda: Scene(crossing(5), camera_on_z(33, 17, fov=None)),
+    "crossing at pixel centers": lambda: Scene(crossing(5), camera_on_z(33, 17, fov=40.0)),
+    "many crossing at pixel centers": lambda: Scene(crossing(16), camera_on_z(65, 5, fov=40.0)),
+    "crossing at pixel centers, parallel": lambda: Scene(crossing(5), camera_on_z(33, 17, fov=None)),
     "coincident": lambda: Scene(floor_and_ceiling([(6, 6), (5, 8), (9, 2)], [-1.0, -1.0, -1.0]), rolled(aside(24, 17), 33)),
     "coincident, parallel": lambda: Scene(facing_cloud([3.0, 3.0], [(4, 4), (3, 6)]), aside(17, 12, fov=None)),
 }  # fmt: skip

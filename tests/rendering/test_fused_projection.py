@@ -55,7 +55,7 @@ def test_random_scenes_are_projected_as_torch_projects_them() -> None:
     backs, everywhere, nowhere = 0, 0, 0
     for cloud, camera in [*scenes(12), *(random_scene(seed, 17, orthographic=seed % 2 == 1) for seed in range(12))]:
         elsewhere = replace(cloud, centers=cloud.centers + 7, rights=cloud.ups, ups=cloud.rights, half_extents=2 * cloud.half_extents)
-        projector, placement, cameras = Projector(elsewhere.bare(), camera), placement_of(cloud), camera.batch()
+        projector, placement, cameras = Projector(elsewhere.without_textures(), camera), placement_of(cloud), camera.batch()
         before, owned = placement.clone(), cloud.texture_sizes.prod(-1) * (1 + cloud.two_sided.long())
         first = owned.cumsum(0) - owned
         for chosen in orders(len(cameras)):
@@ -172,7 +172,7 @@ def through_torch(cloud: BillboardCloud, cameras: Camera, of_matrices: Tensor) -
 
 
 def assert_same_gradient(found: Tensor, wanted: Tensor, limit: float = 1e-12) -> None:
-    """Of every billboard, in its centre, its right, its up and its half extents each."""
+    """Of every billboard, in its center, its right, its up and its half extents each."""
     assert found.shape == wanted.shape and found.dtype == torch.float64
     for name, ours, theirs in zip(PLACEMENT, *(gradient.split((3, 3, 3, 2), -1) for gradient in (found, wanted)), strict=True):
         error, size = (ours - theirs).norm(dim=-1), theirs.norm(dim=-1)
@@ -182,7 +182,7 @@ def assert_same_gradient(found: Tensor, wanted: Tensor, limit: float = 1e-12) ->
 def test_gradients_are_autograds() -> None:
     """Also of views that were chosen more than once, which count as often."""
     for cloud, camera in scenes(12):
-        projector, placement, cameras = Projector(cloud.bare(), camera), placement_of(cloud), camera.batch()
+        projector, placement, cameras = Projector(cloud.without_textures(), camera), placement_of(cloud), camera.batch()
         for seed, chosen in enumerate(orders(len(cameras))):
             weights = weights_of((len(chosen), 3, 3, 3), seed)
             projector.project(placement, chosen)

@@ -25,7 +25,7 @@ def placed(centers: Tensor, angles: Tensor, half_extents: Tensor, texels: Tensor
 
 
 def distance_to_kinks(cloud: BillboardCloud, camera: Camera) -> float:
-    """How near a sample comes to a texel centre's row or column, in texels, or two planes' depths to each other, in metres.
+    """How near a sample comes to a texel center's row or column, in texels, or two planes' depths to each other, in meters.
 
     Bilinear filtering has a kink at the one and the picture a jump at the other, so finite differences need some room.
     """
@@ -138,7 +138,7 @@ def test_gradients_are_finite_among_the_planes() -> None:
         finite_gradients(cloud.to(torch.float32), camera)
 
 
-def test_a_plane_on_a_pixel_centre_horizon_still_has_a_gradient() -> None:
+def test_a_plane_on_a_pixel_center_horizon_still_has_a_gradient() -> None:
     """Its other pixels keep theirs, equal to those in a picture where the horizon misses all pixels by a little."""
     cloud = floor_and_ceiling()
     camera = camera_on_z(9, 9, fov=90)
@@ -184,7 +184,7 @@ def test_each_side_learns_only_from_the_views_on_its_side() -> None:
     assert (back[:9] == 0).all() and (back[9:] != 0).any()
 
 
-def test_the_picture_is_linear_in_the_colours() -> None:
+def test_the_picture_is_linear_in_the_colors() -> None:
     cloud, camera = random_scene(2, 3, orthographic=False)
     one, other = cloud.texels, cloud.texels.clone()
     other[:, :3] = torch.rand(other[:, :3].shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -194,7 +194,7 @@ def test_the_picture_is_linear_in_the_colours() -> None:
     assert torch.allclose(render_reference(mixed, camera), 0.25 * images[0] + 0.75 * images[1], atol=1e-14)
 
 
-def test_colours_never_exceed_alpha_and_alpha_never_exceeds_one() -> None:
+def test_colors_never_exceed_alpha_and_alpha_never_exceeds_one() -> None:
     for seed in range(10):
         cloud, camera = random_scene(seed, 17, orthographic=False)
         image = render_reference(cloud.to(torch.float32), camera)

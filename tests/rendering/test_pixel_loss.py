@@ -70,13 +70,13 @@ def test_gradients_are_added_to_what_is_there(kind: str) -> None:
 
 
 def texel_a_pixel(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Opaque 8-bit colours [16 * 16, 3] as a target [1, 16, 16, 4], and the texels that are exactly they; seen one texel a pixel."""
+    """Opaque 8-bit colors [16 * 16, 3] as a target [1, 16, 16, 4], and the texels that are exactly they; seen one texel a pixel."""
     target = torch.cat([values, torch.full_like(values[:, :1], 255)], -1)
     return target.view(1, 16, 16, 4), target.float() / 255
 
 
 def matching(values: Tensor, kind: str, straight: bool) -> tuple[float, Tensor]:
-    """Sum and gradient of a loss of opaque greys, uint8 [256], drawn one texel a pixel, that are the target exactly."""
+    """Sum and gradient of a loss of opaque grays, uint8 [256], drawn one texel a pixel, that are the target exactly."""
     target, texels = texel_a_pixel(torch.stack([values, values.flip(0), values], -1))
     cloud, camera = facing_cloud([3.0], [(16, 16)], (2.0, 2.0)).to(torch.float32), camera_on_z(16, 16, fov=None, extent=4.0)
     projection, gradient = project(cloud, camera), torch.zeros_like(texels)

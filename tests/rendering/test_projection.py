@@ -93,7 +93,7 @@ def test_every_pixel_that_hits_lies_in_its_box() -> None:
 
 
 def test_boxes_are_no_larger_than_they_must_be() -> None:
-    """A rectangle of 2 m at 3 m, seen at 4 pixels a metre: its corners and its margins of a quarter metre are known."""
+    """A rectangle of 2 m at 3 m, seen at 4 pixels a meter: its corners and its margins of a quarter meter are known."""
     cloud, camera = facing_cloud([3.0], [(8, 8)]), camera_on_z(33, 21, fov=None, extent=33 / 4)
     assert project(cloud, camera).boxes.tolist() == [[[16 - 4 - 1, 16 + 4 + 1, 10 - 4 - 1, 10 + 4 + 1]]]
     right = replace(cloud, centers=cloud.centers + torch.tensor([2.5, 0.0, 0.0]).double())
@@ -103,7 +103,7 @@ def test_boxes_are_no_larger_than_they_must_be() -> None:
 
 
 def test_homographies_and_nearness_are_those_of_the_rays() -> None:
-    """Measured at most 3e-4 texels of 60 and 2.2e-6 in nearness, of which 1e-5 decides on order; of a depth near 0 it is 3e-6 metres."""
+    """Measured at most 3e-4 texels of 60 and 2.2e-6 in nearness, of which 1e-5 decides on order; of a depth near 0 it is 3e-6 meters."""
     compared = 0
     for cloud, camera in scenes(12):
         projection, (texels, depth) = project(cloud, camera), samples(cloud, camera)

@@ -1,4 +1,4 @@
-"""Charts for pages: every view has its point, marks are where they say, and no colour is the chart's own."""
+"""Charts for pages: every view has its point, marks are where they say, and no color is the chart's own."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from bbfit.checks import InputError
 from bbfit.evaluation.report import SizeScore, ViewScore
 from bbfit.evaluation.scoring import measure
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.reporting.charts import Chart, azimuth_chart, billboard_colour, loss_chart, plan_chart, sizes_chart, worst_views
+from bbfit.reporting.charts import Chart, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
 
-HUES = {billboard_colour(index) for index in range(10)}
+HUES = {billboard_color(index) for index in range(10)}
 
 
 def scores(*values: tuple[float, float, float], azimuths: tuple[float, ...] | None = None, elevation: float = 0.0) -> list[ViewScore]:
@@ -82,7 +82,7 @@ def test_the_plan_turns_about_its_middle(known_cloud: BillboardCloud) -> None:
     plan_chart(known_cloud.take([]))
 
 
-def test_colours_are_the_pages(known_cloud: BillboardCloud) -> None:
+def test_colors_are_the_pages(known_cloud: BillboardCloud) -> None:
     sizes = [SizeScore(64 >> n, 64 >> n, 20.0 + n, None if n else 1.1, 0.1) for n in range(3)]
     charts = [azimuth_chart(scores((20, 0.9, 0.1))), plan_chart(known_cloud), sizes_chart(sizes), loss_chart([3.0, 2.0, float("nan"), 1.0])]
     for chart in charts:

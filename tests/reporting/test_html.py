@@ -26,13 +26,13 @@ from bbfit.exporting.model import shipped_cards
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import over_colour
+from bbfit.images import over_color
 from bbfit.pipeline import RunConfig, RunResult, run
 from bbfit.reporting.charts import worst_views
 
 # What a folder and a picture may be called.
 EVIL = "<img src=x onerror=alert(1)> & \"tree\" 'of' {{ 7 * 7 }} </script><script>alert(2)<"
-CONFIG = RunConfig(fit=FitConfig(billboards=2, candidates=2, revisions=0, steps=40), views=ViewsConfig())
+CONFIG = RunConfig(fit=FitConfig(billboards=2, candidates=2, refinement_rounds=0, steps=40), views=ViewsConfig())
 Visit = Callable[..., Any]
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's
 
@@ -176,7 +176,7 @@ def test_pictures_are_the_views_and_the_renders(visit: Visit, result: RunResult)
         for truth, uri in zip(held_out(result.cloud, views, index), uris[:2], strict=True):
             image = np.asarray(Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1]))).convert("RGBA")) / 255
             premultiplied = torch.tensor(np.concatenate([image[..., :3] * image[..., 3:], image[..., 3:]], -1))
-            assert psnr(over_colour(truth).numpy(), over_colour(premultiplied).numpy()) > 33  # lossy, for its size
+            assert psnr(over_color(truth).numpy(), over_color(premultiplied).numpy()) > 33  # lossy, for its size
         assert Image.open(io.BytesIO(base64.b64decode(uris[2].split(",")[1]))).size == (48, 40)
 
 
@@ -233,8 +233,8 @@ def test_the_model_is_drawn_as_bbfit_draws_it(visit: Visit, result: RunResult, s
     image, camera = visit(lambda page: drawn(page.frames[1]), scheme=scheme, width=700)
     paper = torch.tensor([1.0, 1.0, 1.0] if scheme == "light" else [0x1D / 255, 0x21 / 255, 0x26 / 255])
     drawing = draw_cards(shipped_cards(result.cloud, ExportConfig()), camera).double()
-    wanted = over_colour(drawing, paper.double()).numpy()
-    assert psnr(wanted, over_colour(torch.zeros_like(drawing), paper.double()).numpy()) < 22  # there is something to see
+    wanted = over_color(drawing, paper.double()).numpy()
+    assert psnr(wanted, over_color(torch.zeros_like(drawing), paper.double()).numpy()) < 22  # there is something to see
     assert psnr(wanted, image) > 28  # antialiased edges differ
 
 
@@ -296,10 +296,10 @@ def test_it_reads_on_phones_and_screens_in_light_and_dark(visit: Visit, width: i
 
 
 def contrast(one: list[float], other: list[float]) -> float:
-    """WCAG 2.2's contrast ratio of two sRGB colours in [0, 255]."""
+    """WCAG 2.2's contrast ratio of two sRGB colors in [0, 255]."""
 
-    def luminance(colour: list[float]) -> float:
-        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in np.array(colour) / 255]
+    def luminance(color: list[float]) -> float:
+        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in np.array(color) / 255]
         return float(np.dot(linear, [0.2126, 0.7152, 0.0722]))
 
     low, high = sorted((luminance(one), luminance(other)))

@@ -14,7 +14,7 @@ from bbfit.budget.choice import Choice, Trial
 from bbfit.checks import InputError
 from bbfit.evaluation.scoring import held_out
 from bbfit.fitting.config import FitConfig, Placement, Sides
-from bbfit.images import over_colour, to_bytes
+from bbfit.images import over_color, to_bytes
 from bbfit.reporting.plots import Cost, comparison_picture, loss_plot, pareto_plot, running_mean, spread_views
 
 
@@ -40,7 +40,7 @@ def test_comparison_holds_the_pictures_unchanged(tmp_path: Path, width: int) -> 
     sheet = read(tmp_path / "out.png")
     places = []
     for index in spread_views(np.array([[0, 0], [90, 0], [180, 0], [270, 0]]), 3):
-        pair = [to_bytes(over_colour(picture)) for picture in held_out(worse, views, index)]
+        pair = [to_bytes(over_color(picture)) for picture in held_out(worse, views, index)]
         places.append([find(sheet, picture) for picture in pair])
     assert all(place is not None for row in places for place in row)
     array = np.array(places)  # [view, target or result, row or column]

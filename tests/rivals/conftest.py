@@ -12,7 +12,7 @@ from trimesh.visual.material import PBRMaterial
 from bbfit.blender.config import ViewsConfig
 from bbfit.rivals.baking import BakeConfig
 
-# A red post on the origin, a green arm along +X at its top, a blue foot along +Z: low and high corner, colour.
+# A red post on the origin, a green arm along +X at its top, a blue foot along +Z: low and high corner, color.
 BOXES = (
     ((-0.2, 0.0, -0.2), (0.2, 2.0, 0.2), (200, 30, 30)),
     ((0.2, 1.5, -0.1), (1.3, 1.8, 0.1), (30, 200, 30)),
@@ -25,9 +25,9 @@ def thing_glb(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The boxes as a .glb, matt."""
     path = tmp_path_factory.mktemp("thing") / "thing.glb"
     meshes = []
-    for low, high, colour in BOXES:
+    for low, high, color in BOXES:
         mesh = trimesh.creation.box(bounds=np.array([low, high]))
-        material = PBRMaterial(name=str(colour), baseColorFactor=[*colour, 255], metallicFactor=0.0, roughnessFactor=1.0)
+        material = PBRMaterial(name=str(color), baseColorFactor=[*color, 255], metallicFactor=0.0, roughnessFactor=1.0)
         mesh.visual = trimesh.visual.TextureVisuals(material=material)
         meshes.append(mesh)
     trimesh.Scene(meshes).export(str(path))
@@ -36,5 +36,5 @@ def thing_glb(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def coarse() -> BakeConfig:
-    """Twenty texels a metre, one light path a texel."""
+    """Twenty texels a meter, one light path a texel."""
     return BakeConfig(20.0, views=ViewsConfig(samples=4, denoise=False))

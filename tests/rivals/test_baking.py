@@ -21,7 +21,7 @@ WHOLE = (-5.0, 5.0)
 
 
 def slabs(*rows: tuple[list[float], list[float], list[float], tuple[float, float]]) -> Slabs:
-    """Rectangles by centre, right, up and depths, with sides that leave out nothing of the thing."""
+    """Rectangles by center, right, up and depths, with sides that leave out nothing of the thing."""
     columns = [torch.tensor([row[i] for row in rows], dtype=torch.float64) for i in range(4)]
     return Slabs(*columns[:3], torch.tensor([[2.1, 2.3]], dtype=torch.float64).repeat(len(rows), 1), columns[3])
 
@@ -55,7 +55,7 @@ def test_baked_cloud_seen_from_where_it_was_baked_is_the_picture(
         back = read_rgba(tmp_path / f"{n + 2:04}.png") if two_sided else front[:, ::-1]
         size = len(front)
         for side, picture in ((1, front), (-1, back)):
-            drawn = render_reference(cloud.take([n]).to(torch.float64), picture_camera(asked, n, size, coarse.texels_a_metre, side))
+            drawn = render_reference(cloud.take([n]).to(torch.float64), picture_camera(asked, n, size, coarse.texels_a_meter, side))
             expected = premultiply(torch.from_numpy(np.ascontiguousarray(picture)).double() / 255)
             torch.testing.assert_close(drawn, expected, atol=1e-5, rtol=0)
         assert (front != read_rgba(tmp_path / f"{n:04}.png")[:, ::-1]).any()
@@ -67,7 +67,7 @@ def test_rectangle_lies_about_what_it_shows(thing_glb: Path, coarse: BakeConfig)
     low, high = (cloud.centers[0] + sign * torch.cat([cloud.half_extents[0], torch.zeros(1)]) for sign in (-1, 1))
     np.testing.assert_allclose(low, [-0.2, 0.0, 0.0], atol=0.1)
     np.testing.assert_allclose(high, [1.3, 2.0, 0.0], atol=0.1)
-    assert (2 * cloud.half_extents * coarse.texels_a_metre).flip(-1).round().long().tolist() == cloud.texture_sizes.tolist()
+    assert (2 * cloud.half_extents * coarse.texels_a_meter).flip(-1).round().long().tolist() == cloud.texture_sizes.tolist()
     texture = cloud.textures()[0][0]
     assert all((texture[edge][..., 3] > 0).any() for edge in (0, -1)) and all((texture[:, edge, 3] > 0).any() for edge in (0, -1))
 
@@ -85,7 +85,7 @@ def test_slab_shows_what_lies_within_it(thing_glb: Path, coarse: BakeConfig) -> 
     assert not rest[rest[..., 3] == 1].amin(0)[:3].any()  # the post is cut open, and dark inside
 
 
-def test_cut_stems_take_the_colour_of_what_is_lit(thing_glb: Path, coarse: BakeConfig) -> None:
+def test_cut_stems_take_the_color_of_what_is_lit(thing_glb: Path, coarse: BakeConfig) -> None:
     """The post cut at z = 0.15 is black inside; filled, every texel is one of the lit ones, and as opaque as before."""
     asked = slabs((*FRONT, (-0.5, 0.15)))
     black, filled = (bake(thing_glb, asked, coarse, fill_cuts=fill).textures()[0][0] for fill in (False, True))
@@ -110,12 +110,12 @@ def test_nothing_at_all_is_an_empty_cloud(thing_glb: Path, coarse: BakeConfig) -
 
 
 def test_no_transparent_texel_is_black(thing_glb: Path, coarse: BakeConfig) -> None:
-    """Each has a visible texel's colour, which for the front of the thing is red, green or blue."""
+    """Each has a visible texel's color, which for the front of the thing is red, green or blue."""
     texture = bake(thing_glb, slabs((*TILTED, WHOLE)), coarse).textures()[0][0]
     hidden = texture[..., 3] == 0
     assert hidden.float().mean() > 0.3
-    shown = {tuple(colour) for colour in texture[~hidden][:, :3].tolist()}
-    assert all(tuple(colour) in shown for colour in texture[hidden][:, :3].tolist())
+    shown = {tuple(color) for color in texture[~hidden][:, :3].tolist()}
+    assert all(tuple(color) in shown for color in texture[hidden][:, :3].tolist())
 
 
 def test_rectangle_cuts_off_what_is_beyond_it(thing_glb: Path, coarse: BakeConfig) -> None:
@@ -124,7 +124,7 @@ def test_rectangle_cuts_off_what_is_beyond_it(thing_glb: Path, coarse: BakeConfi
     low = Slabs(torch.tensor([[0.0, 0.5, 0.0]]).double(), whole.rights, whole.ups, torch.tensor([[0.2, 0.5]]).double(), whole.depths)
     cloud = bake(thing_glb, low, coarse)
     top = float(cloud.centers[0, 1] + cloud.half_extents[0, 1])
-    assert top == pytest.approx(1.0 + 2 / coarse.texels_a_metre, abs=1e-6)
+    assert top == pytest.approx(1.0 + 2 / coarse.texels_a_meter, abs=1e-6)
 
 
 def test_settings_arrive(thing_glb: Path, tmp_path: Path, coarse: BakeConfig) -> None:
@@ -153,7 +153,7 @@ def test_triangles_of_every_kind_of_file_are_in_the_world_of_the_views(thing_glb
 
 
 def test_bad_input_is_refused(thing_glb: Path, coarse: BakeConfig) -> None:
-    with pytest.raises(InputError, match="texels_a_metre"):
+    with pytest.raises(InputError, match="texels_a_meter"):
         BakeConfig(0.0)
     with pytest.raises(InputError, match="least before the greatest"):
         slabs((*FRONT, (1.0, 1.0)))
@@ -161,4 +161,4 @@ def test_bad_input_is_refused(thing_glb: Path, coarse: BakeConfig) -> None:
     with pytest.raises(InputError, match="none to bake"):
         bake(thing_glb, Slabs(*(getattr(asked, name)[:0] for name in ("centers", "rights", "ups", "half_extents", "depths"))), coarse)
     with pytest.raises(InputError, match="16384"):
-        bake(thing_glb, asked, replace(coarse, texels_a_metre=1e5))
+        bake(thing_glb, asked, replace(coarse, texels_a_meter=1e5))

@@ -24,7 +24,7 @@ AXIS = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 
 def looking(azimuth: float, elevation: float = 0.0, *, distance: float = 6.0, orthographic: bool = True) -> Camera:
-    """One camera of 64 x 64 pixels at an azimuth around the axis; the parallel one has 20 pixels a metre."""
+    """One camera of 64 x 64 pixels at an azimuth around the axis; the parallel one has 20 pixels a meter."""
     a, e = np.radians([azimuth, elevation])
     direction = torch.tensor([[np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)]])
     k = orthographic_intrinsics(3.2, 64, 64) if orthographic else pinhole_intrinsics(40.0, 64, 64)

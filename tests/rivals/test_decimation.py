@@ -34,7 +34,7 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_edges_collapse_where_they_can(ball: Path) -> None:
-    """A ball stays a ball of its place, size and colour; quadrics keep its surface to some per cent of its radius."""
+    """A ball stays a ball of its place, size and color; quadrics keep its surface to some per cent of its radius."""
     made = decimate(ball, vertices=100)
     assert not made.clustered and 80 <= made.vertices <= 100 and made.triangles == 2 * made.vertices - 4
     (mesh,) = reloaded(made.glb).geometry.values()

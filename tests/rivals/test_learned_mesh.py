@@ -41,7 +41,7 @@ def quad(cloud: BillboardCloud) -> LearnedMesh:
 
 
 def painted_billboard() -> BillboardCloud:
-    """A billboard of 2 x 3 metres: random colours in bytes and a clear margin, so that nothing is beyond the outermost texels."""
+    """A billboard of 2 x 3 meters: random colors in bytes and a clear margin, so that nothing is beyond the outermost texels."""
     cloud = even_upright(1, axis=torch.tensor([0.2, 1.5, -0.1]), half_extents=torch.tensor([1.0, 1.5]), texture_sizes=torch.tensor([9, 7]))
     texels = torch.randint(0, 256, (9, 7, 4), generator=torch.Generator().manual_seed(3)) / 255
     texels[[0, -1]] = 0
@@ -66,13 +66,13 @@ def oblique_camera(orthographic: bool) -> Camera:
 
 @pytest.mark.parametrize("orthographic", [False, True])
 def test_a_quad_looks_as_the_billboard_of_the_same_place(orthographic: bool) -> None:
-    """One ray through each pixel's centre is what bbfit's renderer draws. Measured 1.5e-6 and 1.7e-6 of 1."""
+    """One ray through each pixel's center is what bbfit's renderer draws. Measured 1.5e-6 and 1.7e-6 of 1."""
     cloud, camera = painted_billboard(), oblique_camera(orthographic)
     mesh = quad(cloud)
     caster = RayCaster(mesh.faces, mesh.uvs)
     caster.move(mesh.vertices)
-    centres = torch.full((camera.height * camera.width, 2), 0.5)
-    seen = caster.colours(*pixel_rays(camera, centres, 1), mesh.texture / 255).reshape(camera.height, camera.width, 4)
+    centers = torch.full((camera.height * camera.width, 2), 0.5)
+    seen = caster.colors(*pixel_rays(camera, centers, 1), mesh.texture / 255).reshape(camera.height, camera.width, 4)
     expected = render(cloud, camera)
     assert expected[..., 3].max() > 0.5
     assert (seen - expected).abs().max() < 1e-5
@@ -109,7 +109,7 @@ def test_surfaces_behind_one_another_are_blended_front_to_back() -> None:
 
 
 def square(center: tuple[float, float, float], half: float) -> LearnedMesh:
-    """An opaque upright square of one colour that faces +Z."""
+    """An opaque upright square of one color that faces +Z."""
     cloud = even_upright(1, axis=torch.tensor(center), half_extents=torch.tensor([half, half]), texture_sizes=torch.tensor([2, 2]))
     return quad(cloud.with_texels(torch.tensor([0.9, 0.2, 0.1, 1.0]).expand(4, 4).contiguous()))
 
@@ -128,7 +128,7 @@ def views_of(mesh: LearnedMesh, folder: Path, *, count: int, size: int) -> ViewD
 
 
 def test_a_moved_square_comes_back_to_its_place(tmp_path: Path) -> None:
-    """Only its silhouettes can tell where a square of one colour is. Moved by 0.3, 0.2 and 0.25 m, pixels are 0.1 m wide.
+    """Only its silhouettes can tell where a square of one color is. Moved by 0.3, 0.2 and 0.25 m, pixels are 0.1 m wide.
 
     Measured with four seeds: back to within 0.013 to 0.018 m, with 0.02 to 0.03 of the loss.
     """
@@ -142,7 +142,7 @@ def test_a_moved_square_comes_back_to_its_place(tmp_path: Path) -> None:
 
 
 def painted_ball() -> LearnedMesh:
-    """An opaque ball of one metre about (0, 1.5, 0), its colours smooth in the place."""
+    """An opaque ball of one meter about (0, 1.5, 0), its colors smooth in the place."""
     ball = trimesh.creation.icosphere(3, 1.0)
     points, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
     source, corners, uvs = unfold(points, faces, 128)
@@ -153,7 +153,7 @@ def painted_ball() -> LearnedMesh:
 
 
 def test_a_mesh_is_learned_from_views_alone(tmp_path: Path) -> None:
-    """From the hull and a grey texture to a small part of the error on held-out views. Measured 0.10, and 0.12 of the loss."""
+    """From the hull and a gray texture to a small part of the error on held-out views. Measured 0.10, and 0.12 of the loss."""
     views = views_of(painted_ball(), tmp_path, count=16, size=32)
     steps: list[int] = []
     losses: list[float] = []
@@ -176,9 +176,9 @@ def test_a_mesh_is_learned_from_views_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("kind", ["plain", "painted"])
 def test_gradients_of_a_weighted_sum_of_pixels_are_exact(axis: int, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The sum grows, as a ball moves along weights that grow by 1 a pixel, by all that is seen of it times the pixels of a metre.
+    """The sum grows, as a ball moves along weights that grow by 1 a pixel, by all that is seen of it times the pixels of a meter.
 
-    For one colour, all of it comes from the silhouettes. Error measured: 0.8 %, -0.8 %, 2.5 % and 1.0 %, by few and random samples.
+    For one color, all of it comes from the silhouettes. Error measured: 0.8 %, -0.8 %, 2.5 % and 1.0 %, by few and random samples.
     """
     monkeypatch.setattr(mesh_silhouettes, "BOUNDARY_SAMPLES", 16)
     camera, grid = oblique_camera(True), 4
@@ -198,7 +198,7 @@ def test_gradients_of_a_weighted_sum_of_pixels_are_exact(axis: int, kind: str, m
     rays = pixel_rays(camera, torch.rand(32 * 40 * grid**2, 2, generator=random), grid)
     slope, moved, _ = caster.gradients(*rays, texture, grid**2, slope_of_sum)
     ordered = surface.points(surface.latent(points))
-    outer = boundary_gradient(surface, ordered, camera, slope, partial(caster.colours, texture=texture), random)
+    outer = boundary_gradient(surface, ordered, camera, slope, partial(caster.colors, texture=texture), random)
     along = camera.world_to_camera[axis, :3].float()  # the picture's axis in the world
     got = float((moved.sum(0) + outer.sum(0)) @ along)
     expected = float(camera.intrinsics[axis, axis] * seen[0].sum())
@@ -267,7 +267,7 @@ def test_nonsense_is_refused(argument: str, views_folder: Path) -> None:
 
 
 def test_the_file_holds_the_mesh_unlit_blended_and_seen_from_both_sides() -> None:
-    """Texture coordinates count from the top-left corner, as glTF's do; what is clear has a colour to be filtered with."""
+    """Texture coordinates count from the top-left corner, as glTF's do; what is clear has a color to be filtered with."""
     mesh = quad(painted_billboard())
     glb = mesh_glb(mesh)
     tree = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])

@@ -9,14 +9,14 @@ from bbfit.checks import InputError
 from bbfit.rivals.billboard_clouds import PlaneChoice, choose_planes, slabs_of
 
 
-def quad(centre: list[float], normal: list[float], width: float, height: float, cells: int = 3) -> np.ndarray:
+def quad(center: list[float], normal: list[float], width: float, height: float, cells: int = 3) -> np.ndarray:
     """A rectangle with an upright frame as triangles of equal size, [2 * cells², 3, 3]."""
     n = np.array(normal) / np.linalg.norm(normal)
     up = np.array([0.0, 1.0, 0.0]) - n[1] * n
     up /= np.linalg.norm(up)
     right = np.cross(up, n)
     x, y = (np.linspace(-side / 2, side / 2, cells + 1) for side in (width, height))
-    grid = np.array(centre) + x[:, None, None] * right + y[None, :, None] * up
+    grid = np.array(center) + x[:, None, None] * right + y[None, :, None] * up
     a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
     return np.concatenate([np.stack(corners, 2).reshape(-1, 3, 3) for corners in ((a, b, c), (a, c, d))])
 
@@ -29,7 +29,7 @@ QUADS = [
 
 
 def soup(count: int, seed: int = 0) -> np.ndarray:
-    """Small triangles of random size and direction in a box of 4 x 6 x 3 metres."""
+    """Small triangles of random size and direction in a box of 4 x 6 x 3 meters."""
     generator = np.random.default_rng(seed)
     return generator.uniform([-2, 0, -1], [2, 6, 2], (count, 1, 3)) + generator.normal(0, 0.1, (count, 3, 3))
 
@@ -48,7 +48,7 @@ def farthest(choice: PlaneChoice, triangles: np.ndarray) -> float:
 
 
 def test_quads_on_known_planes_are_found_exactly() -> None:
-    """Each plane to rounding, though none is in the discretised plane space, and each rectangle from edge to edge."""
+    """Each plane to rounding, though none is in the discretized plane space, and each rectangle from edge to edge."""
     parts = [quad(*values) for values in QUADS]
     triangles = np.concatenate(parts)
     choice = choose_planes(triangles, 3, share=1.0)
@@ -57,13 +57,13 @@ def test_quads_on_known_planes_are_found_exactly() -> None:
     found = set()
     for n, members in enumerate(choice.members):
         which = int(members[0]) // len(parts[0])
-        centre, normal, width, height = QUADS[which]
+        center, normal, width, height = QUADS[which]
         unit = np.array(normal) / np.linalg.norm(normal)
         np.testing.assert_array_equal(members, np.arange(which * 18, which * 18 + 18))
         side = np.sign(choice.normals[n] @ unit)
         np.testing.assert_allclose(choice.normals[n] * side, unit, atol=1e-9)
-        assert choice.distances[n] * side == pytest.approx(unit @ centre, abs=1e-9)
-        np.testing.assert_allclose(slabs.centers[n], centre, atol=1e-9)
+        assert choice.distances[n] * side == pytest.approx(unit @ center, abs=1e-9)
+        np.testing.assert_allclose(slabs.centers[n], center, atol=1e-9)
         np.testing.assert_allclose(slabs.half_extents[n], [width / 2, height / 2], atol=1e-9)
         frame = np.stack([slabs.rights[n], slabs.ups[n], choice.normals[n]])
         np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)

@@ -114,7 +114,7 @@ def test_trees_are_rendered_on_the_cluster_and_their_views_come_back(cluster: Cl
     assert cluster.address
     views = ViewsConfig(count=4, size=48, samples=1, denoise=False)
     grown = GrowConfig(detail=0.1, leaves=0.02)
-    stages = RunConfig(grow=grown, views=views, fit=FitConfig(billboards=2, candidates=1, revisions=0))
+    stages = RunConfig(grow=grown, views=views, fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0))
     config = SweepConfig(grid="default", steps=4, ray=cluster.address)
 
     def sweep() -> SweepResult:

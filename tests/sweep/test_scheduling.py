@@ -139,7 +139,7 @@ def test_failures_are_recorded_and_retried_when_asked(two_trees: list[Path], tmp
     shutil.copytree(two_trees[0], broken)
     (broken / "0001.png").write_bytes(b"no picture")
     config = SweepConfig(grid="default", workers=1)
-    stages = RunConfig(fit=FitConfig(billboards=2, candidates=1, revisions=0, steps=8))
+    stages = RunConfig(fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0, steps=8))
     result = run_sweep(tmp_path / "out", config, stages, trees=[bad], views=[broken, two_trees[0]])
     reasons = [row.reason for row in result.rows]
     assert "bad.glb is no glTF" in str(reasons[0])
@@ -154,7 +154,7 @@ def test_failures_are_recorded_and_retried_when_asked(two_trees: list[Path], tmp
 def test_a_failed_run_stands_until_it_is_to_be_retried(two_trees: list[Path], tmp_path: Path) -> None:
     folder = tmp_path / "out"
     config = SweepConfig(grid="default", workers=1)
-    stages = RunConfig(fit=FitConfig(billboards=2, candidates=1, revisions=0, steps=8))
+    stages = RunConfig(fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0, steps=8))
     first = run_sweep(folder, config, stages, views=two_trees[:1])
     (path,) = (folder / "results").iterdir()
     content = json.loads(path.read_text())
@@ -168,7 +168,7 @@ def test_a_failed_run_stands_until_it_is_to_be_retried(two_trees: list[Path], tm
 def test_trees_are_grown_and_rendered_once(tmp_path: Path) -> None:
     """A species and a tree's file, with views of 48 x 48 pixels by Blender; the second start finds all of them."""
     stages = RunConfig(
-        views=ViewsConfig(count=4, size=48, samples=1, denoise=False), fit=FitConfig(billboards=2, candidates=1, revisions=0)
+        views=ViewsConfig(count=4, size=48, samples=1, denoise=False), fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0)
     )
     config = SweepConfig(grid="default", workers=1, steps=4)
     told = list[tuple[str, int, int]]()
@@ -207,7 +207,7 @@ def test_species_of_ones_own_file_are_grown(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "own.json").write_text(json.dumps({"sapling": figures}))
         grown = GrowConfig(detail=0.1, leaves=0.02, species_file=tmp_path / folder / "own.json")
-        stages = RunConfig(grow=grown, views=views, fit=FitConfig(billboards=2, candidates=1, revisions=0))
+        stages = RunConfig(grow=grown, views=views, fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0))
         result = run_sweep(tmp_path / "out", SweepConfig(grid="default", workers=1, steps=4), stages, species=["sapling"])
         assert [(row.tree, row.reason) for row in result.rows] == [("sapling", None)] and result.kept == kept
 

@@ -154,7 +154,7 @@ def test_leaves_have_the_normals_of_their_own_plane() -> None:
             corners = triangles(part)
             normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-            # Counter-clockwise seen from the normal's side; float32 coordinates of 10 m tilt a triangle of some centimetres.
+            # Counter-clockwise seen from the normal's side; float32 coordinates of 10 m tilt a triangle of some centimeters.
             assert (normals[:, None] * part.normals[part.faces]).sum(-1).min() > 0.999
 
 
@@ -294,7 +294,7 @@ ODD: dict[str, dict[str, Any]] = {
     "thick": {"ratio": 0.2, "ratio_power": 0},
     "flare_and_lobes": {"flare": 10, "lobes": 100, "lobe_depth": 0.9},
     "a_kilometre": {"scale": 1000, "scale_v": 0},
-    "ten_centimetres": {"scale": 0.1, "scale_v": 0, "leaf_scale": 0.01},
+    "ten_centimeters": {"scale": 0.1, "scale_v": 0, "leaf_scale": 0.01},
     "smaller_than_its_leaves": {"scale": 0.1, "scale_v": 0},
     **{f"shape_{shape}": {"shape": shape, "base_size": (0,) * 4} for shape in range(9)},
 }

@@ -158,8 +158,8 @@ def test_lists_of_another_length_are_refused(key: str) -> None:
         ("PruneWidthPeak", 0.01, 0, "PruneWidthPeak: expected a value in (0, 1], got 0"),
         ("PruneWidthPeak", 0.99, 1, "PruneWidthPeak: expected less than 1, got 1"),
         ("BarkColor", [0, 1, 0.5], [0, 1.5, 0], "BarkColor[1]: expected a value in [0, 1], got 1.5"),
-        ("LeafColors", [[0, 0, 0]] * 16, [], "LeafColors: expected 1 to 16 colours, got 0"),
-        ("LeafColors", [[0, 0, 0]], [[0, 0, 0]] * 17, "LeafColors: expected 1 to 16 colours, got 17"),
+        ("LeafColors", [[0, 0, 0]] * 16, [], "LeafColors: expected 1 to 16 colors, got 0"),
+        ("LeafColors", [[0, 0, 0]], [[0, 0, 0]] * 17, "LeafColors: expected 1 to 16 colors, got 17"),
         ("LeafColors", [(1, 1, 1)], [[0, 0]], "LeafColors[0]: expected 3 numbers, got 2"),
     ],
 )

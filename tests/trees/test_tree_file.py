@@ -216,7 +216,7 @@ def test_the_same_scene_gives_the_same_bytes_in_every_process(tmp_path: Path) ->
 
 
 def test_changes_to_a_scene_are_written(tmp_path: Path) -> None:
-    """Another colour, and another place."""
+    """Another color, and another place."""
     scene = scene_of(sample(), name="tree")
     scene.geometry["bark"].visual.material.baseColorFactor = [51, 102, 0, 255]
     scene.apply_transform(trimesh.transformations.compose_matrix(angles=(0, np.pi / 2, 0), translate=(10, 0, 0), scale=(2, 2, 2)))

@@ -60,7 +60,7 @@ def find_tubes(bark: Part) -> Tubes:
 
 
 def beyond_bark(tubes: Tubes, points: Array, before: Indices | None = None, *, reach: float) -> tuple[Array, Array]:
-    """How far points [K, 3] are from the nearest axis, and how far beyond the tube's radius there, both in metres.
+    """How far points [K, 3] are from the nearest axis, and how far beyond the tube's radius there, both in meters.
 
     ``before`` [K] leaves only tubes of lower numbers. A point farther than ``reach`` from all axes gets infinity.
     """

@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def unlight() -> None:
-    """Let materials emit their colour in place of reflecting light: what an MTL's ``illum 0`` asks for and Blender's importer ignores."""
+    """Let materials emit their color in place of reflecting light: what an MTL's ``illum 0`` asks for and Blender's importer ignores."""
     import bpy
 
     for material in bpy.data.materials:
@@ -58,7 +58,7 @@ def unlight() -> None:
 
 
 def set_up(job: dict[str, Any]) -> None:
-    """The renderer: one sample at the centre of each pixel, nothing but what the model itself emits."""
+    """The renderer: one sample at the center of each pixel, nothing but what the model itself emits."""
     import bpy
 
     scene = bpy.context.scene
@@ -66,7 +66,7 @@ def set_up(job: dict[str, Any]) -> None:
     render.engine, cycles.device = "CYCLES", "CPU"
     cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = job["samples"], False, False
     cycles.transparent_max_bounces = TRANSPARENT_LAYERS
-    # As narrow as Blender allows; of filters of this width a Gaussian keeps nearest to the centre.
+    # As narrow as Blender allows; of filters of this width a Gaussian keeps nearest to the center.
     cycles.pixel_filter_type, cycles.filter_width = "GAUSSIAN", 0.01
     render.resolution_x, render.resolution_y, render.resolution_percentage = job["width"], job["height"], 100
     render.threads_mode, render.threads = "FIXED", 1

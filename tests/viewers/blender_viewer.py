@@ -27,7 +27,7 @@ CLIP = (1e-2, 1e2)
 def render_blender(model: Path, camera: Camera, *, samples: int = 1) -> NDArray[np.float64]:
     """Display-referred RGB over white in [0, 1] of a batch of V cameras, [V, H, W, 3]; view transform Standard.
 
-    Every sample lies at the centre of its pixel, so more than one only matters where Cycles chooses at random. Blender blends layers in
+    Every sample lies at the center of its pixel, so more than one only matters where Cycles chooses at random. Blender blends layers in
     linear light; the picture over the white is composited as bbfit does its own, display-referred.
 
     The test fails where Blender is not installed; what Blender says is the message of an ``AssertionError`` where it fails itself.
@@ -54,8 +54,8 @@ def render_blender(model: Path, camera: Camera, *, samples: int = 1) -> NDArray[
         pictures = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted(Path(folder).glob("*.png"))]
     images = np.stack(pictures)[..., [2, 1, 0, 3]] / 65535.0
     assert images.shape == (len(camera), camera.height, camera.width, 4)
-    colour, alpha = images[..., :3], images[..., 3:]
-    return colour * alpha + 1 - alpha
+    color, alpha = images[..., :3], images[..., 3:]
+    return color * alpha + 1 - alpha
 
 
 def _view(camera: Camera) -> dict[str, Any]:

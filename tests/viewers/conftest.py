@@ -26,7 +26,7 @@ def three() -> Iterator[ThreeViewer]:
 
 @pytest.fixture(scope="session")
 def around() -> Camera:
-    """Five views from around, 64 x 56 pixels, in which two metres are about 28 pixels; the axis passes beside the picture's middle."""
+    """Five views from around, 64 x 56 pixels, in which two meters are about 28 pixels; the axis passes beside the picture's middle."""
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).double() + torch.tensor([0.0, 1.0, 0.0])
     camera = Orbit(5, (12.0,)).frame(corners.numpy(), target=torch.tensor([0.0, 1.0, 0.0]).double(), width=64, height=56)
     aside = torch.tensor([[0.0, 0, 3.3], [0, 0, -2.6], [0, 0, 0]], dtype=torch.float64)

@@ -17,9 +17,9 @@ GRAIN = 8
 
 
 def noise_cloud(count: int, *, texels: int, two_sided: bool = False) -> BillboardCloud:
-    """Squares of 2 x 2 metres that cross near (0, 1, 0), turned about the vertical and leaning a little; float64.
+    """Squares of 2 x 2 meters that cross near (0, 1, 0), turned about the vertical and leaning a little; float64.
 
-    Colour and alpha are smooth noise; alpha passes through 1/2 on long curves and is 0 or 1 in parts.
+    Color and alpha are smooth noise; alpha passes through 1/2 on long curves and is 0 or 1 in parts.
     """
     generator = torch.Generator().manual_seed(0)
 

@@ -18,7 +18,7 @@ from bbfit.evaluation.metrics import psnr
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import export
 from bbfit.geometry.camera import Camera, orthographic_intrinsics
-from bbfit.images import over_colour
+from bbfit.images import over_color
 from bbfit.rendering.reference import render_reference
 
 
@@ -32,11 +32,11 @@ def test_blender_shows_a_glb(alpha: str, count: int, around: Camera, tmp_path: P
 
 
 def test_blender_shows_an_obj(around: Camera, tmp_path: Path) -> None:
-    """Blended, the only thing that an OBJ can ask for; colours are emitted, as ``illum 0`` asks and the importer does not do."""
+    """Blended, the only thing that an OBJ can ask for; colors are emitted, as ``illum 0`` asks and the importer does not do."""
     cloud = noise_cloud(1, texels=32)
     model, *_ = export(cloud, tmp_path / "model.obj")
     (glb,) = export(cloud, tmp_path / "model.glb")
-    # Measured 60.5 dB: the importer has Blender filter premultiplied colours. Lit and without light, as it comes, it has 17.4.
+    # Measured 60.5 dB: the importer has Blender filter premultiplied colors. Lit and without light, as it comes, it has 17.4.
     assert psnr(expected(glb, around), render_blender(model, around)) >= 48
 
 
@@ -46,5 +46,5 @@ def test_blender_shows_a_parallel_projection(around: Camera, tmp_path: Path) -> 
     intrinsics = orthographic_intrinsics(2.6, 64, 56) + torch.tensor([[0.0, 0, 3.3], [0, 0, -2.6], [0, 0, 0]])
     camera = Camera(around.world_to_camera[:1], intrinsics[None], 64, 56, orthographic=True)
     (glb,) = export(cloud, tmp_path / "model.glb")
-    target = over_colour(render_reference(cloud, camera)).numpy()
+    target = over_color(render_reference(cloud, camera)).numpy()
     assert psnr(target, render_blender(glb, camera)) >= 48  # measured 61.3, of the exporter's 8 bits; half a pixel of shift leaves 35

@@ -20,7 +20,7 @@ from bbfit.exporting.model import as_shipped, export, shipped_cards
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import fit
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import over_colour
+from bbfit.images import over_color
 from bbfit.rendering.dispatch import render
 from bbfit.views import ViewDataset
 
@@ -37,13 +37,13 @@ def views() -> ViewDataset:
 @pytest.fixture(scope="module")
 def fits(views: ViewDataset) -> dict[str, BillboardCloud]:
     """Four crossing billboards fitted for either mode."""
-    config = FitConfig(billboards=4, placement="even", placement_rate=0, steps=400)
+    config = FitConfig(billboards=4, placement="even", placement_learning_rate=0, steps=400)
     return {alpha: fit(views, replace(config, alpha=alpha)).cloud for alpha in ("mask", "blend")}  # type: ignore[arg-type]
 
 
 def psnrs(pictures: NDArray[np.float64], cloud: BillboardCloud, views: ViewDataset) -> tuple[float, float, float]:
     """Of a viewer's pictures: against bbfit's own renders, against the targets, and of bbfit's renders against the targets."""
-    pairs = [[over_colour(picture).numpy() for picture in held_out(cloud, views.test, index)] for index in range(len(views.test))]
+    pairs = [[over_color(picture).numpy() for picture in held_out(cloud, views.test, index)] for index in range(len(views.test))]
     against_render = metrics.psnr(np.stack([render for _, render in pairs]), pictures)
     against_target = float(np.mean([metrics.psnr(target, picture) for (target, _), picture in zip(pairs, pictures, strict=True)]))
     return against_render, against_target, evaluate(cloud, views.test).mean.over_white.psnr
@@ -64,7 +64,7 @@ def test_three_shows_what_was_scored(
     _, score, told = psnrs(show.images, shipped, views)
     assert abs(score - told) <= SCORE
     cameras = views.test.cameras.resized(2 * views.test.cameras.width, 2 * views.test.cameras.height)
-    own = [over_colour(render(shipped, cameras[index]).double()).numpy() for index in range(len(cameras))]
+    own = [over_color(render(shipped, cameras[index]).double()).numpy() for index in range(len(cameras))]
     assert metrics.psnr(np.stack(own), three.render(path, cameras)) >= LEAST
     assert {(material.transparent, material.alpha_test > 0) for material in show.materials} == {(alpha == "blend", alpha == "mask")}
 
@@ -95,7 +95,7 @@ def test_three_shows_mip_levels_as_dense_as_the_views_from_afar(
     for halving in (1, 2, 3):
         cameras = views.test.cameras.resized(width >> halving, height >> halving)
         shown = three.render(path, cameras)
-        own, without = (over_colour(draw_cards(each, cameras).double()).numpy() for each in (cards, replace(cards, chain=None)))
+        own, without = (over_color(draw_cards(each, cameras).double()).numpy() for each in (cards, replace(cards, chain=None)))
         assert metrics.psnr(own, shown) >= max(21, metrics.psnr(without, shown) + 4)
         assert float((shown < 1).any(-1).mean()) / wanted == pytest.approx(1, abs=0.05)
 

@@ -26,7 +26,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import export
 from bbfit.geometry.camera import Camera, orthographic_intrinsics
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import encode_png, over_colour
+from bbfit.images import encode_png, over_color
 from bbfit.rendering.reference import render_reference
 
 BILINEAR = 9729
@@ -75,7 +75,7 @@ def test_three_shows_a_parallel_projection(three: ThreeViewer, around: Camera, t
     intrinsics = orthographic_intrinsics(2.6, 64, 56) + torch.tensor([[0.0, 0, 3.3], [0, 0, -2.6], [0, 0, 0]])
     camera = Camera(around.world_to_camera[:1], intrinsics[None], 64, 56, orthographic=True)
     (glb,) = export(cloud, tmp_path / "model.glb", ExportConfig(alpha="blend"))
-    target = over_colour(render_reference(cloud, camera)).numpy()
+    target = over_color(render_reference(cloud, camera)).numpy()
     assert psnr(target, three.render(with_min_filter(glb, BILINEAR), camera)) >= 45  # measured 55.3; half a pixel of shift leaves 35
 
 
@@ -103,7 +103,7 @@ def test_three_shows_one_node_alone(three: ThreeViewer, around: Camera, tmp_path
 
 
 def test_three_shows_textures_in_ktx2(three: ThreeViewer, around: Camera, tmp_path: Path) -> None:
-    """Blocks of 4 x 4 texels of one colour each, which Basis Universal holds without loss, look as they do in a PNG."""
+    """Blocks of 4 x 4 texels of one color each, which Basis Universal holds without loss, look as they do in a PNG."""
     (glb,) = export(noise_cloud(1, texels=32), tmp_path / "model.glb", ExportConfig(alpha="mask"))
     blocks = np.ascontiguousarray(read_glb(glb)[2][::4, ::4])
 
@@ -119,18 +119,18 @@ def test_three_shows_textures_in_ktx2(three: ThreeViewer, around: Camera, tmp_pa
 
     png, basis = (edit_glb(glb, tmp_path / f"{change.__name__}.glb", change) for change in (as_png, as_ktx2))
     show = three.show(with_min_filter(basis, BILINEAR), around)
-    # Measured: not a byte of difference, but compressed formats of other GPUs round colours.
+    # Measured: not a byte of difference, but compressed formats of other GPUs round colors.
     assert psnr(three.render(with_min_filter(png, BILINEAR), around), show.images) >= 40
     assert show.materials[0].size == (4 * blocks.shape[1], 4 * blocks.shape[0])
 
 
 def ktx2(blocks: NDArray[np.uint8]) -> bytes:
-    """A KTX 2.0 file of one level in UASTC from one colour a block, [h, w, 4]: its mode 8, which is all that this writes."""
+    """A KTX 2.0 file of one level in UASTC from one color a block, [h, w, 4]: its mode 8, which is all that this writes."""
     mode_8, uastc, bt709, srgb, rgba = 0x17, 166, 1, 2, 3
     height, width = (4 * side for side in blocks.shape[:2])
     words = (mode_8 | r << 5 | g << 13 | b << 21 | a << 29 for r, g, b, a in blocks.reshape(-1, 4).tolist())
     data = b"".join(word.to_bytes(16, "little") for word in words)
-    # The data format descriptor: colour model, size of a block less 1, bytes a block, and one sample that fills it.
+    # The data format descriptor: color model, size of a block less 1, bytes a block, and one sample that fills it.
     form = struct.pack("<4H12B", 0, 0, 2, 40, uastc, bt709, srgb, 0, 3, 3, 0, 0, 16, 0, 0, 0)
     form = struct.pack("<I", 44) + form + bytes(4) + struct.pack("<HBBIII", 0, 127, rgba, 0, 0, 2**32 - 1)
     start = 80 + 24

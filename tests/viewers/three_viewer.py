@@ -42,7 +42,7 @@ class ThreeMaterial:
     side: str
     """``front`` (back faces are culled), ``back`` or ``double``."""
     size: tuple[int, int] | None
-    """Width and height of its colour texture, if it has one."""
+    """Width and height of its color texture, if it has one."""
     min_filter: int | None
     """glTF's number of the minification filter."""
     mag_filter: int | None
@@ -121,7 +121,7 @@ def open_three() -> Iterator[ThreeViewer]:
 def projection_matrix(camera: Camera, near: float, far: float) -> NDArray[np.float64]:
     """OpenGL's projection of one camera, [4, 4]: from its axes as OpenGL has them (+Y up, -Z forward) to clip coordinates.
 
-    Pixel x, whose centre is the whole number, lies at (2 x + 1) / width - 1 of OpenGL's picture, which reaches from -1 to 1.
+    Pixel x, whose center is the whole number, lies at (2 x + 1) / width - 1 of OpenGL's picture, which reaches from -1 to 1.
     """
     to_clip = np.array([[2 / camera.width, 0, 1 / camera.width - 1], [0, -2 / camera.height, 1 - 1 / camera.height], [0, 0, 1]])
     x, y, w = to_clip @ camera.camera_to_pixel.double().numpy()

@@ -105,6 +105,6 @@ def halves(picture: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.in
     return picture[:, :width], picture[:, width:]
 
 
-def coloured(picture: NDArray[np.int64]) -> NDArray[np.bool_]:
+def colored(picture: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Where a tree or an outline is, [H, W]."""
     return picture.min(-1) < DARK

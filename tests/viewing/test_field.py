@@ -35,7 +35,7 @@ def test_every_tree_stands_on_the_ground_upright_and_apart() -> None:
     np.testing.assert_allclose(feet[:, 1], 1.0, atol=1e-4)
     np.testing.assert_allclose(tops - feet, field.scales[:, None] * UP, atol=1e-4)
     away = np.linalg.norm(feet[:, None] - feet[None], axis=-1) + 1e9 * np.eye(400)
-    assert away.min() > 1.05 * 4.0 * (1 - 2 * 0.35) - 1e-3  # neighbours on the grid that are both shaken towards each other
+    assert away.min() > 1.05 * 4.0 * (1 - 2 * 0.35) - 1e-3  # neighbors on the grid that are both shaken towards each other
     assert np.ptp(feet[:, 0]) <= field.side
 
 

@@ -11,7 +11,7 @@ from urllib.parse import urlparse
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from page_browser import Tab, coloured, halves, wait_for
+from page_browser import Tab, colored, halves, wait_for
 
 from bbfit.viewing.page import Page
 from bbfit.viewing.panel import BILLBOARDS, BOTH, BY_DISTANCE, FIELD, ORIGINAL
@@ -49,11 +49,11 @@ def foot(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def test_both_trees_stand_in_the_same_place_of_their_panes(seen: Seen) -> None:
-    """From one camera: what is seen of them coincides, and they have about the same colour."""
+    """From one camera: what is seen of them coincides, and they have about the same color."""
     left, right = halves(seen[2].still())
-    ours, theirs = coloured(right), coloured(left)
+    ours, theirs = colored(right), colored(left)
     assert theirs.mean() > 0.02
-    # Measured: a pane is 288 pixels wide, the trunks' feet are within a pixel of each other, the silhouettes' IoU is 0.53, the colours
+    # Measured: a pane is 288 pixels wide, the trunks' feet are within a pixel of each other, the silhouettes' IoU is 0.53, the colors
     # differ by 10. Crowns of four planes do not reach as far as the tree's everywhere.
     np.testing.assert_allclose(foot(ours), foot(theirs), atol=2)
     assert (ours & theirs).sum() / (ours | theirs).sum() > 0.4
@@ -63,8 +63,8 @@ def test_both_trees_stand_in_the_same_place_of_their_panes(seen: Seen) -> None:
 def test_the_trees_stand_upright_on_the_ground(seen: Seen) -> None:
     """The trunk is narrow and below, the crown above; the camera looks a little down at the tree's middle."""
     left, _ = halves(seen[2].still())
-    low, high = box(coloured(left))[:2]
-    widths = coloured(left).sum(1)
+    low, high = box(colored(left))[:2]
+    widths = colored(left).sum(1)
     assert widths[high - (high - low) // 10 : high].mean() < 0.3 * widths[low : (low + high) // 2].mean()
     assert abs((low + high) / 2 - left.shape[0] / 2) < 0.1 * left.shape[0]
 
@@ -89,7 +89,7 @@ def test_outlines_are_drawn_around_the_billboards_alone_by_a_click(seen: Seen) -
     wait_for(lambda: visitor.panel.outlines.value)
     after = halves(tab.still())
     np.testing.assert_array_equal(before[0], after[0])
-    assert (coloured(after[1]) & ~coloured(before[1])).sum() > 300
+    assert (colored(after[1]) & ~colored(before[1])).sum() > 300
 
 
 @pytest.mark.parametrize("alpha", ["blend", "hash"])
@@ -110,7 +110,7 @@ def test_one_at_a_time_either_fills_the_picture(seen: Seen) -> None:
     original = tab.still()
     visitor.panel.show.value = BILLBOARDS
     billboards = tab.still()
-    ours, theirs = coloured(billboards), coloured(original)
+    ours, theirs = colored(billboards), colored(original)
     assert (ours & theirs).sum() / (ours | theirs).sum() > 0.4
     assert abs(box(theirs)[2:].mean() - original.shape[1] / 2) < 20
     assert tab.text("#bbfit-label-0").startswith("4 billboards")
@@ -119,14 +119,14 @@ def test_one_at_a_time_either_fills_the_picture(seen: Seen) -> None:
 def test_the_level_follows_the_distance(seen: Seen) -> None:
     """Near, the original stands in both panes; from where its error does not show, the billboards do."""
     _, visitor, tab = seen
-    (distance,) = [level.distance(visitor.picture.pixels_a_metre(1.0)) for level in visitor.subject.clouds]
+    (distance,) = [level.distance(visitor.picture.pixels_a_meter(1.0)) for level in visitor.subject.clouds]
     assert distance is not None
     visitor.panel.level.value = BY_DISTANCE
-    visitor.panel.metres.value = 0.9 * distance
+    visitor.panel.meters.value = 0.9 * distance
     wait_for(lambda: tab.text("#bbfit-label-1").startswith("original"))
     left, right = halves(tab.still())
     assert abs(left - right).max() <= 24  # measured: 12, where lines of the ground are thinner than a pixel
-    visitor.panel.metres.value = 1.1 * distance
+    visitor.panel.meters.value = 1.1 * distance
     wait_for(lambda: tab.text("#bbfit-label-1").startswith("4 billboards"))
     left, right = halves(tab.still())
     assert abs(left - right).max() > 24
@@ -136,14 +136,14 @@ def test_slider_and_camera_follow_each_other(seen: Seen) -> None:
     _, visitor, tab = seen
     visitor.panel.slider.value = 120
     assert visitor.distance == pytest.approx(visitor.panel.reach.distance(120), rel=1e-6)
-    assert visitor.panel.metres.value == pytest.approx(visitor.distance, rel=1e-3)
-    far = visitor.panel.metres.value
+    assert visitor.panel.meters.value == pytest.approx(visitor.distance, rel=1e-3)
+    far = visitor.panel.meters.value
     tab.still()  # the browser's camera is there
 
     def nearer() -> bool:
         tab.do(lambda page: (page.mouse.move(150, 200), page.mouse.wheel(0, -600)))  # towards the tree
         time.sleep(0.5)
-        return visitor.panel.metres.value < 0.9 * far
+        return visitor.panel.meters.value < 0.9 * far
 
     wait_for(nearer)
     wait_for(lambda: visitor.panel.slider.value == visitor.panel.reach.step(visitor.distance))
@@ -164,7 +164,7 @@ def test_ten_thousand_trees_and_the_time_of_a_frame(seen: Seen) -> None:
     # Those in front of the camera: 8 triangles each, and the ground.
     assert 10_000 < frame["triangles"] <= 80_000 + 2
     assert frame["calls"] <= len(planted.counts) + 2
-    assert coloured(picture)[picture.shape[0] // 2 :].mean() > 0.3
+    assert colored(picture)[picture.shape[0] // 2 :].mean() > 0.3
     assert re.search(r"\d ms a frame \(\d+ a second\) · drawing takes \d", tab.text("#bbfit-frame"))
     # Frames that are drawn one after the other come no faster than they are drawn.
     assert len(frame["intervals"]) > 0

@@ -95,13 +95,13 @@ def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
 
 def lod_folder(folder: Path, cloud: BillboardCloud, *, original: bool = True) -> Path:
     """A folder as bbfit lod leaves it: two billboards from 10 m, one from 40 m, for a screen whose focal length is 1000 pixels."""
-    levels = [{"planes": None, "distance_metres": 0.0}] if original else []
+    levels = [{"planes": None, "distance_meters": 0.0}] if original else []
     for planes, distance in ((2, 10.0 if original else 0.0), (1, 40.0)):
         (folder / str(planes)).mkdir(parents=True)
         cloud.take(range(planes)).save(folder / str(planes) / "cloud.safetensors")
         record = {"source": str(folder / "views"), "config": {"tree": str(DATA / "tree.glb"), "export": {"profile": "three"}}}
         (folder / str(planes) / "run.json").write_text(json.dumps(record))
-        levels.append({"planes": planes, "distance_metres": distance})
+        levels.append({"planes": planes, "distance_meters": distance})
     config = {"screen_height": 2000, "screen_fov_degrees": 90.0}
     (folder / "lod.json").write_text(json.dumps({"config": config, "levels": levels}))
     return folder

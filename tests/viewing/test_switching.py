@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bbfit.evaluation.silhouettes import worst_silhouette
-from bbfit.fitting.initialize import pixels_a_metre
+from bbfit.fitting.initialize import pixels_a_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.viewing.levels import Level, choose_level, choose_levels, field_levels, takes_over
 from bbfit.views import ViewDataset
@@ -31,9 +31,9 @@ def test_a_cloud_takes_over_where_its_error_is_a_pixel(views_folder: Path, known
     moved = BillboardCloud(**{**vars(known_cloud), "centers": known_cloud.centers + torch.tensor([0.4, 0.0, 0.0])})
     error = worst_silhouette(moved, views)
     assert error > 2
-    assert takes_over(moved, views) == pytest.approx(float(pixels_a_metre(views.cameras)) / (1.15 * error))
-    assert takes_over(known_cloud, views) == float(pixels_a_metre(views.cameras))
-    assert takes_over(moved, views, stop=lambda: True) == float(pixels_a_metre(views.cameras))
+    assert takes_over(moved, views) == pytest.approx(float(pixels_a_meter(views.cameras)) / (1.15 * error))
+    assert takes_over(known_cloud, views) == float(pixels_a_meter(views.cameras))
+    assert takes_over(moved, views, stop=lambda: True) == float(pixels_a_meter(views.cameras))
 
 
 def test_far_trees_of_a_field_have_halved_textures(known_cloud: BillboardCloud) -> None:

@@ -67,7 +67,7 @@ def test_pictures_are_few_but_the_last_is_among_them(known_cloud: BillboardCloud
     assert taken == [1, 100]
 
 
-def test_previews_have_fewer_texels_of_the_same_colour(known_cloud: BillboardCloud, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_previews_have_fewer_texels_of_the_same_color(known_cloud: BillboardCloud, monkeypatch: pytest.MonkeyPatch) -> None:
     texels = known_cloud.texels.clone()
     texels[:] = torch.tensor([0.2, 0.6, 0.4, 0.5])
     flat = replace(known_cloud, texels=texels)
