@@ -183,8 +183,8 @@ def evaluate_command(
     from bbfit.exporting.model import as_shipped, shipped_cards
     from bbfit.files import output_folder
     from bbfit.geometry.cloud import BillboardCloud
-    from bbfit.pipeline import original_tree, with_model
     from bbfit.reporting.tables import report_table
+    from bbfit.stages.results import original_tree, with_model
     from bbfit.views import ViewDataset
 
     billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
