@@ -11,7 +11,6 @@ import cv2
 import pytest
 import torch
 
-from bbfit.stages import billboards
 from bbfit.budget import choice
 from bbfit.budget.choice import Trial
 from bbfit.budget.config import BudgetConfig
@@ -19,6 +18,7 @@ from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.pipeline import RunConfig, RunResult, run
+from bbfit.stages import billboards
 
 VIEWS = Path(__file__).resolve().parents[1] / "data" / "views"
 FIT = FitConfig(placement="even", steps=6, views_per_step=1)

@@ -11,10 +11,10 @@ import torch
 import trimesh
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.tree_files.tree_file import UP_AXES
 from bbfit.blender.views_folder import render_views
 from bbfit.files import read_json
 from bbfit.images import read_rgba
+from bbfit.tree_files.tree_file import UP_AXES
 from bbfit.views import ViewDataset
 
 from .conftest import FORMATS, SMALL, box, run_in_blender, thing
