@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from bbfit.exporting.cards import Cards, cloud_cards
+from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import with_hulls
@@ -14,6 +14,7 @@ from bbfit.exporting.obj import mtl_bytes, obj_bytes
 from bbfit.exporting.splitting import split
 from bbfit.files import write_bytes
 from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png
 from bbfit.model_files import check_model_path
