@@ -12,13 +12,13 @@ from bbfit.blender.sources import check_tree
 from bbfit.blender.views_folder import render_views
 from bbfit.checks import fail
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
-from bbfit.exporting.cards import Cards
 from bbfit.exporting.config import LodConfig
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.lod import LodLevel, glb_counts, lod_glb, stands_alone
 from bbfit.exporting.model import shipped_cards
 from bbfit.files import output_folder, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_a_meter
+from bbfit.geometry.cards import Cards
 from bbfit.pipeline import Progress, RunConfig, RunResult, export_config, run
 from bbfit.reporting.plots import lod_picture
 from bbfit.views import ViewDataset

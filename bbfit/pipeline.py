@@ -20,17 +20,17 @@ from bbfit.checks import InputError, check_file, fail
 from bbfit.evaluation.report import Report
 from bbfit.evaluation.scoring import OriginalTree, evaluate
 from bbfit.evaluation.sizes import score_sizes
-from bbfit.exporting.cards import Cards
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.drawing import draw_cards
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import overdraw
 from bbfit.exporting.model import as_shipped, shipped_cards, shows_from, write_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
+from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.records import Record, hash_file, hash_inputs, plain, record_head
+from bbfit.rendering.cards import draw_cards
 from bbfit.rendering.dispatch import render
 from bbfit.reporting.html import RunFacts, report_page
 from bbfit.reporting.plots import Cost, comparison_picture, loss_plot, pareto_plot

@@ -8,9 +8,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from bbfit.exporting.cards import Cards, cloud_cards
+from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.drawing import draw_cards
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import overdraw, with_hulls
 from bbfit.exporting.mip_matching import reduced, with_mips
@@ -19,9 +18,11 @@ from bbfit.exporting.splitting import split
 from bbfit.files import write_bytes
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
+from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png
 from bbfit.model_files import check_model_path
+from bbfit.rendering.cards import draw_cards
 from bbfit.rendering.dispatch import render
 
 

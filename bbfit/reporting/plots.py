@@ -15,12 +15,12 @@ from bbfit.checks import check_count, fail
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import held_out, view_angles
 from bbfit.evaluation.sizes import shrunk
-from bbfit.exporting.cards import Cards
-from bbfit.exporting.drawing import draw_cards
 from bbfit.exporting.lod import LodLevel
 from bbfit.files import write_bytes
+from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png, over_color, to_bytes
+from bbfit.rendering.cards import draw_cards
 from bbfit.views import ViewSet
 
 if TYPE_CHECKING:
