@@ -13,12 +13,10 @@ from bbfit.blender.views_folder import render_views
 from bbfit.checks import fail
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import LodConfig
-from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.lod import LodLevel, glb_counts, lod_glb, stands_alone
-from bbfit.exporting.model import shipped_cards
+from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import output_folder, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_a_meter
-from bbfit.geometry.cards import Cards
 from bbfit.pipeline import Progress, RunConfig, RunResult, export_config, run
 from bbfit.reporting.plots import lod_picture
 from bbfit.views import ViewDataset
@@ -88,18 +86,18 @@ def build_lod(
         export = replace(export, textures="auto")  # from afar is where mip levels matter
     places = _places(views, runs, config)
     tell("join", 0, len(runs) + 1)
-    cards = list[Cards]()
+    models, shipped = [original.read_bytes()] if original else [], list[ShippedModel]()
     for number, (fitted, place) in enumerate(zip(runs, places, strict=True), 1):
-        cards.append(shipped_cards(fitted.cloud, export, place.halvings))
+        shipped.append(shipped_model(fitted.cloud, export, place.halvings))
+        models.append(shipped[-1].glb)
         tell("join", number, len(runs) + 1)
-    models = ([original.read_bytes()] if original else []) + [glb_bytes(each, export) for each in cards]
     if original:
         places.insert(0, _Place(math.inf, 0.0, 0.0, 0))
     fits = [None] * (len(models) - len(runs)) + runs
     levels = _levels(views, models, fits, places, config, out.stem)
     write_bytes(out, lod_glb(models, levels))
     write_json(folder / "lod.json", {"config": asdict(config), "levels": [asdict(level) for level in levels]})
-    lod_picture(list(zip(levels[-len(cards) :], cards, strict=True)), views.test, folder / "lod.png")
+    lod_picture(list(zip(levels[-len(shipped) :], shipped, strict=True)), views.test, folder / "lod.png")
     tell("join", len(runs) + 1, len(runs) + 1)
     return LodResult(out, folder, levels)
 

@@ -7,7 +7,7 @@ import io
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cache
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -18,27 +18,22 @@ from bbfit.budget.choice import Choice, Trial, choose, within_bytes
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, check_file, fail
 from bbfit.evaluation.report import Report
-from bbfit.evaluation.scoring import OriginalTree, evaluate
-from bbfit.evaluation.sizes import score_sizes
+from bbfit.evaluation.scoring import OriginalTree, evaluate_model
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
-from bbfit.exporting.hulls import overdraw
-from bbfit.exporting.model import as_shipped, shipped_cards, shows_from, write_model
+from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
-from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.records import Record, hash_file, hash_inputs, plain, record_head
-from bbfit.rendering.cards import draw_cards
-from bbfit.rendering.dispatch import render
 from bbfit.reporting.html import RunFacts, report_page
 from bbfit.reporting.plots import Cost, comparison_picture, loss_plot, pareto_plot
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.growth import grow
 from bbfit.trees.species import Species, load_species
 from bbfit.trees.tree_file import write_tree
-from bbfit.views import ViewDataset, ViewSet
+from bbfit.views import ViewDataset
 
 # The parts of a configuration that are options of stages.
 _STAGES = ("grow", "views", "fit", "budget", "export")
@@ -125,11 +120,10 @@ def run(
         asked, missed = choice.config, None if choice.met else config.budget.target_psnr
         record.head["config"]["fit"] = plain(asdict(asked))  # what is fitted where that was left to a budget
     cloud = _fit(views, tree, record, asked, (config.budget.most_bytes, exported), tell, on_step)
-    cards = cache(lambda: shipped_cards(cloud, exported))
-    _export(cards, record, exported, tell)
-    shipped = as_shipped(cloud, exported)
-    report = _evaluate(shipped, cards, views, tree, record, tell)
-    _page(report, shipped, cards, views, exported, record, tell)
+    model = shipped_model(cloud, exported)
+    _export(model, record, tell)
+    report = _evaluate(model, views, tree, record, tell)
+    _page(report, model, views, record, tell)
     return RunResult(record.folder, cloud, report, tuple(record.skipped), missed)
 
 
@@ -168,20 +162,6 @@ def _prepare(source: str | Path | None, out: str | Path, config: RunConfig, tell
     views = _render(source, record, config.views, tell)
     readable = source.suffix.lower() in MESH_SUFFIXES  # else only Blender can read it; the views tell enough
     return record, source if readable else None, views
-
-
-def with_model(
-    report: Report, cloud: BillboardCloud, cards: Cards, views: ViewSet, *, on_size: Callable[[int, int], None] | None = None
-) -> Report:
-    """The report with what a model file has and shows in pictures of 1 to 1/16 of the held-out views' size.
-
-    ``cloud`` and ``cards`` are what ships (:func:`~bbfit.exporting.model.as_shipped`, :func:`~bbfit.exporting.model.shipped_cards`).
-    Without mip levels they show the same, and the cloud is drawn faster. ``on_size`` is called after each size with the number of sizes
-    done and of all.
-    """
-    vertices = replace(report.vertices, model=cards.vertex_count)
-    sizes = score_sizes(lambda camera: draw_cards(cards, camera) if cards.chain else render(cloud, camera), views, on_size=on_size)
-    return replace(report, vertices=vertices, overdraw=overdraw(cards, shows_from(cards)), sizes=sizes)
 
 
 def original_tree(views: ViewDataset, tree: Path | None = None) -> OriginalTree:
@@ -319,51 +299,35 @@ def _fit(
     return cloud
 
 
-def _export(cards: Callable[[], Cards], record: Record, config: ExportConfig, tell: Progress) -> None:
-    inputs = hash_inputs("export", asdict(config.resolve()), hash_file(record.folder / "cloud.safetensors"))
+def _export(model: ShippedModel, record: Record, tell: Progress) -> None:
+    inputs = hash_inputs("export", asdict(model.config), hash_file(record.folder / "cloud.safetensors"))
     if record.stands("export", inputs):
         return
     begun, written = time.perf_counter(), list[Path]()
     for step, suffix in enumerate((".glb", ".obj"), 1):
-        written += write_model(cards(), record.folder / f"model{suffix}", config)
+        written += model.save(record.folder / f"model{suffix}")
         tell("export", step, 2)
     record.done("export", inputs, [path.name for path in written], time.perf_counter() - begun)
 
 
-def _evaluate(
-    cloud: BillboardCloud, cards: Callable[[], Cards], views: ViewDataset, tree: Path | None, record: Record, tell: Progress
-) -> Report:
-    """The score of the cloud in the alpha mode that its model has."""
+def _evaluate(model: ShippedModel, views: ViewDataset, tree: Path | None, record: Record, tell: Progress) -> Report:
     path = record.folder / "metrics.json"
     results = [hash_file(record.folder / name) for name in ("cloud.safetensors", "model.glb")]
-    inputs = hash_inputs("evaluate", results, asdict(cloud.alpha), views.fingerprint, None if tree is None else hash_file(tree))
+    inputs = hash_inputs("evaluate", results, asdict(model.cloud.alpha), views.fingerprint, None if tree is None else hash_file(tree))
     if record.stands("evaluate", inputs):
         return Report.load(path)
     begun = time.perf_counter()
-    report = evaluate(
-        cloud,
-        views.test,
-        original=original_tree(views, tree),
-        model_bytes=(record.folder / "model.glb").stat().st_size,
-        seconds={name: seconds for name, seconds in record.seconds.items() if name not in ("evaluate", "report")},
-        on_view=lambda done, total: tell("evaluate", done, total),
-    )
-    report = with_model(report, cloud, cards(), views.test, on_size=lambda done, total: tell("sizes", done, total))
+    on_progress = partial(tell, "evaluate")
+    report = evaluate_model(model, views.test, original=original_tree(views, tree), on_progress=on_progress)
+    earlier = {name: seconds for name, seconds in record.seconds.items() if name not in ("evaluate", "report")}
+    report = replace(report, seconds={**earlier, **report.seconds})
     report.save(path)
-    comparison_picture(cloud, views.test, record.folder / "comparison.png")
+    comparison_picture(model, views.test, record.folder / "comparison.png")
     record.done("evaluate", inputs, [path.name, "comparison.png"], time.perf_counter() - begun)
     return report
 
 
-def _page(
-    report: Report,
-    cloud: BillboardCloud,
-    cards: Callable[[], Cards],
-    views: ViewDataset,
-    export: ExportConfig,
-    record: Record,
-    tell: Progress,
-) -> None:
+def _page(report: Report, model: ShippedModel, views: ViewDataset, record: Record, tell: Progress) -> None:
     """``report.html``, made anew when what it shows has changed."""
     path, head = record.folder / "report.html", record.head
     pareto = record.folder / "pareto.png" if "budget" in record.stages and any(head["config"]["budget"].values()) else None
@@ -383,10 +347,10 @@ def _page(
         versions=head["versions"],
         losses=[float(row["loss"]) for row in csv.DictReader((record.folder / "loss.csv").read_text().splitlines())],
         pareto=pareto.read_bytes() if pareto else None,
-        cut_up=bool(export.resolve().split),
+        cut_up=bool(model.config.split),
     )
-    readable = replace(export, textures="webp", fallback=False, mip_files=False)  # by browsers
-    page = report_page(report, cloud, views.test, facts, glb_bytes(cards(), readable))
+    readable = replace(model.config, textures="webp", fallback=False, mip_files=False)  # by browsers
+    page = report_page(report, model, views.test, facts, glb_bytes(model.cards, readable))
     write_bytes(path, page.encode())
     record.done("report", inputs, [path.name], time.perf_counter() - begun)
     tell("report", 1, 1)

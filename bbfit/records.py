@@ -15,7 +15,7 @@ from bbfit.files import read_json, write_json
 
 RECORD_FILE = "run.json"
 """The record's name in a run's folder."""
-STAGE_VERSIONS = {"grow": 1, "budget": 3, "fit": 8, "export": 3, "evaluate": 6, "report": 1}
+STAGE_VERSIONS = {"grow": 1, "budget": 3, "fit": 8, "export": 3, "evaluate": 7, "report": 1}
 """Raise a stage's number when its results change for the same inputs, so that old results are made anew."""
 _PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headless", "bpy", "trimesh", "xatlas", "scikit-image", "warp-lang")
 

@@ -16,7 +16,7 @@ _MARGIN = 1.15
 
 
 def worst_silhouette(cloud: BillboardCloud, views: ViewSet, *, stop: Callable[[], bool] = lambda: False) -> float:
-    """The largest :func:`~bbfit.evaluation.metrics.silhouette_distance` between a cloud and a view, in pixels of the views; 0 without views.
+    """The largest :func:`~bbfit.evaluation.metrics.silhouette_distance` between a cloud and a view, in pixels; 0 without views.
 
     Parameters
     ----------
