@@ -17,10 +17,8 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, fail
 from bbfit.evaluation.report import Measures, mean_measures
 from bbfit.evaluation.scoring import held_out, score_views
-from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.lod import glb_counts
-from bbfit.exporting.model import as_shipped, shipped_cards
+from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_a_meter
@@ -219,19 +217,20 @@ class _Comparison:
             self._on_progress(f"{folder.name} {stage}", done, total, note)
 
         result = run(self._folder / "views", folder / "run", replace(stages, tree=self._tree.path), on_progress=report)
-        shipped = as_shipped(result.cloud, self._stages.export)
+        shipped = shipped_model(result.cloud, self._stages.export)
         seconds = sum(result.report.seconds.get(stage, 0.0) for stage in ("budget", "fit", "export"))
         model = (folder / "run" / "model.glb").read_bytes()
         return _Made(model, result.report.vertices.model or 0, seconds, lambda index: self._drawn(shipped, index), len(result.cloud))
 
-    def _drawn(self, cloud: BillboardCloud, index: int) -> Tensor:
-        return held_out(cloud, self._views.test, index)[1]
+    def _drawn(self, model: ShippedModel, index: int) -> Tensor:
+        return held_out(model.draw, self._views.test, index)[1]
 
     def _baked(self, bake: Callable[..., BillboardCloud], folder: Path) -> _Made:
         begun = time.perf_counter()
         cloud = bake(self._tree, config=self._bake, folder=folder / "baked", on_progress=self._on(folder, "bake"))
-        model = _model(cloud)
-        return _Made(model, glb_counts(model)[0], time.perf_counter() - begun, lambda index: self._drawn(cloud, index), len(cloud))
+        model = shipped_model(cloud)
+        vertices = glb_counts(model.glb)[0]
+        return _Made(model.glb, vertices, time.perf_counter() - begun, lambda index: self._drawn(model, index), len(cloud))
 
     def _sliced(self, folder: Path) -> _Made:
         begun = time.perf_counter()
@@ -243,7 +242,7 @@ class _Comparison:
             folder=folder / "baked",
             on_progress=self._on(folder, "bake"),
         )
-        model = _model(BillboardCloud.joined(made.clouds))
+        model = shipped_model(BillboardCloud.joined(made.clouds)).glb
         cameras, planes = self._views.test.cameras, sum(map(len, made.clouds))
         note = "two slicings of the six are drawn at a time and their pictures mixed, which takes a shader"
         return _Made(model, made.vertex_count, time.perf_counter() - begun, lambda index: made.draw(cameras[index]), planes, note)
@@ -312,9 +311,3 @@ class _Comparison:
 
     def _on(self, folder: Path, what: str) -> Callable[[int, int], None]:
         return lambda done, total: self._on_progress(f"{folder.name} {what}", done, total)
-
-
-def _model(cloud: BillboardCloud) -> bytes:
-    """A cloud as GLB, as bbfit writes its own."""
-    export = ExportConfig()
-    return glb_bytes(shipped_cards(cloud, export), export)

@@ -9,11 +9,9 @@ from pathlib import Path
 
 from bbfit.checks import fail
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
-from bbfit.exporting.cards import Cards
 from bbfit.exporting.config import ExportConfig, LodConfig
-from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.lod import LodLevel, glb_counts, lod_glb, stands_alone
-from bbfit.exporting.model import shipped_cards
+from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_a_meter
 from bbfit.pipeline import RunConfig, RunResult, run
@@ -106,18 +104,18 @@ def _join_stage(
     def work(on_progress: OnProgress) -> None:
         switches = _switches(views, runs, config)
         on_progress("join", 0, len(runs) + 1)
-        cards = list[Cards]()
+        models, shipped = [original.read_bytes()] if original else [], list[ShippedModel]()
         for number, (fitted, switch) in enumerate(zip(runs, switches, strict=True), 1):
-            cards.append(shipped_cards(fitted.cloud, export, switch.halvings))
+            shipped.append(shipped_model(fitted.cloud, export, switch.halvings))
+            models.append(shipped[-1].glb)
             on_progress("join", number, len(runs) + 1)
-        models = ([original.read_bytes()] if original else []) + [glb_bytes(each, export) for each in cards]
         if original:
             switches.insert(0, _Switch(math.inf, 0.0, 0.0, 0))
         fits = [None] * (len(models) - len(runs)) + runs
         levels = _levels(views, models, fits, switches, config, out.stem)
         write_bytes(out, lod_glb(models, levels))
         write_json(folder / "lod.json", {"config": asdict(config), "levels": [asdict(level) for level in levels]})
-        lod_picture(list(zip(levels[-len(cards) :], cards, strict=True)), views.test, folder / "lod.png")
+        lod_picture(list(zip(levels[-len(shipped) :], shipped, strict=True)), views.test, folder / "lod.png")
         on_progress("join", len(runs) + 1, len(runs) + 1)
 
     clouds = [digest_file(fitted.folder / name) for fitted in runs for name in ("cloud.safetensors", "metrics.json")]

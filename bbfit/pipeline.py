@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.checks import fail
 from bbfit.evaluation.report import Report
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import as_shipped, shipped_cards
+from bbfit.exporting.model import shipped_model
 from bbfit.files import output_folder
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step
@@ -124,12 +123,12 @@ def run(
     record.run(fit_stage(folder, views, tree, fit_config, None if most is None else (most, export), on_step), on_progress)
     remove_checkpoint(folder)
     cloud = BillboardCloud.load(folder / "cloud.safetensors")
-    shipped, cards = as_shipped(cloud, export), cache(lambda: shipped_cards(cloud, export))
-    record.run(export_stage(folder, cards, export), on_progress)
+    model = shipped_model(cloud, export)
+    record.run(export_stage(folder, model), on_progress)
     seconds = {name: spent for name, spent in record.seconds.items() if name not in ("evaluate", "report")}
-    record.run(evaluate_stage(folder, shipped, cards, views, tree, seconds), on_progress)
+    record.run(evaluate_stage(folder, model, views, tree, seconds), on_progress)
     report = Report.load(folder / "metrics.json")
-    record.run(report_stage(folder, report, shipped, cards, views, export, _facts(record)), on_progress)
+    record.run(report_stage(folder, report, model, views, _facts(record)), on_progress)
     return RunResult(folder, cloud, report, tuple(record.skipped), missed)
 
 
