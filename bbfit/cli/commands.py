@@ -196,7 +196,7 @@ def evaluate_command(
     seconds = Report.load(earlier).seconds if earlier.is_file() else {}
     output_folder("out", out.parent)
     with progress() as tell:
-        original, on_progress = original_tree(dataset, tree and TreeFile.open(tree)), partial(tell, "evaluate")
+        original, on_progress = original_tree(dataset, None if tree is None else TreeFile.open(tree)), partial(tell, "evaluate")
         report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=on_progress)
     report = replace(report, seconds={**seconds, **report.seconds})
     report.save(out)
