@@ -315,7 +315,7 @@ def test_bad_places_for_the_file_are_refused(thing_glb: Path, tmp_path: Path) ->
 def test_a_crash_is_told(thing_glb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "worker.py").write_text("import os, sys; sys.stdin.readline(); print('oh no', file=sys.stderr, flush=True); os._exit(11)")
     monkeypatch.setattr(processes, "WORKER", tmp_path / "worker.py")
-    with pytest.raises(BlenderError, match=r"crashed while converting .*thing\.glb \(exit code 11; its last words: oh no\)"):
+    with pytest.raises(BlenderError, match=r"crashed while converting .*thing\.glb \(exit code 11; its last output: oh no\)"):
         tree_as_glb(thing_glb, tmp_path / "out.glb")
     assert not (tmp_path / "out.glb").exists()
 

@@ -203,7 +203,7 @@ def test_crash_while_reading(thing_glb: Path, tmp_path: Path, monkeypatch: pytes
     worker = tmp_path / "worker.py"
     worker.write_text("import os, sys; sys.stderr.write('Fra: 1\\nout of luck\\n'); sys.stderr.flush(); os.abort()")
     monkeypatch.setattr(processes, "WORKER", worker)
-    with pytest.raises(BlenderError, match=r"crashed while reading .*thing\.glb \(signal 6; its last words: out of luck\)"):
+    with pytest.raises(BlenderError, match=r"crashed while reading .*thing\.glb \(signal 6; its last output: out of luck\)"):
         render_views(thing_glb, tmp_path / "views", CONFIG)
     assert not (tmp_path / "views").exists()
 
