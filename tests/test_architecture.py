@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import setuptools
 
 import bbfit
 
@@ -166,8 +167,10 @@ print(json.dumps([bare, [name for name in heavy if name in sys.modules]]))
 def test_every_package_is_installed() -> None:
     settings = configparser.ConfigParser()
     settings.read(ROOT / "setup.cfg", encoding="utf-8")
-    packages = {".".join(path.parent.relative_to(ROOT).parts) for path in MODULES if path.name == "__init__.py"}
-    assert packages <= set(settings["options"]["packages"].split())
+    assert settings["options"]["packages"] == "find:"
+    installed = setuptools.find_packages(str(ROOT), include=[settings["options.packages.find"]["include"]])
+    folders = {path.parent for path in [*MODULES, ROOT / "bbfit" / "data" / "__init__.py"]}
+    assert {".".join(folder.relative_to(ROOT).parts) for folder in folders} == set(installed)
 
 
 def test_files_are_short() -> None:
