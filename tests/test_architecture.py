@@ -188,8 +188,8 @@ def test_no_module_is_named_like_a_public_function_or_a_grab_bag() -> None:
 
 def test_public_list_is_sorted_and_complete() -> None:
     assert list(bbfit.__all__) == sorted(bbfit.__all__)
-    assert set(bbfit.__all__) < set(dir(bbfit))
-    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+    assert list(bbfit.__all__) == dir(bbfit)
+    with pytest.raises(AttributeError, match="nonsense"):
         bbfit.nonsense  # noqa: B018
 
 
