@@ -24,7 +24,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in MODULES}
 # Lowest first. A module imports from the groups before its own and from its own package, never from another name of its group.
 GROUPS = (
     ("checks",),
-    ("files", "model_files"),
+    ("files", "glb", "model_files"),
     ("geometry",),
     ("layout",),
     ("images",),
