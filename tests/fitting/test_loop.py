@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bbfit.checks import InputError
+from bbfit.checks import InputError, MissingFileError
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
 from bbfit.fitting.levels import LEAST_SIDE
@@ -182,10 +182,10 @@ def test_a_checkpoint_that_does_not_fit_is_not_used(views: ViewDataset, tmp_path
 
 def test_held_out_views_are_not_opened(views_folder: Path) -> None:
     views = ViewDataset.load(views_folder)
-    opened = []
-    test = dataclasses.replace(views.test, _cache=type("Watch", (), {"get": lambda self, path: opened.append(path)})())
-    fit(dataclasses.replace(views, test=test), quick(billboards=1, steps=2))
-    assert opened == []
+    missing = dataclasses.replace(views.test, paths=tuple(path.with_name("missing.png") for path in views.test.paths))
+    with pytest.raises(MissingFileError):
+        missing.image(0)
+    fit(dataclasses.replace(views, test=missing), quick(billboards=1, steps=2))
 
 
 def test_batches_deal_every_view_equally_often() -> None:
