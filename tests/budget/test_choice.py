@@ -614,7 +614,10 @@ def test_each_trial_is_told(views: ViewDataset) -> None:
     ],
 )
 def test_what_cannot_be_chosen(views: ViewDataset, config: FitConfig, budget: BudgetConfig, count: int, says: str) -> None:
-    few, world = dataclasses.replace(views, train=views.train.take(range(count))), World(rising, size=lambda count, texels: 1000 + 2 * texels)
+    few, world = (
+        dataclasses.replace(views, train=views.train.take(range(count))),
+        World(rising, size=lambda count, texels: 1000 + 2 * texels),
+    )
     with pytest.raises(InputError, match=says):
         choose(few, config, budget, known=world.trial)
     assert (len(world.asked) > 0) == (budget.bytes is not None)

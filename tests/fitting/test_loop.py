@@ -252,15 +252,15 @@ def test_unknown_device_is_refused(views: ViewDataset) -> None:
 @pytest.mark.parametrize("cutoff", [0.3, 0.5])
 def test_a_fit_for_mask_is_better_cut_off_than_one_for_blend(data_views: ViewDataset, cutoff: float) -> None:
     """And covers as much of views that it was not fitted to as the tree does; it is drawn with the texels that 8 bits hold."""
-    config = FitConfig(billboards=4, placement="even", placement_learning_rate=0, alpha_cutoff=cutoff)
+    config = FitConfig(billboards=3, placement="even", placement_learning_rate=0, alpha_cutoff=cutoff, steps=100)
     masked, blended = (fit(data_views, dataclasses.replace(config, alpha=alpha)).cloud for alpha in ("mask", "blend"))
     assert masked.alpha == AlphaMode("mask", cutoff) and blended.alpha == AlphaMode("blend", cutoff)
     cut = dataclasses.replace(blended, alpha=masked.alpha)
     test = data_views.test
     gain = over_white(masked, test) - over_white(cut, test)
-    assert gain > 0.5  # measured: 0.86 and 0.82 dB
+    assert gain > 0.5  # measured: 0.57 and 0.58 dB
     covered = render_reference(masked, test.cameras)[..., 3].mean() / test.targets(range(len(test)))[..., 3].mean()
-    assert abs(float(covered) - 1) < 0.04  # measured: 0.01 to 0.02
+    assert abs(float(covered) - 1) < 0.04  # measured: 0.015 and 0.017
     assert torch.equal((masked.texels * 255).round() / 255, masked.texels)
 
 
