@@ -21,8 +21,8 @@ from bbfit.exporting.lod import glb_counts
 from bbfit.files import read_json
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.glb import split_glb
 from bbfit.lod import LodLevel, LodResult, build_lod
-from bbfit.model_files import split_glb
 from bbfit.pipeline import RunConfig
 from bbfit.views import ViewDataset
 
