@@ -512,6 +512,7 @@ def test_of_equals_the_first_is_chosen(choosing: Choosing) -> None:
 QUICK = FitConfig(candidates=1, refinement_rounds=0, steps=4, views_per_step=1)
 
 
+@pytest.mark.slow
 def test_a_trial_is_a_short_fit_measured_on_views_it_has_not_seen(views: ViewDataset) -> None:
     """Every fifth training view is for validation."""
     export, tree = ExportConfig(padding=2), TreeFile.open(DATA / "tree.glb")
@@ -644,6 +645,7 @@ def sealed(folder: Path) -> ViewDataset:
     return dataclasses.replace(views, test=dataclasses.replace(views.test, paths=missing))
 
 
+@pytest.mark.slow
 def test_a_choice_on_real_views() -> None:
     """Limits hold in every trial; the one that is chosen is a fit of views that leave out those for validation."""
     views, told = sealed(DATA / "views"), []
@@ -662,6 +664,7 @@ def test_a_choice_on_real_views() -> None:
     assert best.psnr == pytest.approx(mean_psnr(cloud, views.train.take(held)), abs=6e-4)
 
 
+@pytest.mark.slow
 def test_bytes_on_real_views() -> None:
     found = choose(sealed(DATA / "views"), dataclasses.replace(QUICK, placement="even"), BudgetConfig(bytes="20k", vertices=8))
     assert 10_000 < found.trials[found.chosen].bytes <= 20_000 and found.config.max_texels is not None

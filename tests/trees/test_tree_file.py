@@ -151,6 +151,7 @@ def test_an_obj_holds_the_parts_to_the_last_bit(tmp_path: Path) -> None:
     assert {"newmtl bark", "Kd 0.0221 0.333333333 0.1", "Pr 0.85", "d 1"} <= set(files[1].read_text().splitlines())
 
 
+@pytest.mark.blender
 def test_blender_makes_the_same_surfaces_of_both_kinds_of_file(tmp_path: Path) -> None:
     parts = sample()
     for ending in (".glb", ".obj"):
@@ -191,6 +192,7 @@ os._exit(0)
             np.testing.assert_allclose(uvs, made.uvs[corners], rtol=0, atol=1e-6)
 
 
+@pytest.mark.node
 def test_khronos_validator_finds_nothing(tmp_path: Path) -> None:
     write_tree(scene_of(sample(), name="tree"), tmp_path / "tree.glb")
     (report,) = reports(tmp_path / "tree.glb")
