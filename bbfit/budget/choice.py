@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from bbfit.fitting.levels import resize_textures
 from bbfit.fitting.loop import fit
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset, ViewSet
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
@@ -92,7 +92,7 @@ def choose(
     config: FitConfig,
     budget: BudgetConfig,
     *,
-    tree: Path | None = None,
+    tree: TreeFile | None = None,
     export: ExportConfig | None = None,
     known: Sequence[Trial] = (),
     on_trial: Callable[[list[Trial], int], None] | None = None,
@@ -167,7 +167,7 @@ class _Trials:
         views: ViewDataset,
         config: FitConfig,
         budget: BudgetConfig,
-        tree: Path | None,
+        tree: TreeFile | None,
         export: ExportConfig,
         known: list[Trial],
         on_trial: Callable[[list[Trial], int], None] | None,

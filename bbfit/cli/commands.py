@@ -186,8 +186,9 @@ def evaluate_command(
     from bbfit.evaluation.scoring import evaluate
     from bbfit.files import output_folder
     from bbfit.geometry.cloud import BillboardCloud
-    from bbfit.pipeline import original_tree
     from bbfit.reporting.tables import report_table
+    from bbfit.stages.results import original_tree
+    from bbfit.tree_files.tree_file import TreeFile
     from bbfit.views import ViewDataset
 
     billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
@@ -195,7 +196,7 @@ def evaluate_command(
     seconds = Report.load(earlier).seconds if earlier.is_file() else {}
     output_folder("out", out.parent)
     with progress() as tell:
-        original, on_progress = original_tree(dataset, tree), partial(tell, "evaluate")
+        original, on_progress = original_tree(dataset, None if tree is None else TreeFile.open(tree)), partial(tell, "evaluate")
         report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=on_progress)
     report = replace(report, seconds={**seconds, **report.seconds})
     report.save(out)
