@@ -18,6 +18,7 @@ from bbfit.fitting.points import mesh_points
 from bbfit.fitting.search import SIDE, Effort, _Search, find_placement
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.rendering.reference import render_reference
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset
 
 DATA = Path(__file__).resolve().parents[2] / "data"
@@ -31,7 +32,7 @@ def views() -> ViewDataset:
 
 @pytest.fixture(scope="module")
 def points(views: ViewDataset) -> torch.Tensor:
-    return mesh_points(DATA / "tree.glb", views.train, count=4000)
+    return mesh_points(TreeFile.open(DATA / "tree.glb"), views.train, count=4000)
 
 
 def config(**asked: object) -> FitConfig:
