@@ -50,13 +50,30 @@ MARKED = {
 # The same for tests that use a fixture, directly or not.
 MARKED_FIXTURES = {"stand_ins": "blender"}
 
+# Modules that take long. They come first, so that no process is left with one of them when the others have nothing to do.
+FIRST = (
+    "test_readme.py",
+    "test_comparison.py",
+    "test_notebooks.py",
+    "sweep/test_cluster.py",
+    "sweep/test_scheduling.py",
+    "fitting/test_search.py",
+    "test_cli.py",
+    "viewers/test_fits.py",
+    "exporting/test_splitting.py",
+    "rendering/test_fused.py",
+    "fitting/test_loop.py",
+)
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests by what they need."""
+    """Mark tests by what they need, and put those that take long first."""
+    places = [TESTS / place for place in FIRST]
+    items.sort(key=lambda item: places.index(item.path) if item.path in places else len(places))
     for item in items:
         place = item.path.relative_to(TESTS) if item.path.is_relative_to(TESTS) else item.path
-        for marker, places in MARKED.items():
-            if any(place.is_relative_to(folder) for folder in places):
+        for marker, folders in MARKED.items():
+            if any(place.is_relative_to(folder) for folder in folders):
                 item.add_marker(marker)
         for fixture, marker in MARKED_FIXTURES.items():
             if fixture in getattr(item, "fixturenames", ()):
