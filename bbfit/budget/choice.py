@@ -94,7 +94,7 @@ def choose(
     *,
     tree: TreeFile | None = None,
     export: ExportConfig | None = None,
-    known: Sequence[Trial] = (),
+    known: Callable[[FitConfig], Trial | None] | None = None,
     on_trial: Callable[[list[Trial], int], None] | None = None,
 ) -> Choice:
     """Choose number, sides, placement and texel density of billboards for a budget; the test views are not looked at.
@@ -109,7 +109,7 @@ def choose(
     config : what the fit will be asked for; ``billboards`` has to be left open.
     budget : at least one limit.
     tree, export : as for the fit and the export to come; the export decides over the bytes.
-    known : trials of an earlier call with the same arguments, which are not done again.
+    known : called with the configuration of each short fit; returns its trial if that is known already, as by :func:`lookup`.
     on_trial : told of all trials so far, and how many there may be, after each.
 
     Raises
@@ -127,7 +127,13 @@ def choose(
     if len(views.train) < _SHARE:
         fail("views", f"{len(views.train)} training views leave none for validation", f"give at least {_SHARE}")
     split = replace(views, train=views.train.take([index for index in train if index not in held]), test=views.train.take(held))
-    return _Trials(split, config, budget, tree, export or ExportConfig(), list(known), on_trial).choice()
+    return _Trials(split, config, budget, tree, export or ExportConfig(), known, on_trial).choice()
+
+
+def lookup(trials: Sequence[Trial]) -> Callable[[FitConfig], Trial | None]:
+    """Find the trial of a configuration among those of an earlier call of :func:`choose` with the same arguments."""
+    by_choice = {(trial.billboards, trial.sides, trial.placement, trial.max_texels): trial for trial in trials}
+    return lambda config: by_choice.get((config.billboards, config.sides, config.placement, config.max_texels))  # type: ignore[arg-type]
 
 
 def within_bytes(cloud: BillboardCloud, most: int | None, export: ExportConfig) -> BillboardCloud:
@@ -169,11 +175,11 @@ class _Trials:
         budget: BudgetConfig,
         tree: TreeFile | None,
         export: ExportConfig,
-        known: list[Trial],
+        known: Callable[[FitConfig], Trial | None] | None,
         on_trial: Callable[[list[Trial], int], None] | None,
     ) -> None:
         self._views, self._config, self._budget, self._tree, self._export = views, config, budget, tree, export
-        self._known, self._on_trial = known, on_trial or (lambda trials, total: None)
+        self._known, self._on_trial = known or (lambda config: None), on_trial or (lambda trials, total: None)
         self._trials: list[Trial] = []
         most = COUNTS[-1] if budget.vertices is None else min(COUNTS[-1], budget.vertices // self._vertices(1, config.sides))
         if most < 1:
@@ -279,12 +285,11 @@ class _Trials:
         return trial
 
     def _trial(self, count: int, sides: Sides, placement: Placement, most: int | None) -> Trial:
-        for trial in self._known:
-            if (trial.billboards, trial.sides, trial.placement, trial.max_texels) == (count, sides, placement, most):
-                return trial
-        begun = time.perf_counter()
         short = {name: value for name, value in _SHORT.items() if getattr(self._config, name) is None}
         config = replace(self._config, billboards=count, sides=sides, placement=placement, max_texels=most, **short)
+        if (known := self._known(config)) is not None:
+            return known
+        begun = time.perf_counter()
         cloud = fit(self._views, config, tree=self._tree).cloud
         size, seconds = model_bytes(cloud, self._export), time.perf_counter() - begun
         score = mean_psnr(cloud, self._views.test)

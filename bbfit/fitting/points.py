@@ -18,8 +18,8 @@ COUNT = 20_000
 """Points that are drawn unless said otherwise."""
 # Points of a mesh that must lie on the tree in a training view, on average, for the two to belong together.
 _AGREEMENT = 0.95
-# Random points that the hull is carved from at a time, and how often at most.
-_CARVED, _ROUNDS = 1 << 18, 64
+# How often random points are drawn at most.
+_ROUNDS = 64
 # Side of the silhouettes that the hull is carved with, in pixels, at least.
 _HULL_SIDE = 256
 
@@ -54,8 +54,12 @@ def mesh_points(tree: TreeFile, views: ViewSet, *, count: int = COUNT, seed: int
     return points
 
 
-def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
+def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0, batch: int = 1 << 18) -> Tensor:
     """Points in the visual hull (Laurentini 1994): wherever no view shows the background, [P, 3] float64.
+
+    Parameters
+    ----------
+    batch : random points that the hull is carved from at a time.
 
     Raises
     ------
@@ -76,7 +80,7 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
     low, high = center - extent / 2, center + extent / 2
     generator, found = torch.Generator().manual_seed(seed), list[Tensor]()
     for _ in range(_ROUNDS):
-        points = low + (high - low) * torch.rand(_CARVED, 3, dtype=torch.float64, generator=generator)
+        points = low + (high - low) * torch.rand(batch, 3, dtype=torch.float64, generator=generator)
         for index, mask in enumerate(masks):
             points = points[_inside(points, cameras[index], mask, beyond=cropped[index])]
         found.append(points)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import itemgetter
 
 import torch
@@ -25,10 +25,8 @@ from bbfit.views import ViewSet
 
 SIDE = 64
 """About the width of the pictures that the search is done on, in pixels."""
-# Steps of every candidate, of those that survive, and of every alternative later on; their rates; how many survive.
-_STEPS, _MORE_STEPS, _MEND_STEPS = 30, 50, 40
+# Adam's learning rate for every candidate, and later on.
 _RATE, _LATER_RATE = 0.15, 0.06
-_SURVIVORS = 0.3
 # One in so many billboards does not come from a clustering but is added to it; alternatives for each, and in every revision.
 _ADDED, _ADDITIONS, _REVISIONS = 4, 4, 5
 # Views in every step.
@@ -39,7 +37,27 @@ _NEAR, _TRIALS = 0.08, 150
 _MARGIN = 0.06
 
 
-def find_placement(views: ViewSet, points: Tensor, config: FitConfig, on_work: Callable[[int, int], None] | None = None) -> BillboardCloud:
+@dataclass(frozen=True)
+class Effort:
+    """How long a search takes."""
+
+    steps: int = 30
+    """Steps of every candidate."""
+    more_steps: int = 50
+    """Further steps of the candidates that survive."""
+    mend_steps: int = 40
+    """Steps of every alternative for an added or a revised billboard."""
+    survivors: float = 0.3
+    """Share of the candidates that survives."""
+
+
+USUAL = Effort()
+"""The effort of every fit."""
+
+
+def find_placement(
+    views: ViewSet, points: Tensor, config: FitConfig, on_work: Callable[[int, int], None] | None = None, effort: Effort = USUAL
+) -> BillboardCloud:
     """Billboards placed where the tree is, with textures fitted at a low resolution.
 
     Clusterings of the points from different random starts, upright and free, are fitted for a few steps each in which billboards move with
@@ -53,18 +71,21 @@ def find_placement(views: ViewSet, points: Tensor, config: FitConfig, on_work: C
     views : training views.
     points : on the tree, [P, 3] float64.
     config : resolved; ``billboards``, ``searches``, ``candidates``, ``revisions``, ``orientation`` and ``seed`` matter.
-    on_work : told how much of the work is done and how much there is, in steps of one candidate.
+    on_work : called with how much of the work is done and how much there is, in steps of one candidate.
+    effort : how long each part of the search takes.
 
     Returns
     -------
     Float32 on the CPU; textures of :data:`SIDE` texels where the full resolution has as many as a view is wide.
     """
-    return _Search(views, points, config, on_work or (lambda done, total: None)).best()
+    return _Search(views, points, config, on_work or (lambda done, total: None), effort).best()
 
 
 class _Search:
-    def __init__(self, views: ViewSet, points: Tensor, config: FitConfig, on_work: Callable[[int, int], None]) -> None:
-        self._config, self._points, self._on_work = replace(config.coarse(), ssim_weight=0.0), points, on_work
+    def __init__(
+        self, views: ViewSet, points: Tensor, config: FitConfig, on_work: Callable[[int, int], None], effort: Effort = USUAL
+    ) -> None:
+        self._config, self._points, self._on_work, self._effort = replace(config.coarse(), ssim_weight=0.0), points, on_work, effort
         side = min(views.cameras.width, views.cameras.height)
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))
@@ -78,13 +99,13 @@ class _Search:
         self._colors = point_colors(self._pixels, self._pictures)
         self._radius = tree_radius(views)
         self._added = config.billboards // _ADDED
-        self._clusters, self._survivors = config.billboards - self._added, max(1, round(_SURVIVORS * config.candidates))
+        self._clusters, self._survivors = config.billboards - self._added, max(1, round(effort.survivors * config.candidates))
         self._generator, self._proposed, self._done = torch.Generator().manual_seed(config.seed), 0, 0
         # So many of them are completed, half as many after every addition; fewer where that would take long beside the fit.
         self._chains = min(self._survivors, max(1, config.billboards // 2))
         completed = sum(max(1, self._chains >> addition) for addition in range(self._added))
-        each = _STEPS * config.candidates + _MORE_STEPS * self._survivors + _MEND_STEPS * _ADDITIONS * completed
-        self._total = config.restarts * each + _MEND_STEPS * _REVISIONS * config.refinement_rounds
+        each = effort.steps * config.candidates + effort.more_steps * self._survivors + effort.mend_steps * _ADDITIONS * completed
+        self._total = config.restarts * each + effort.mend_steps * _REVISIONS * config.refinement_rounds
 
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
@@ -99,9 +120,9 @@ class _Search:
         config = self._config
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:
             clouds = list(pool.map(self._clustered, range(number * config.candidates, (number + 1) * config.candidates)))
-        clouds, losses = self._fitted(clouds, _STEPS, _RATE)
+        clouds, losses = self._fitted(clouds, self._effort.steps, _RATE)
         chosen = sorted(range(len(clouds)), key=losses.__getitem__)[: self._survivors]
-        clouds, losses = self._fitted([clouds[index] for index in chosen], _MORE_STEPS, _LATER_RATE)
+        clouds, losses = self._fitted([clouds[index] for index in chosen], self._effort.more_steps, _LATER_RATE)
         grown = sorted(zip(clouds, losses, strict=True), key=itemgetter(1))[: self._chains]
         for _ in range(self._added):
             grown = sorted((self._best_of(self._extended(cloud)) for cloud, _ in grown), key=itemgetter(1))
@@ -110,7 +131,7 @@ class _Search:
 
     def _best_of(self, clouds: list[BillboardCloud]) -> tuple[BillboardCloud, float]:
         """The best of some clouds after some steps, and its loss."""
-        return min(zip(*self._fitted(clouds, _MEND_STEPS, _LATER_RATE), strict=True), key=itemgetter(1))
+        return min(zip(*self._fitted(clouds, self._effort.mend_steps, _LATER_RATE), strict=True), key=itemgetter(1))
 
     def _without(self, cloud: BillboardCloud) -> list[tuple[BillboardCloud, Tensor]]:
         """A cloud without one of its billboards, and its losses of every pixel, for each of them; what is missed least first."""
