@@ -11,7 +11,7 @@ from operator import itemgetter
 import torch
 from torch import Tensor
 
-from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, seen_across, splatted, split_planes
+from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, splatted, split_planes, view_projection
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_a_meter, tree_radius
 from bbfit.fitting.levels import Targets
@@ -72,7 +72,7 @@ class _Search:
         assert config.texel_density is not None and config.billboards is not None
         assert config.restarts is not None and config.refinement_rounds is not None
         self._density = float(pixels_a_meter(cameras)) * config.texel_density
-        self._seen = seen_across(cameras)
+        self._seen = view_projection(cameras)
         self._pixels = [pixels_of(points, cameras[index]) for index in range(len(cameras))]
         self._all_upright = config.orientation == "upright"
         self._colors = point_colors(self._pixels, self._pictures)
