@@ -107,9 +107,7 @@ def resampled(cloud: BillboardCloud, onto: BillboardCloud, sizes: Tensor) -> Bil
             coarse = [max(1, round(count / max(1.0, float(r)))) for count, r in zip(texture.shape[1:3], ratio, strict=True)]
             texture = _resized(texture, coarse)
         shift = onto.centers[n] - cloud.centers[n]
-        across = (
-            torch.stack([shift @ cloud.rights[n], -shift @ cloud.ups[n]]) / cloud.half_extents[n]
-        )  # new center in old coordinates, in [-1, 1]
+        across = torch.stack([shift @ cloud.rights[n], -shift @ cloud.ups[n]]) / cloud.half_extents[n]  # new center, in [-1, 1]
         steps = [(2 * torch.arange(count, dtype=torch.float64) + 1) / count - 1 for count in size]
         grid = torch.stack(torch.meshgrid(across[1] + scale[1] * steps[0], across[0] + scale[0] * steps[1], indexing="ij")[::-1], -1)
         grid = grid[None].expand(len(texture), -1, -1, -1).to(texture)

@@ -57,7 +57,7 @@ class Movement:
         )
 
     def placement(self) -> Tensor:
-        """Compute the current centers, rights, ups and half extents, concatenated to float64 [N, 11], many times faster than :meth:`placed`."""
+        """Concatenate the current centers, rights, ups and half extents to float64 [N, 11], many times faster than :meth:`placed`."""
         moved, cloud = self.parameters * self._units, self._cloud
         vectors = moved[:, 3:6]
         angles = vectors.norm(dim=-1, keepdim=True)
