@@ -21,8 +21,9 @@ from bbfit.exporting.encoders import encode_webp
 from bbfit.exporting.model import ShippedModel
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
+from bbfit.glb import joined_glb, split_glb
 from bbfit.images import over_color, to_bytes, unpremultiply
-from bbfit.model_files import generator, joined_glb, split_glb
+from bbfit.model_files import generator
 from bbfit.reporting.charts import MEASURES, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
 from bbfit.reporting.plots import magma, spread_views
 from bbfit.views import ViewSet

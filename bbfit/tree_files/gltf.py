@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
 import re
-import struct
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -15,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.checks import MissingFileError, fail
+from bbfit.glb import gltf_parts
 
-_FLOAT, _JSON_CHUNK, _BINARY_CHUNK = 5126, 0x4E4F534A, 0x004E4942
+_FLOAT = 5126
 
 
 def read_gltf(path: Path) -> tuple[list[Path], list[NDArray[np.float32]]]:
@@ -29,7 +28,7 @@ def read_gltf(path: Path) -> tuple[list[Path], list[NDArray[np.float32]]]:
     MissingFileError, InputError
         If the file is damaged, or refers to a file that is missing or outside its folder.
     """
-    content, binary = _parts(path)
+    content, binary = gltf_parts(path.read_bytes(), "tree", path)
     buffers: list[bytes] = []
     files: list[Path] = []
     for kind in ("buffers", "images"):
@@ -49,31 +48,6 @@ def read_gltf(path: Path) -> tuple[list[Path], list[NDArray[np.float32]]]:
     primitives = [primitive for mesh in _entries(content, "meshes") for primitive in _entries(mesh, "primitives")]
     read = (_positions(content, primitive, buffers) for primitive in primitives)
     return list(dict.fromkeys(files)), [positions for positions in read if positions is not None]
-
-
-def _parts(path: Path) -> tuple[dict[str, Any], bytes]:
-    """JSON and binary chunk of a glTF (glTF 2.0 specification, section 4.4 for the binary container)."""
-    data, binary = path.read_bytes(), b""
-    text = data
-    if data[:4] == b"glTF":
-        length = struct.unpack_from("<I", data, 8)[0] if len(data) >= 20 else 0
-        if length < 20 or length > len(data):
-            fail("tree", f"{path} is cut short", "get or export the file again")
-        start, text = 12, b""
-        while start + 8 <= length:
-            size, kind = struct.unpack_from("<II", data, start)
-            if kind == _JSON_CHUNK and not text:
-                text = data[start + 8 : start + 8 + size]
-            elif kind == _BINARY_CHUNK and not binary:
-                binary = data[start + 8 : start + 8 + size]
-            start += 8 + size
-    try:
-        content = json.loads(text)
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        fail("tree", f"{path} is no glTF ({error})", "get or export the file again")
-    if not isinstance(content, dict):
-        fail("tree", f"{path} is no glTF", "get or export the file again")
-    return content, binary
 
 
 def _entries(content: dict[str, Any], kind: str) -> list[dict[str, Any]]:

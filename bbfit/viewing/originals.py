@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from bbfit.checks import InputError
 from bbfit.exporting.lod import glb_counts, stands_alone
+from bbfit.glb import gltf_parts
 from bbfit.tree_files.tree_file import MESH_SUFFIXES, TreeFile
 
 MOST_BYTES = 64 << 20
@@ -64,8 +64,7 @@ def find_original(candidates: Sequence[Path | None], most_bytes: int = MOST_BYTE
 
 
 def _as_it_is(glb: bytes, name: str) -> Original:
-    length = int.from_bytes(glb[12:16], "little")
-    packed = sorted(_PACKED & set(json.loads(glb[20 : 20 + length]).get("extensionsRequired", ())))
+    packed = sorted(_PACKED & set(gltf_parts(glb)[0].get("extensionsRequired", ())))
     if packed:
         return Original.missing(f"{name} is packed by {' and '.join(packed)}, which the page cannot read")
     return Original(glb, "", _vertices(glb))

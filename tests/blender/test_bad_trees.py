@@ -70,9 +70,9 @@ RIGHT = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
         ("tree", b"no ending", "unknown format"),
         ("short.glb", glb(triangle(RIGHT), RIGHT.tobytes())[:-10], "is cut short"),
         ("stub.glb", b"glTF", "is cut short"),
-        ("text.gltf", b"no glTF at all", "is no glTF"),
-        ("list.gltf", b"[1, 2]", "is no glTF"),
-        ("latin.gltf", b'{"asset": "\xff"}', "is no glTF"),
+        ("text.gltf", b"no glTF at all", "is not a glTF"),
+        ("list.gltf", b"[1, 2]", "is not a glTF"),
+        ("latin.gltf", b'{"asset": "\xff"}', "is not a glTF"),
     ],
 )
 def test_files_refused_at_a_glance(tmp_path: Path, name: str, content: bytes, said: str) -> None:
@@ -91,7 +91,7 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 def test_garbage_is_told(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"garbage{ending}"
     path.write_bytes(b"this is no tree\n" * 20)
-    refused(path, "cannot be read as|has no faces|is no glTF")
+    refused(path, "cannot be read as|has no faces|is not a glTF")
 
 
 @pytest.mark.parametrize("ending", [".glb", ".gltf", ".ply", ".stl", ".fbx", ".usdc", ".usdz", ".blend"])
@@ -99,7 +99,7 @@ def test_a_file_cut_in_half_is_told(things: Path, tmp_path: Path, ending: str) -
     path = tmp_path / f"half{ending}"
     data = (things / f"thing{ending}").read_bytes()
     path.write_bytes(data[: len(data) // 2])
-    refused(path, "cannot be read as|has no faces|is cut short|is no glTF|crashed while reading")
+    refused(path, "cannot be read as|has no faces|is cut short|is not a glTF|crashed while reading")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
