@@ -137,7 +137,7 @@ def test_a_fit_keeps_the_limit_at_every_level_and_in_its_result(
         monkeypatch.setattr(loop, name, watched)
     asked = config(**kind, max_texels=most)
     result = fit(views, asked, on_step=lambda step: seen.append(len(step.snapshot().texels)))
-    levels = len(loop.levels_of(asked.resolve(), views.train.cameras))
+    levels = len(loop.resolution_levels(asked.resolve(), views.train.cameras))
     moves = asked.placement_learning_rate is None
     assert len(starts) == 1 + moves * max(1, levels - 1)  # at the beginning, and after every level in which billboards move
     assert all(0.7 * most < count <= most for count in starts)
