@@ -611,7 +611,7 @@ def test_each_trial_is_told(views: ViewDataset, fits: Fits) -> None:
         ),
         (FitConfig(preset="thesis"), BudgetConfig(auto=True), 12, "^preset: 'thesis' cannot be combined with a budget"),
         (FitConfig(), BudgetConfig(vertices=8), 4, "^views: 4 training views are too few for a validation split; give at least 5$"),
-        (FitConfig(), BudgetConfig(vertices=8), 1, "^views: 1 training views leave none"),
+        (FitConfig(), BudgetConfig(vertices=8), 1, "^views: 1 training views are too few"),
         (FitConfig(sides="two"), BudgetConfig(vertices=7), 12, "^vertices: 7 are too few for one billboard of sides 'two'; allow more"),
         (FitConfig(sides="pair"), BudgetConfig(vertices=4), 12, "^vertices: 4 are too few for one billboard of sides 'pair'"),
         (FitConfig(), BudgetConfig(bytes=100), 12, r"^budget: 1 billboard with \d,\d+ bytes exceeds it; allow more$"),
