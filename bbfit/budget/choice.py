@@ -188,7 +188,8 @@ class _Trials:
         self._views, self._config, self._budget, self._tree, self._export = views, config, budget, tree, export
         self._known, self._on_trial = known, on_trial or (lambda trials, total: None)
         self._trials: list[Trial] = []
-        most = COUNTS[-1] if budget.vertices is None else min(COUNTS[-1], budget.vertices // self._vertices(1, config.sides))
+        vertices = 4 if config.sides == "one" else 8
+        most = COUNTS[-1] if budget.vertices is None else min(COUNTS[-1], budget.vertices // vertices)
         if most < 1:
             fail("vertices", f"{budget.vertices} are too few for one billboard of sides {config.sides!r}", "allow more, or sides one")
         self._counts = sorted({count for count in COUNTS if count < most} | {most})
@@ -302,10 +303,6 @@ class _Trials:
         size, seconds = model_bytes(cloud, self._export), time.perf_counter() - started
         score = mean_psnr(cloud, self._views.test)
         return Trial(count, sides, placement, most, cloud.vertex_count, len(cloud.texels), size, round(score, 3), round(seconds, 1))
-
-    @staticmethod
-    def _vertices(count: int, sides: Sides) -> int:
-        return count * (4 if sides == "one" else 8)
 
 
 def mean_psnr(cloud: BillboardCloud, views: ViewSet) -> float:

@@ -86,9 +86,8 @@ def opaque_bounds(cloud: BillboardCloud) -> Tensor:
         x, y, width, height = cv2.boundingRect(mask)
         sides = torch.tensor([mask.shape[1], mask.shape[0]])
         if not width:
-            bounds.append(
-                torch.stack([-cloud.half_extents[n, 0], cloud.half_extents[n, 0], -cloud.half_extents[n, 1], cloud.half_extents[n, 1]])
-            )
+            half_width, half_height = cloud.half_extents[n]
+            bounds.append(torch.stack([-half_width, half_width, -half_height, half_height]))
             continue
         low, high = torch.tensor([x, y]), torch.tensor([x + width, y + height])
         margin = (sides / 10).ceil().clamp_min(2)
@@ -113,8 +112,6 @@ def trimmed(cloud: BillboardCloud) -> BillboardCloud:
         x, y, width, height = cv2.boundingRect(mask)
         left, top = max(x - 1, 0), max(y - 1, 0)
         right, bottom = min(x + width + 1, mask.shape[1]), min(y + height + 1, mask.shape[0])
-        if not width:
-            left, top, right, bottom = 0, 0, 1, 1
         parts.append([(right - left) / mask.shape[1], (bottom - top) / mask.shape[0]])
         middles.append([(left + right) / mask.shape[1] - 1, 1 - (top + bottom) / mask.shape[0]])
         sizes.append([bottom - top, right - left])

@@ -35,19 +35,9 @@ class Planes:
 
 
 def view_projection(camera: Camera) -> Tensor:
-    """Compute the mean projection M across the viewing directions of all views.
+    """Average the projections across the viewing directions of V cameras to a matrix M, [3, 3].
 
     Of the squared length of a displacement d, the views see ``d . M d`` on average.
-
-    Parameters
-    ----------
-    camera
-        V cameras.
-
-    Returns
-    -------
-    Tensor
-        M, [3, 3].
     """
     forward = camera.batch().forward
     return torch.eye(3, dtype=forward.dtype) - (forward[:, :, None] * forward[:, None, :]).mean(0)
@@ -133,23 +123,9 @@ def _displacement(points: Tensor, normals: Tensor, offsets: Tensor, projection: 
 
 
 def moments(points: Tensor, labels: Tensor, count: int) -> Tensor:
-    """Sum p p^T over the points p = (x, y, z, 1) of each cluster.
+    """Sum p p^T over the points p = (x, y, z, 1) of each cluster, [K, 4, 4]. ``labels`` are the clusters of the points, int64 [P].
 
     The moments of a union of clusters are the sum of their moments.
-
-    Parameters
-    ----------
-    points
-        [P, 3].
-    labels
-        Cluster of every point, int64 [P].
-    count
-        Number of clusters K.
-
-    Returns
-    -------
-    Tensor
-        [K, 4, 4].
     """
     extended = torch.nn.functional.pad(points, (0, 1), value=1.0)
     return points.new_zeros(count, 4, 4).index_add_(0, labels, extended[:, :, None] * extended[:, None, :])

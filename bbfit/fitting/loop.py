@@ -192,10 +192,7 @@ def _initial_state(views: ViewDataset, config: FitConfig, tree: TreeFile | None,
     """Place the billboards evenly, or search for a placement."""
     if config.placement == "even":
         return _FitState([], start_cloud(views.train, config), None, {}, 0.0)
-    if tree is None:
-        points = hull_points(views.train, seed=config.seed)
-    else:
-        points = mesh_points(tree, views.train, seed=config.seed)
+    points = hull_points(views.train, seed=config.seed) if tree is None else mesh_points(tree, views.train, seed=config.seed)
     assert config.texel_density is not None
     placement = find_placement(views.train, points, config, on_place)
     density = config.texel_density * float(pixels_a_meter(views.train.cameras))
@@ -226,7 +223,7 @@ def resolution_levels(config: FitConfig, cameras: Camera) -> list[ResolutionLeve
 def step_alpha(config: FitConfig, level: ResolutionLevel, index: int) -> AlphaMode:
     """Return the alpha mode that step ``index``, from 0, of a resolved configuration renders with.
 
-    It is ``blend``, except for a ``mask`` at full resolution. There the ramp around the cutoff hardens over the first third of the level's
+    It is ``blend``, except for a ``mask`` at full resolution. There the ramp around the cutoff hardens over the first 30 % of the level's
     steps and is a step function after that. At lower resolutions, a mask at full resolution looks like ``blend``. On average, so does
     ``hash``.
     """

@@ -91,10 +91,7 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
     cameras = views.cameras
     halvings = max(0, int(math.log2(min(cameras.width, cameras.height) / _HULL_SIDE)))
     side = 1 << halvings
-    masks = []
-    for index in range(len(views)):
-        alpha = (views.image(index)[..., 3] > 0).float()
-        masks.append(max_pool2d(alpha[None], side, ceil_mode=True)[0] > 0)
+    masks = [max_pool2d((views.image(i)[..., 3] > 0).float()[None], side, ceil_mode=True)[0] > 0 for i in range(len(views))]
     # Space outside a picture is background too, unless the border of the picture cuts off the tree.
     cropped = [bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()) for mask in masks]
     cameras = cameras.resized(masks[0].shape[1], masks[0].shape[0])
@@ -160,7 +157,7 @@ def pixels_of(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     return torch.where(inside, y * camera.width + x, 0), inside
 
 
-def _inside(points: Tensor, camera: Camera, mask: Tensor, *, outside: bool = False) -> Tensor:
+def _inside(points: Tensor, camera: Camera, mask: Tensor, *, outside: bool) -> Tensor:
     """Whether each point projects onto a mask [H, W] in a single camera; ``outside`` is the value for points outside the picture."""
     index, inside = pixels_of(points, camera)
     return torch.where(inside, mask.flatten()[index], outside)
