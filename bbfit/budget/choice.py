@@ -136,25 +136,25 @@ def choose(
     if config.preset != "default":
         fail("preset", f"{config.preset!r} cannot be combined with a budget", "leave out one of them")
     train = range(len(views.train))
-    held = [index for index in train if index % _SHARE == _SHARE // 2]
+    validation = [index for index in train if index % _SHARE == _SHARE // 2]
     if len(views.train) < _SHARE:
         fail("views", f"{len(views.train)} training views are too few for a validation split", f"give at least {_SHARE}")
-    split = replace(views, train=views.train.take([index for index in train if index not in held]), test=views.train.take(held))
+    split = replace(views, train=views.train.take([index for index in train if index not in validation]), test=views.train.take(validation))
     return _Trials(split, config, budget, tree, export or ExportConfig(), list(known), on_trial).choice()
 
 
-def within_bytes(cloud: BillboardCloud, most: int | None, export: ExportConfig) -> BillboardCloud:
-    """Shrink the textures of a cloud until the exported model has at most ``most`` bytes; ``None`` is no limit.
+def within_bytes(cloud: BillboardCloud, max_bytes: int | None, export: ExportConfig) -> BillboardCloud:
+    """Shrink the textures of a cloud until the exported model has at most ``max_bytes`` bytes; ``None`` is no limit.
 
     Raises
     ------
     InputError
         If the model is larger even with one texel per texture.
     """
-    while most is not None and (size := model_bytes(cloud, export)) > most:
+    while max_bytes is not None and (size := model_bytes(cloud, export)) > max_bytes:
         if int(cloud.texture_sizes.amax()) == 1:
-            fail("bytes", f"{most:,} are too few: {size:,} are needed without textures", "allow more, or fewer billboards")
-        sizes = (cloud.texture_sizes * min(0.98, math.sqrt(most / size))).long().clamp_min(1)
+            fail("bytes", f"{max_bytes:,} are too few: {size:,} are needed without textures", "allow more, or fewer billboards")
+        sizes = (cloud.texture_sizes * min(0.98, math.sqrt(max_bytes / size))).long().clamp_min(1)
         cloud = resize_textures(cloud, sizes)
     return cloud
 
@@ -189,10 +189,10 @@ class _Trials:
         self._known, self._on_trial = known, on_trial or (lambda trials, total: None)
         self._trials: list[Trial] = []
         vertices = 4 if config.sides == "one" else 8
-        most = COUNTS[-1] if budget.vertices is None else min(COUNTS[-1], budget.vertices // vertices)
-        if most < 1:
+        max_count = COUNTS[-1] if budget.vertices is None else min(COUNTS[-1], budget.vertices // vertices)
+        if max_count < 1:
             fail("vertices", f"{budget.vertices} are too few for one billboard of sides {config.sides!r}", "allow more, or sides one")
-        self._counts = sorted({count for count in COUNTS if count < most} | {most})
+        self._counts = sorted({count for count in COUNTS if count < max_count} | {max_count})
         self._total = len(self._counts) + 2 + len(_LESS) * (budget.texels is not None or budget.bytes is not None)
 
     def choice(self) -> Choice:
@@ -213,12 +213,12 @@ class _Trials:
                 self._try(count, config.sides, "even")
             best = max([best, *filter(self._is_within_budget, self._trials[before:])], key=lambda trial: trial.psnr)
             if budget.texels is not None or budget.bytes is not None:  # fewer texels, for the curve
-                for share in _LESS:
-                    self._trial_of(best.billboards, best.sides, best.placement, max(2 * count, int(share * best.texels)))
-        most = best.max_texels
+                for fraction in _LESS:
+                    self._trial_of(best.billboards, best.sides, best.placement, max(2 * count, int(fraction * best.texels)))
+        max_texels = best.max_texels
         if budget.most_bytes is not None:
-            most = min(int(_CRISPER * budget.most_bytes / best.bytes * best.texels), budget.most_texels or 1 << 40)
-        chosen = replace(config, billboards=best.billboards, sides=best.sides, placement=best.placement, max_texels=most)
+            max_texels = min(int(_CRISPER * budget.most_bytes / best.bytes * best.texels), budget.most_texels or 1 << 40)
+        chosen = replace(config, billboards=best.billboards, sides=best.sides, placement=best.placement, max_texels=max_texels)
         met = budget.target_psnr is None or best.psnr >= budget.target_psnr
         return Choice(chosen.resolve(), tuple(self._trials), self._trials.index(best), met, tuple(self._views.test.names))
 
@@ -263,46 +263,46 @@ class _Trials:
     def _try(self, count: int, sides: Sides, placement: Placement) -> Trial:
         """Run a trial. With a limit in bytes, run up to three, until one is within the limit and uses most of it."""
         limit, trials = self._budget.most_bytes, list[Trial]()
-        most = self._guess(count, self._trials[-1:])
+        max_texels = self._guess(count, self._trials[-1:])
         for _ in range(3):
-            trials.append(trial := self._trial_of(count, sides, placement, most))
-            if limit is None or (trial.bytes <= limit and (trial.bytes > _NEAR * limit or trial.texels < _NEAR * (most or 0))):
+            trials.append(trial := self._trial_of(count, sides, placement, max_texels))
+            if limit is None or (trial.bytes <= limit and (trial.bytes > _NEAR * limit or trial.texels < _NEAR * (max_texels or 0))):
                 break
-            previous, most = most, self._guess(count, trials[-2:])
-            if most == previous:
+            previous, max_texels = max_texels, self._guess(count, trials[-2:])
+            if max_texels == previous:
                 break
         return trials[-1]
 
     def _guess(self, count: int, known: list[Trial]) -> int | None:
         """Estimate the most texels within the limits from the last one or two trials. Bytes are about linear in texels."""
-        limit, most = self._budget.most_bytes, self._budget.most_texels
+        limit, max_texels = self._budget.most_bytes, self._budget.most_texels
         if limit is None:
-            return most
+            return max_texels
         target, texels = 0.95 * limit, 0.95 * limit / _BYTES_A_TEXEL
         if len(known) == 2 and (known[1].bytes - known[0].bytes) * (known[1].texels - known[0].texels) > 0:
             rate = (known[1].bytes - known[0].bytes) / (known[1].texels - known[0].texels)
             texels = known[1].texels + (target - known[1].bytes) / rate
         elif known:
             texels = target * known[-1].texels / known[-1].bytes
-        return max(2 * count, min(int(texels), most or 1 << 40))
+        return max(2 * count, min(int(texels), max_texels or 1 << 40))
 
-    def _trial_of(self, count: int, sides: Sides, placement: Placement, most: int | None) -> Trial:
-        trial = self._trial(count, sides, placement, most)
+    def _trial_of(self, count: int, sides: Sides, placement: Placement, max_texels: int | None) -> Trial:
+        trial = self._trial(count, sides, placement, max_texels)
         self._trials.append(trial)
         self._on_trial(list(self._trials), self._total)
         return trial
 
-    def _trial(self, count: int, sides: Sides, placement: Placement, most: int | None) -> Trial:
+    def _trial(self, count: int, sides: Sides, placement: Placement, max_texels: int | None) -> Trial:
         for trial in self._known:
-            if (trial.billboards, trial.sides, trial.placement, trial.max_texels) == (count, sides, placement, most):
+            if (trial.billboards, trial.sides, trial.placement, trial.max_texels) == (count, sides, placement, max_texels):
                 return trial
         started = time.perf_counter()
         short = {name: value for name, value in _SHORT.items() if getattr(self._config, name) is None}
-        config = replace(self._config, billboards=count, sides=sides, placement=placement, max_texels=most, **short)
+        config = replace(self._config, billboards=count, sides=sides, placement=placement, max_texels=max_texels, **short)
         cloud = fit(self._views, config, tree=self._tree).cloud
         size, seconds = model_bytes(cloud, self._export), time.perf_counter() - started
         score = mean_psnr(cloud, self._views.test)
-        return Trial(count, sides, placement, most, cloud.vertex_count, len(cloud.texels), size, round(score, 3), round(seconds, 1))
+        return Trial(count, sides, placement, max_texels, cloud.vertex_count, len(cloud.texels), size, round(score, 3), round(seconds, 1))
 
 
 def mean_psnr(cloud: BillboardCloud, views: ViewSet) -> float:

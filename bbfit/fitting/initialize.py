@@ -74,7 +74,7 @@ def random_textures(cloud: BillboardCloud, sizes: Tensor, seed: int) -> Billboar
     return replace(cloud, texture_sizes=sizes, texels=texels)
 
 
-def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_meter: float, most: int | None = None) -> BillboardCloud:
+def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_meter: float, max_texels: int | None = None) -> BillboardCloud:
     """Resize billboards to bounds and allocate their textures as :func:`sized` does.
 
     Parameters
@@ -85,16 +85,16 @@ def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_meter: float, most:
         Left, right, bottom and top along the billboards' axes from their centers, in meters, [N, 4].
     texels_a_meter
         Texels per meter along each side.
-    most
+    max_texels
         Most texels of all billboards together.
     """
     left, right, bottom, top = bounds.unbind(-1)
     middle, sides = torch.stack([left + right, bottom + top], -1) / 2, torch.stack([right - left, top - bottom], -1)
     centers = planes.centers + middle[:, :1] * planes.rights + middle[:, 1:] * planes.ups
-    return sized(replace(planes, centers=centers, half_extents=sides / 2), texels_a_meter, most)
+    return sized(replace(planes, centers=centers, half_extents=sides / 2), texels_a_meter, max_texels)
 
 
-def sized(cloud: BillboardCloud, texels_a_meter: float, most: int | None = None) -> BillboardCloud:
+def sized(cloud: BillboardCloud, texels_a_meter: float, max_texels: int | None = None) -> BillboardCloud:
     """Give billboards transparent textures with square texels, and round the rectangles up to whole texels.
 
     Parameters
@@ -102,24 +102,24 @@ def sized(cloud: BillboardCloud, texels_a_meter: float, most: int | None = None)
     cloud
         N billboards.
     texels_a_meter
-        Texels per meter along each side. It is lowered if ``most`` requires it.
-    most
+        Texels per meter along each side. It is lowered if ``max_texels`` requires it.
+    max_texels
         Most texels of all billboards together.
 
     Raises
     ------
     InputError
-        If there are more textures than ``most`` allows texels.
+        If there are more textures than ``max_texels`` allows texels.
     """
     sides = 1 + cloud.two_sided.long()
-    if most is not None and most < int(sides.sum()):
-        fail("max_texels", f"{most} are too few for {int(sides.sum())} textures", "allow more")
+    if max_texels is not None and max_texels < int(sides.sum()):
+        fail("max_texels", f"{max_texels} are too few for {int(sides.sum())} textures", "allow more")
     while True:
         sizes = _at_least_one(2 * cloud.half_extents * texels_a_meter).flip(-1)
         count = int((sizes.prod(-1) * sides).sum())
-        if most is None or count <= most:
+        if max_texels is None or count <= max_texels:
             break
-        texels_a_meter *= min(0.995, math.sqrt(most / count))
+        texels_a_meter *= min(0.995, math.sqrt(max_texels / count))
     half_extents = sizes.flip(-1).to(cloud.half_extents) / texels_a_meter / 2
     return replace(cloud, half_extents=half_extents, texture_sizes=sizes, texels=cloud.texels.new_zeros(1, 4).expand(count, 4))
 
