@@ -99,7 +99,7 @@ def choose(
     *,
     tree: TreeFile | None = None,
     export: ExportConfig | None = None,
-    known: Sequence[Trial] = (),
+    known: Callable[[FitConfig], Trial | None] | None = None,
     on_trial: Callable[[list[Trial], int], None] | None = None,
 ) -> Choice:
     """Choose the number, sides, placement and texel density of billboards for a budget. The test views are not used.
@@ -121,7 +121,7 @@ def choose(
     export
         Options of the export. They determine the size in bytes.
     known
-        Trials of an earlier call with the same arguments, which are not repeated.
+        Called with the configuration of each short fit. Returns the trial of an earlier call, or ``None`` to run the fit; see :func:`lookup`.
     on_trial
         Called after each trial with all trials so far and the expected total number.
 
@@ -140,7 +140,13 @@ def choose(
     if len(views.train) < _SHARE:
         fail("views", f"{len(views.train)} training views are too few for a validation split", f"give at least {_SHARE}")
     split = replace(views, train=views.train.take([index for index in train if index not in validation]), test=views.train.take(validation))
-    return _Trials(split, config, budget, tree, export or ExportConfig(), list(known), on_trial).choice()
+    return _Trials(split, config, budget, tree, export or ExportConfig(), known, on_trial).choice()
+
+
+def lookup(trials: Sequence[Trial]) -> Callable[[FitConfig], Trial | None]:
+    """Return a function that finds the trial of a configuration among those of an earlier call of :func:`choose` with the same arguments."""
+    by_choice = {(trial.billboards, trial.sides, trial.placement, trial.max_texels): trial for trial in trials}
+    return lambda config: by_choice.get((config.billboards, config.sides, config.placement, config.max_texels))  # type: ignore[arg-type]
 
 
 def within_bytes(cloud: BillboardCloud, max_bytes: int | None, export: ExportConfig) -> BillboardCloud:
@@ -182,11 +188,11 @@ class _Trials:
         budget: BudgetConfig,
         tree: TreeFile | None,
         export: ExportConfig,
-        known: list[Trial],
+        known: Callable[[FitConfig], Trial | None] | None,
         on_trial: Callable[[list[Trial], int], None] | None,
     ) -> None:
         self._views, self._config, self._budget, self._tree, self._export = views, config, budget, tree, export
-        self._known, self._on_trial = known, on_trial or (lambda trials, total: None)
+        self._known, self._on_trial = known or (lambda config: None), on_trial or (lambda trials, total: None)
         self._trials: list[Trial] = []
         vertices = 4 if config.sides == "one" else 8
         max_count = COUNTS[-1] if budget.vertices is None else min(COUNTS[-1], budget.vertices // vertices)
@@ -293,12 +299,11 @@ class _Trials:
         return trial
 
     def _trial(self, count: int, sides: Sides, placement: Placement, max_texels: int | None) -> Trial:
-        for trial in self._known:
-            if (trial.billboards, trial.sides, trial.placement, trial.max_texels) == (count, sides, placement, max_texels):
-                return trial
-        started = time.perf_counter()
         short = {name: value for name, value in _SHORT.items() if getattr(self._config, name) is None}
         config = replace(self._config, billboards=count, sides=sides, placement=placement, max_texels=max_texels, **short)
+        if (known := self._known(config)) is not None:
+            return known
+        started = time.perf_counter()
         cloud = fit(self._views, config, tree=self._tree).cloud
         size, seconds = model_bytes(cloud, self._export), time.perf_counter() - started
         score = mean_psnr(cloud, self._views.test)

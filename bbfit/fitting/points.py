@@ -18,8 +18,8 @@ COUNT = 20_000
 """Default number of points."""
 # Least fraction of the mesh's points, averaged over views, that must project onto the tree in the views.
 _AGREEMENT = 0.95
-# Random points that are carved at a time, and the most rounds.
-_CARVED, _ROUNDS = 1 << 18, 64
+# Most batches of random points.
+_ROUNDS = 64
 # Least side of the silhouettes that carve the hull, in pixels.
 _HULL_SIDE = 256
 
@@ -66,7 +66,7 @@ def mesh_points(tree: TreeFile, views: ViewSet, *, count: int = COUNT, seed: int
     return points
 
 
-def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
+def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0, batch: int = 1 << 18) -> Tensor:
     """Sample points uniformly in the visual hull (Laurentini 1994), the space that no view shows as background.
 
     Parameters
@@ -77,6 +77,8 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
         Most points P.
     seed
         Seed of the sampling.
+    batch
+        Number of random points to carve at a time.
 
     Returns
     -------
@@ -99,7 +101,7 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
     low, high = center - extent / 2, center + extent / 2
     generator, batches = torch.Generator().manual_seed(seed), list[Tensor]()
     for _ in range(_ROUNDS):
-        points = low + (high - low) * torch.rand(_CARVED, 3, dtype=torch.float64, generator=generator)
+        points = low + (high - low) * torch.rand(batch, 3, dtype=torch.float64, generator=generator)
         for index, mask in enumerate(masks):
             points = points[_inside(points, cameras[index], mask, outside=cropped[index])]
         batches.append(points)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import itemgetter
 
 import torch
@@ -25,12 +25,8 @@ from bbfit.views import ViewSet
 
 SIDE = 64
 """Approximate side of the pictures that the search renders, in pixels."""
-# Steps of every candidate, further steps of the survivors, and steps of every alternative in additions and refinement rounds.
-_STEPS, _MORE_STEPS, _MEND_STEPS = 30, 50, 40
 # Learning rate of the candidates, and of everything after them.
 _RATE, _LATER_RATE = 0.15, 0.06
-# Fraction of the candidates that survive.
-_SURVIVORS = 0.3
 # A clustering supplies three quarters of the billboards, and additions the rest, one in _ADDED. Alternatives for each addition, and in
 # every refinement round, which include the unchanged cloud.
 _ADDED, _ADDITIONS, _REVISIONS = 4, 4, 5
@@ -42,8 +38,26 @@ _NEAR, _PLANES = 0.08, 150
 _MARGIN = 0.06
 
 
+@dataclass(frozen=True)
+class Effort:
+    """The length of the parts of a search."""
+
+    steps: int = 30
+    """Steps of every candidate."""
+    more_steps: int = 50
+    """Further steps of the surviving candidates."""
+    mend_steps: int = 40
+    """Steps of every alternative in additions and refinement rounds."""
+    survivors: float = 0.3
+    """Fraction of the candidates that survive."""
+
+
+USUAL = Effort()
+"""The effort of every fit."""
+
+
 def find_placement(
-    views: ViewSet, points: Tensor, config: FitConfig, on_progress: Callable[[int, int], None] | None = None
+    views: ViewSet, points: Tensor, config: FitConfig, on_progress: Callable[[int, int], None] | None = None, effort: Effort = USUAL
 ) -> BillboardCloud:
     """Search for the placement of billboards that explains the training views best at a low resolution.
 
@@ -66,18 +80,22 @@ def find_placement(
         A resolved configuration.
     on_progress
         Called after every step with the work done and the total work, in steps of one candidate.
+    effort
+        Length of the parts of the search.
 
     Returns
     -------
     BillboardCloud
         The placed billboards with fitted textures, float32 on the CPU. The texel density is that of pictures of about :data:`SIDE` pixels.
     """
-    return _Search(views, points, config, on_progress or (lambda done, total: None)).best()
+    return _Search(views, points, config, on_progress or (lambda done, total: None), effort).best()
 
 
 class _Search:
-    def __init__(self, views: ViewSet, points: Tensor, config: FitConfig, on_progress: Callable[[int, int], None]) -> None:
-        self._config, self._points, self._on_progress = replace(config.coarse(), ssim_weight=0.0), points, on_progress
+    def __init__(
+        self, views: ViewSet, points: Tensor, config: FitConfig, on_progress: Callable[[int, int], None], effort: Effort = USUAL
+    ) -> None:
+        self._config, self._points, self._on_progress, self._effort = replace(config.coarse(), ssim_weight=0.0), points, on_progress, effort
         side = min(views.cameras.width, views.cameras.height)
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))
@@ -91,13 +109,13 @@ class _Search:
         self._colors = point_colors(self._pixels, self._pictures)
         self._radius = tree_radius(views)
         self._added = config.billboards // _ADDED
-        self._clusters, self._survivors = config.billboards - self._added, max(1, round(_SURVIVORS * config.candidates))
+        self._clusters, self._survivors = config.billboards - self._added, max(1, round(effort.survivors * config.candidates))
         self._generator, self._proposed, self._done = torch.Generator().manual_seed(config.seed), 0, 0
         # Clouds that get additions. Every addition halves their number, and few billboards limit it, so that the search stays short.
         self._chains = min(self._survivors, max(1, config.billboards // 2))
         completed = sum(max(1, self._chains >> addition) for addition in range(self._added))
-        each = _STEPS * config.candidates + _MORE_STEPS * self._survivors + _MEND_STEPS * _ADDITIONS * completed
-        self._total = config.restarts * each + _MEND_STEPS * _REVISIONS * config.refinement_rounds
+        each = effort.steps * config.candidates + effort.more_steps * self._survivors + effort.mend_steps * _ADDITIONS * completed
+        self._total = config.restarts * each + effort.mend_steps * _REVISIONS * config.refinement_rounds
 
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
@@ -112,9 +130,9 @@ class _Search:
         config = self._config
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:
             clouds = list(pool.map(self._clustered, range(number * config.candidates, (number + 1) * config.candidates)))
-        clouds, losses = self._fitted(clouds, _STEPS, _RATE)
+        clouds, losses = self._fitted(clouds, self._effort.steps, _RATE)
         survivors = sorted(range(len(clouds)), key=losses.__getitem__)[: self._survivors]
-        clouds, losses = self._fitted([clouds[index] for index in survivors], _MORE_STEPS, _LATER_RATE)
+        clouds, losses = self._fitted([clouds[index] for index in survivors], self._effort.more_steps, _LATER_RATE)
         best = sorted(zip(clouds, losses, strict=True), key=itemgetter(1))[: self._chains]
         for _ in range(self._added):
             best = sorted((self._best_of(self._extended(cloud)) for cloud, _ in best), key=itemgetter(1))
@@ -123,7 +141,7 @@ class _Search:
 
     def _best_of(self, clouds: list[BillboardCloud]) -> tuple[BillboardCloud, float]:
         """Fit clouds for some steps. Return the best one and its loss."""
-        return min(zip(*self._fitted(clouds, _MEND_STEPS, _LATER_RATE), strict=True), key=itemgetter(1))
+        return min(zip(*self._fitted(clouds, self._effort.mend_steps, _LATER_RATE), strict=True), key=itemgetter(1))
 
     def _without(self, cloud: BillboardCloud) -> list[tuple[BillboardCloud, Tensor]]:
         """Remove each billboard in turn. Return the clouds and their losses of every pixel, the least mean loss first."""

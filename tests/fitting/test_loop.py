@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bbfit.checks import InputError
+from bbfit.checks import InputError, MissingFileError
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
 from bbfit.fitting.levels import LEAST_SIDE
@@ -182,10 +182,10 @@ def test_a_checkpoint_that_does_not_fit_is_not_used(views: ViewDataset, tmp_path
 
 def test_held_out_views_are_not_opened(views_folder: Path) -> None:
     views = ViewDataset.load(views_folder)
-    opened = []
-    test = dataclasses.replace(views.test, _cache=type("Watch", (), {"get": lambda self, path: opened.append(path)})())
-    fit(dataclasses.replace(views, test=test), quick(billboards=1, steps=2))
-    assert opened == []
+    missing = dataclasses.replace(views.test, paths=tuple(path.with_name("missing.png") for path in views.test.paths))
+    with pytest.raises(MissingFileError):
+        missing.image(0)
+    fit(dataclasses.replace(views, test=missing), quick(billboards=1, steps=2))
 
 
 def test_batches_deal_every_view_equally_often() -> None:
@@ -252,15 +252,15 @@ def test_unknown_device_is_refused(views: ViewDataset) -> None:
 @pytest.mark.parametrize("cutoff", [0.3, 0.5])
 def test_a_fit_for_mask_is_better_cut_off_than_one_for_blend(data_views: ViewDataset, cutoff: float) -> None:
     """And covers as much of views that it was not fitted to as the tree does; it is drawn with the texels that 8 bits hold."""
-    config = FitConfig(billboards=4, placement="even", placement_learning_rate=0, alpha_cutoff=cutoff)
+    config = FitConfig(billboards=3, placement="even", placement_learning_rate=0, alpha_cutoff=cutoff, steps=100)
     masked, blended = (fit(data_views, dataclasses.replace(config, alpha=alpha)).cloud for alpha in ("mask", "blend"))
     assert masked.alpha == AlphaMode("mask", cutoff) and blended.alpha == AlphaMode("blend", cutoff)
     cut = dataclasses.replace(blended, alpha=masked.alpha)
     test = data_views.test
     gain = over_white(masked, test) - over_white(cut, test)
-    assert gain > 0.5  # measured: 0.86 and 0.82 dB
+    assert gain > 0.5  # measured: 0.57 and 0.58 dB
     covered = render_reference(masked, test.cameras)[..., 3].mean() / test.targets(range(len(test)))[..., 3].mean()
-    assert abs(float(covered) - 1) < 0.04  # measured: 0.01 to 0.02
+    assert abs(float(covered) - 1) < 0.04  # measured: 0.015 and 0.017
     assert torch.equal((masked.texels * 255).round() / 255, masked.texels)
 
 

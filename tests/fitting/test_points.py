@@ -307,11 +307,10 @@ def test_nothing_is_lost_of_silhouettes_that_are_shrunk() -> None:
     torch.testing.assert_close(whole, expected, atol=1e-9, rtol=0)
 
 
-def test_a_hull_that_few_points_hit_is_found_in_several_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hull_that_few_points_hit_is_found_in_several_rounds() -> None:
     """One in a hundred of the first round lies in this ball; later rounds look around where these were, and as evenly."""
-    monkeypatch.setattr("bbfit.fitting.points._CARVED", 1 << 14)
     radius = 0.3
-    points = hull_points(ball_views(12, 64, 64, radius), count=4000)
+    points = hull_points(ball_views(12, 64, 64, radius), count=4000, batch=1 << 14)
     assert len(points) == 4000
     low, high = points.amin(0), points.amax(0)
     assert (low < -radius + 0.03).all() and (high > radius - 0.03).all()
@@ -328,13 +327,12 @@ def test_seen_from_above_or_below_the_hull_of_a_ball_is_not_much_more_either(ele
     assert radius < points.norm(dim=-1).max() < 1.1 * radius / math.cos(math.radians(elevation))
 
 
-def test_silhouettes_that_contradict_each_other_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silhouettes_that_contradict_each_other_are_refused() -> None:
     """Nothing can be on the left from all sides."""
-    monkeypatch.setattr("bbfit.fitting.points._CARVED", 1 << 14)  # dozens of vain rounds take a while
     pictures = torch.zeros(4, 32, 32, 4, dtype=torch.uint8)
     pictures[:, 8:24, 2:10] = 255
     with pytest.raises(InputError, match=r"^views: .*no point in common"):
-        hull_points(viewset(pictures, ring_around_origin(4, 32, 32)))
+        hull_points(viewset(pictures, ring_around_origin(4, 32, 32)), batch=1 << 14)  # dozens of vain rounds take a while
 
 
 # Colors
