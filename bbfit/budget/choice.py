@@ -121,7 +121,7 @@ def choose(
     export
         Options of the export. They determine the size in bytes.
     known
-        Called with the configuration of each short fit. Returns the trial of an earlier call, or ``None`` to run the fit; see :func:`lookup`.
+        Called with the configuration of each short fit. Returns its trial from an earlier call, or ``None``; see :func:`lookup`.
     on_trial
         Called after each trial with all trials so far and the expected total number.
 
@@ -144,7 +144,7 @@ def choose(
 
 
 def lookup(trials: Sequence[Trial]) -> Callable[[FitConfig], Trial | None]:
-    """Return a function that finds the trial of a configuration among those of an earlier call of :func:`choose` with the same arguments."""
+    """Return a function that finds the trial of a configuration among those of an earlier call with the same arguments."""
     by_choice = {(trial.billboards, trial.sides, trial.placement, trial.max_texels): trial for trial in trials}
     return lambda config: by_choice.get((config.billboards, config.sides, config.placement, config.max_texels))  # type: ignore[arg-type]
 
