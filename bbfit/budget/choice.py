@@ -28,22 +28,22 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """Numbers of billboards to try, in addition to the largest number that the limit of vertices allows, up to the last number."""
 MIN_GAIN_DB = 0.75
 """Least gain, in dB, for which ``auto`` doubles the number of billboards."""
-# One in _SHARE training views is for validation.
-_SHARE = 5
+# Every fifth training view is for validation.
+_VALIDATION_EVERY = 5
 # Options of short fits that the configuration leaves open.
 _SHORT: dict[str, Any] = {"steps": 160, "views_per_step": 2, "restarts": 1}
 # Number of larger counts without a gain after which the trials of a budget of texels or bytes end.
-_IN_VAIN = 2
+_PATIENCE = 2
 # Random difference between two short fits, in dB.
-_LUCK = 0.15
+_NOISE_DB = 0.15
 # Fractions of the texels that are also tried, for the curve.
-_LESS = (0.5, 0.25)
+_CURVE_FRACTIONS = (0.5, 0.25)
 # Initial estimate of the bytes per texel.
-_BYTES_A_TEXEL = 2.0
+_BYTES_PER_TEXEL = 2.0
 # Factor on the texels of the full fit, whose textures compress better than those of a short fit.
-_CRISPER = 1.05
+_COMPRESSION_GAIN = 1.05
 # Least fraction of a limit in bytes that a trial has to use.
-_NEAR = 0.6
+_MIN_USE = 0.6
 
 
 @dataclass(frozen=True)
@@ -136,9 +136,9 @@ def choose(
     if config.preset != "default":
         fail("preset", f"{config.preset!r} cannot be combined with a budget", "leave out one of them")
     train = range(len(views.train))
-    validation = [index for index in train if index % _SHARE == _SHARE // 2]
-    if len(views.train) < _SHARE:
-        fail("views", f"{len(views.train)} training views are too few for a validation split", f"give at least {_SHARE}")
+    validation = [index for index in train if index % _VALIDATION_EVERY == _VALIDATION_EVERY // 2]
+    if len(views.train) < _VALIDATION_EVERY:
+        fail("views", f"{len(views.train)} training views are too few for a validation split", f"give at least {_VALIDATION_EVERY}")
     split = replace(views, train=views.train.take([index for index in train if index not in validation]), test=views.train.take(validation))
     return _Trials(split, config, budget, tree, export or ExportConfig(), known, on_trial).choice()
 
@@ -199,7 +199,7 @@ class _Trials:
         if max_count < 1:
             fail("vertices", f"{budget.vertices} are too few for one billboard of sides {config.sides!r}", "allow more, or sides one")
         self._counts = sorted({count for count in COUNTS if count < max_count} | {max_count})
-        self._total = len(self._counts) + 2 + len(_LESS) * (budget.texels is not None or budget.bytes is not None)
+        self._total = len(self._counts) + 2 + len(_CURVE_FRACTIONS) * (budget.texels is not None or budget.bytes is not None)
 
     def choice(self) -> Choice:
         """See :func:`choose`."""
@@ -219,11 +219,11 @@ class _Trials:
                 self._try(count, config.sides, "even")
             best = max([best, *filter(self._is_within_budget, self._trials[before:])], key=lambda trial: trial.psnr)
             if budget.texels is not None or budget.bytes is not None:  # fewer texels, for the curve
-                for fraction in _LESS:
-                    self._trial_of(best.billboards, best.sides, best.placement, max(2 * count, int(fraction * best.texels)))
+                for fraction in _CURVE_FRACTIONS:
+                    self._trial(best.billboards, best.sides, best.placement, max(2 * count, int(fraction * best.texels)))
         max_texels = best.max_texels
         if budget.most_bytes is not None:
-            max_texels = min(int(_CRISPER * budget.most_bytes / best.bytes * best.texels), budget.most_texels or 1 << 40)
+            max_texels = min(int(_COMPRESSION_GAIN * budget.most_bytes / best.bytes * best.texels), budget.most_texels or 1 << 40)
         chosen = replace(config, billboards=best.billboards, sides=best.sides, placement=best.placement, max_texels=max_texels)
         met = budget.target_psnr is None or best.psnr >= budget.target_psnr
         return Choice(chosen.resolve(), tuple(self._trials), self._trials.index(best), met, tuple(self._views.test.names))
@@ -237,7 +237,7 @@ class _Trials:
             return all(_gain(series[-1 - back], series[-2 - back]) < MIN_GAIN_DB for back in (0, 1))
         if budget.texels is not None or budget.bytes is not None:
             best = max(range(len(series)), key=lambda index: series[index].psnr)
-            return len(series) - 1 - best >= _IN_VAIN
+            return len(series) - 1 - best >= _PATIENCE
         return False
 
     def _is_within_budget(self, trial: Trial) -> bool:
@@ -252,7 +252,7 @@ class _Trials:
             first = self._trials[0]
             fail("budget", f"{first.billboards} billboard with {first.bytes:,} bytes exceeds it", "allow more")
         best = max(allowed, key=lambda trial: trial.psnr)
-        equivalent = [trial for trial in allowed if trial.psnr >= best.psnr - _LUCK]
+        equivalent = [trial for trial in allowed if trial.psnr >= best.psnr - _NOISE_DB]
         sign = 1 if budget.vertices is not None else -1  # use all vertices that the budget allows, or draw as few as possible
         best = max(equivalent, key=lambda trial: (sign * trial.vertices, trial.psnr))
         if budget.target_psnr is not None:
@@ -271,8 +271,8 @@ class _Trials:
         limit, trials = self._budget.most_bytes, list[Trial]()
         max_texels = self._guess(count, self._trials[-1:])
         for _ in range(3):
-            trials.append(trial := self._trial_of(count, sides, placement, max_texels))
-            if limit is None or (trial.bytes <= limit and (trial.bytes > _NEAR * limit or trial.texels < _NEAR * (max_texels or 0))):
+            trials.append(trial := self._trial(count, sides, placement, max_texels))
+            if limit is None or (trial.bytes <= limit and (trial.bytes > _MIN_USE * limit or trial.texels < _MIN_USE * (max_texels or 0))):
                 break
             previous, max_texels = max_texels, self._guess(count, trials[-2:])
             if max_texels == previous:
@@ -284,7 +284,7 @@ class _Trials:
         limit, max_texels = self._budget.most_bytes, self._budget.most_texels
         if limit is None:
             return max_texels
-        target, texels = 0.95 * limit, 0.95 * limit / _BYTES_A_TEXEL
+        target, texels = 0.95 * limit, 0.95 * limit / _BYTES_PER_TEXEL
         if len(known) == 2 and (known[1].bytes - known[0].bytes) * (known[1].texels - known[0].texels) > 0:
             rate = (known[1].bytes - known[0].bytes) / (known[1].texels - known[0].texels)
             texels = known[1].texels + (target - known[1].bytes) / rate
@@ -292,22 +292,20 @@ class _Trials:
             texels = target * known[-1].texels / known[-1].bytes
         return max(2 * count, min(int(texels), max_texels or 1 << 40))
 
-    def _trial_of(self, count: int, sides: Sides, placement: Placement, max_texels: int | None) -> Trial:
-        trial = self._trial(count, sides, placement, max_texels)
+    def _trial(self, count: int, sides: Sides, placement: Placement, max_texels: int | None) -> Trial:
+        """Add the trial of a configuration. Run a short fit unless the trial is known."""
+        short = {name: value for name, value in _SHORT.items() if getattr(self._config, name) is None}
+        config = replace(self._config, billboards=count, sides=sides, placement=placement, max_texels=max_texels, **short)
+        trial = self._known(config)
+        if trial is None:
+            started = time.perf_counter()
+            cloud = fit(self._views, config, tree=self._tree).cloud
+            size, seconds = model_bytes(cloud, self._export), round(time.perf_counter() - started, 1)
+            psnr = round(mean_psnr(cloud, self._views.test), 3)
+            trial = Trial(count, sides, placement, max_texels, cloud.vertex_count, len(cloud.texels), size, psnr, seconds)
         self._trials.append(trial)
         self._on_trial(list(self._trials), self._total)
         return trial
-
-    def _trial(self, count: int, sides: Sides, placement: Placement, max_texels: int | None) -> Trial:
-        short = {name: value for name, value in _SHORT.items() if getattr(self._config, name) is None}
-        config = replace(self._config, billboards=count, sides=sides, placement=placement, max_texels=max_texels, **short)
-        if (known := self._known(config)) is not None:
-            return known
-        started = time.perf_counter()
-        cloud = fit(self._views, config, tree=self._tree).cloud
-        size, seconds = model_bytes(cloud, self._export), time.perf_counter() - started
-        score = mean_psnr(cloud, self._views.test)
-        return Trial(count, sides, placement, max_texels, cloud.vertex_count, len(cloud.texels), size, round(score, 3), round(seconds, 1))
 
 
 def mean_psnr(cloud: BillboardCloud, views: ViewSet) -> float:

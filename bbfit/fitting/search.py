@@ -27,9 +27,10 @@ SIDE = 64
 """Approximate side of the pictures that the search renders, in pixels."""
 # Learning rate of the candidates, and of everything after them.
 _RATE, _LATER_RATE = 0.15, 0.06
-# A clustering supplies three quarters of the billboards, and additions the rest, one in _ADDED. Alternatives for each addition, and in
-# every refinement round, which include the unchanged cloud.
-_ADDED, _ADDITIONS, _REVISIONS = 4, 4, 5
+# A clustering supplies three quarters of the billboards. Additions supply the rest, one in four.
+_BILLBOARDS_PER_ADDITION = 4
+# Alternatives for each addition, and alternatives in each refinement round, which include the unchanged cloud.
+_ADDITION_WAYS, _REFINEMENT_WAYS = 4, 5
 # Views in every step.
 _BATCH = 8
 # Random planes that are scored for a new billboard. The plane takes the points within _NEAR times the tree's radius.
@@ -108,14 +109,14 @@ class _Search:
         self._all_upright = config.orientation == "upright"
         self._colors = point_colors(self._pixels, self._pictures)
         self._radius = tree_radius(views)
-        self._added = config.billboards // _ADDED
+        self._added = config.billboards // _BILLBOARDS_PER_ADDITION
         self._clusters, self._survivors = config.billboards - self._added, max(1, round(effort.survivors * config.candidates))
         self._generator, self._proposed, self._done = torch.Generator().manual_seed(config.seed), 0, 0
         # Clouds that get additions. Every addition halves their number, and few billboards limit it, so that the search stays short.
         self._chains = min(self._survivors, max(1, config.billboards // 2))
         completed = sum(max(1, self._chains >> addition) for addition in range(self._added))
-        each = effort.steps * config.candidates + effort.more_steps * self._survivors + effort.mend_steps * _ADDITIONS * completed
-        self._total = config.restarts * each + effort.mend_steps * _REVISIONS * config.refinement_rounds
+        each = effort.steps * config.candidates + effort.more_steps * self._survivors + effort.mend_steps * _ADDITION_WAYS * completed
+        self._total = config.restarts * each + effort.mend_steps * _REFINEMENT_WAYS * config.refinement_rounds
 
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
@@ -160,13 +161,13 @@ class _Search:
     def _extended(self, cloud: BillboardCloud) -> list[BillboardCloud]:
         """Add one billboard to a cloud in several ways: split a billboard, or place one where the loss is large."""
         weight = self._weights(self._losses(cloud))
-        return [self._split(cloud, weight), *(self._with_another(cloud, weight) for _ in range(_ADDITIONS - 1))]
+        return [self._split(cloud, weight), *(self._with_another(cloud, weight) for _ in range(_ADDITION_WAYS - 1))]
 
     def _revised(self, cloud: BillboardCloud, number: int) -> list[BillboardCloud]:
         """Change a cloud in the four ways of refinement round ``number``; see :func:`find_placement`."""
         if len(cloud) == 1:
             weight = self._weights(self._losses(cloud))
-            return [self._proposal(weight) for _ in range(_REVISIONS - 1)]
+            return [self._proposal(weight) for _ in range(_REFINEMENT_WAYS - 1)]
         without = self._without(cloud)
         (first, losses), (second, second_losses) = (without[(2 * number + k) % min(4, len(without))] for k in range(2))
         weight = self._weights(losses)
