@@ -222,7 +222,7 @@ def test_a_limit_of_texels_holds_in_the_result(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("config", "says"),
     [
-        (dataclasses.replace(CONFIG, fit=dataclasses.replace(FIT, billboards=2)), "billboards: 2 are asked for and a budget"),
+        (dataclasses.replace(CONFIG, fit=dataclasses.replace(FIT, billboards=2)), "billboards: 2 are requested in addition to a budget"),
         (RunConfig(fit=FitConfig(preset="thesis"), budget=BudgetConfig(vertices=8)), "preset: 'thesis'"),
         (RunConfig(fit=FitConfig(sides="two"), budget=BudgetConfig(vertices=4)), "vertices: 4 are too few"),
     ],

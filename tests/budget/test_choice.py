@@ -14,7 +14,7 @@ import pytest
 import torch
 from billboard_scene import crossing_billboards
 
-from bbfit.budget.choice import COUNTS, WORTH_DB, Choice, Trial, choose, lookup, mean_psnr, model_bytes, pareto_front, within_bytes
+from bbfit.budget.choice import COUNTS, MIN_GAIN_DB, Choice, Trial, choose, lookup, mean_psnr, model_bytes, pareto_front, within_bytes
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError
 from bbfit.evaluation.scoring import evaluate
@@ -439,7 +439,7 @@ def test_auto_stops_at_the_knee(choosing: Choosing) -> None:
     assert world.others == [(2, "two", "clusters")]
 
 
-@pytest.mark.parametrize(("gain", "last"), [(WORTH_DB + 0.01, COUNTS[-1]), (WORTH_DB - 0.01, 1)])
+@pytest.mark.parametrize(("gain", "last"), [(MIN_GAIN_DB + 0.01, COUNTS[-1]), (MIN_GAIN_DB - 0.01, 1)])
 def test_auto_goes_as_far_as_it_pays(choosing: Choosing, gain: float, last: int) -> None:
     """By what a doubling gains, though most steps are smaller than that."""
     world = World(lambda count, sides, placement: 20 + gain * math.log2(count) - (sides != "one") - (placement == "even"))
@@ -604,14 +604,14 @@ def test_each_trial_is_told(views: ViewDataset) -> None:
             FitConfig(billboards=3),
             BudgetConfig(vertices=8),
             12,
-            "^billboards: 3 are asked for and a budget as well; leave one of them out$",
+            "^billboards: 3 are requested in addition to a budget; leave out one of them$",
         ),
-        (FitConfig(preset="thesis"), BudgetConfig(auto=True), 12, "^preset: 'thesis' is a schedule of its own"),
-        (FitConfig(), BudgetConfig(vertices=8), 4, "^views: 4 training views leave none for validation; give at least 5$"),
-        (FitConfig(), BudgetConfig(vertices=8), 1, "^views: 1 training views leave none"),
+        (FitConfig(preset="thesis"), BudgetConfig(auto=True), 12, "^preset: 'thesis' cannot be combined with a budget"),
+        (FitConfig(), BudgetConfig(vertices=8), 4, "^views: 4 training views are too few for a validation split; give at least 5$"),
+        (FitConfig(), BudgetConfig(vertices=8), 1, "^views: 1 training views are too few"),
         (FitConfig(sides="two"), BudgetConfig(vertices=7), 12, "^vertices: 7 are too few for one billboard of sides 'two'; allow more"),
         (FitConfig(sides="pair"), BudgetConfig(vertices=4), 12, "^vertices: 4 are too few for one billboard of sides 'pair'"),
-        (FitConfig(), BudgetConfig(bytes=100), 12, r"^budget: 1 billboard with \d,\d+ bytes is too much for it; allow more$"),
+        (FitConfig(), BudgetConfig(bytes=100), 12, r"^budget: 1 billboard with \d,\d+ bytes exceeds it; allow more$"),
     ],
 )
 def test_what_cannot_be_chosen(views: ViewDataset, config: FitConfig, budget: BudgetConfig, count: int, says: str) -> None:

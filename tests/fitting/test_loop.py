@@ -14,7 +14,7 @@ from bbfit.checks import InputError, MissingFileError
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
 from bbfit.fitting.levels import LEAST_SIDE
-from bbfit.fitting.loop import FitResult, ResolutionLevel, Step, drawn_as, fit, learning_rate, levels_of, sample_views
+from bbfit.fitting.loop import FitResult, ResolutionLevel, Step, fit, learning_rate, resolution_levels, sample_views, step_alpha
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
@@ -117,12 +117,12 @@ def test_the_fused_fit_is_the_reference_fit(views: ViewDataset, config: FitConfi
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 4, 11, 300])
 def test_levels_share_the_steps(views: ViewDataset, steps: int) -> None:
-    levels = levels_of(FitConfig(steps=steps).resolve(), views.train.cameras)
+    levels = resolution_levels(FitConfig(steps=steps).resolve(), views.train.cameras)
     assert levels[0].begin == 0 and levels[-1].end == steps and levels[-1].halvings == 0
     assert all(a.end == b.begin and a.halvings == b.halvings + 1 for a, b in pairwise(levels))
     assert max(level.end - level.begin for level in levels) - min(level.end - level.begin for level in levels) <= 1
     assert min(views.train.cameras.width, views.train.cameras.height) >> levels[0].halvings >= LEAST_SIDE
-    assert len(levels_of(FitConfig(preset="thesis").resolve(), views.train.cameras)) == 1
+    assert len(resolution_levels(FitConfig(preset="thesis").resolve(), views.train.cameras)) == 1
 
 
 def test_same_seed_same_result_other_seed_another(views: ViewDataset) -> None:
@@ -155,7 +155,7 @@ def test_a_snapshot_is_a_copy_of_the_cloud_at_its_level(views: ViewDataset) -> N
     config, seen = quick(alpha="blend", billboards=2, placement="even", placement_learning_rate=0, steps=8), []
     result = fit(views, config, on_step=lambda step: seen.append(step.snapshot()))
     sizes = [tuple(cloud.texture_sizes[0].tolist()) for cloud in seen]
-    assert sizes == sorted(sizes) and len(set(sizes)) == len(levels_of(config.resolve(), views.train.cameras)) > 1
+    assert sizes == sorted(sizes) and len(set(sizes)) == len(resolution_levels(config.resolve(), views.train.cameras)) > 1
     assert not torch.equal(seen[-1].texels, seen[-2].texels)
     visible = result.cloud.texels[:, 3] > 0
     assert torch.equal(seen[-1].texels[visible], result.cloud.texels[visible])
@@ -267,11 +267,11 @@ def test_a_fit_for_mask_is_better_cut_off_than_one_for_blend(data_views: ViewDat
 def test_a_mask_hardens_at_full_resolution_only() -> None:
     config = FitConfig(steps=80).resolve()
     coarse, fine = ResolutionLevel(1, 40, 60), ResolutionLevel(0, 60, 80)
-    assert all(drawn_as(config, coarse, index) == AlphaMode() for index in range(40, 60))
-    modes = [drawn_as(config, fine, index) for index in range(60, 80)]
+    assert all(step_alpha(config, coarse, index) == AlphaMode() for index in range(40, 60))
+    modes = [step_alpha(config, fine, index) for index in range(60, 80)]
     hardness = [mode.hardness for mode in modes]
     assert hardness[0] == 2 and hardness == sorted(hardness) and math.isinf(hardness[6]) and math.isinf(hardness[-1])
     assert all(mode.kind == "mask" and mode.cutoff == 0.5 for mode in modes)
-    assert drawn_as(FitConfig(alpha_cutoff=0.1).resolve(), ResolutionLevel(0, 0, 8), 0).hardness == 5
+    assert step_alpha(FitConfig(alpha_cutoff=0.1).resolve(), ResolutionLevel(0, 0, 8), 0).hardness == 5
     for alpha in ("blend", "hash"):
-        assert drawn_as(FitConfig(alpha=alpha).resolve(), fine, 79) == AlphaMode()
+        assert step_alpha(FitConfig(alpha=alpha).resolve(), fine, 79) == AlphaMode()

@@ -11,7 +11,7 @@ import torch
 from bbfit.checks import InputError
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import bounded, sized, start_cloud
-from bbfit.fitting.loop import fit, levels_of
+from bbfit.fitting.loop import fit, resolution_levels
 from bbfit.geometry.cloud import TENSORS, BillboardCloud, even_upright
 from bbfit.views import ViewDataset
 
@@ -126,7 +126,7 @@ def test_a_fit_keeps_the_limit_at_every_level_and_in_its_result(views: ViewDatas
     most, seen = 800, list[int]()
     asked = config(**kind, max_texels=most)
     result = fit(views, asked, on_step=lambda step: seen.append(len(step.snapshot().texels)))
-    for level in levels_of(asked.resolve(), views.train.cameras):
+    for level in resolution_levels(asked.resolve(), views.train.cameras):
         for count in seen[level.begin : level.end]:  # halved sides are rounded up
             assert 0.7 * most < count * 4**level.halvings and count <= most
     assert len(seen) == 8 and seen[-1] > 0.7 * most

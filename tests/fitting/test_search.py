@@ -180,22 +180,22 @@ def kept(cloud: BillboardCloud, other: BillboardCloud) -> list[int]:
 
 
 def test_points_belong_to_the_billboard_that_moves_them_least(search: _Search, clustered: BillboardCloud, points: torch.Tensor) -> None:
-    carried = search._carried(clustered)
+    carried = search._nearest(clustered)
     axes = torch.stack([clustered.rights, clustered.ups, clustered.normals], 1).double()
     local = torch.einsum("nij,pnj->pni", axes, points[:, None] - clustered.centers.double())
     inside = torch.minimum(torch.maximum(local[..., :2], -clustered.half_extents.double()), clustered.half_extents.double())
     moved = torch.cat([local[..., :2] - inside, local[..., 2:]], -1)
-    seen = torch.einsum("pni,nij,jk,nlk,pnl->pn", moved[..., 2:], axes[:, 2:], search._seen, axes[:, 2:], moved[..., 2:])
+    seen = torch.einsum("pni,nij,jk,nlk,pnl->pn", moved[..., 2:], axes[:, 2:], search._projection, axes[:, 2:], moved[..., 2:])
     assert torch.equal(carried, (seen + moved[..., :2].square().sum(-1)).argmin(-1))
     assert len(carried.unique()) == len(clustered)
     # Beyond a rectangle's border its plane is of no use.
     narrow = clustered.take([0, 0])
     narrow.half_extents[1] *= 0.1
-    assert search._carried(narrow).bincount(minlength=2)[1] < 0.1 * len(points)
+    assert search._nearest(narrow).bincount(minlength=2)[1] < 0.1 * len(points)
 
 
 def test_splitting_puts_two_nearer_to_the_points_of_one(search: _Search, clustered: BillboardCloud, points: torch.Tensor) -> None:
-    carried = search._carried(clustered)
+    carried = search._nearest(clustered)
     for lossy in range(len(clustered)):
         split = search._split(clustered, torch.where(carried == lossy, 1.0, 1e-12).double())
         assert len(split) == len(clustered) + 1
@@ -218,7 +218,7 @@ def test_merging_takes_two_that_lie_almost_on_one_plane(
     merged = search._merged(cloud, turn)
     assert len(merged) == 3
     given_up = [k for k in range(4) if k not in kept(cloud, merged)]
-    held = points[torch.isin(search._carried(cloud), torch.tensor(given_up))]
+    held = points[torch.isin(search._nearest(cloud), torch.tensor(given_up))]
     least = best_planes(moments(held, torch.zeros(len(held), dtype=torch.int64), 1), upright=False)[2]
     assert float(on_planes(merged.take([2]), held)) == pytest.approx(float((least / len(held)).sqrt()), rel=1e-3)
     if turn % 3 == 0:
