@@ -52,7 +52,7 @@ def render_pictures(
     Parameters
     ----------
     tree : as for :func:`~bbfit.blender.views_folder.render_views`.
-    cameras : V pinhole or parallel cameras with square pictures of at most 16384 pixels, square pixels and a centerd principal point.
+    cameras : V pinhole or parallel cameras with square pictures of at most 16384 pixels, square pixels and a centered principal point.
     out : folder to write to; made if need be.
     config : light, samples, denoising, device, workers and seed; the rest of it is not used.
     clips : nearest and farthest distance from each camera along its axis that is seen, in meters, V pairs with 0 < nearest < farthest;
