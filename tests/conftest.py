@@ -12,7 +12,7 @@ from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
 from bbfit.images import to_bytes, unpremultiply, write_png
 from bbfit.layout import split_views, write_transforms
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.drawing.reference import render_reference
 
 torch.set_num_threads(1)  # the suite runs in as many processes as there are cores
 

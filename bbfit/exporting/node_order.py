@@ -18,7 +18,7 @@ from bbfit.exporting.hulls import bilinear, rimmed_alpha, texel_corners
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.polygons import sides
-from bbfit.rendering.compositing import TIE
+from bbfit.operators.drawing.compositing import TIE
 
 # A ray's pair of layers that matters less than this is left out.
 _FAINT = 1e-4
@@ -121,7 +121,7 @@ def sample_visibility(cards: Cards, cameras: Rig, across: int = 32) -> Visibilit
     """Send ``across`` x ``across`` rays from every camera over the cards.
 
     Cards of one texture count as parts of one sheet, as :func:`~bbfit.exporting.cards.cloud_cards` makes it, which a ray meets once.
-    Layers whose depths differ by less than :data:`~bbfit.rendering.compositing.TIE` have no order.
+    Layers whose depths differ by less than :data:`~bbfit.operators.drawing.compositing.TIE` have no order.
     """
     eyes = cameras.eyes
     rays, cell = _rays(np.concatenate([card.corners for card in cards.cards]), cameras, across)

@@ -24,7 +24,7 @@ from bbfit.exporting.node_order import (
 )
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.polygons import kept_half
-from bbfit.rendering.compositing import TIE
+from bbfit.operators.drawing.compositing import TIE
 
 # Share of the pieces that are cut before origins are fitted again.
 _AT_ONCE = 0.2

@@ -7,14 +7,13 @@ from typing import Any, Literal, get_args
 
 from bbfit.checks import check_choice, check_count, check_range, fail
 from bbfit.geometry.alpha import AlphaKind, check_cutoff
-from bbfit.rendering.config import Backend
+from bbfit.operators.config import Backend, Loss
 
 Preset = Literal["default", "thesis"]
 Sides = Literal["one", "two", "pair"]
 Placement = Literal["even", "clusters"]
 Orientation = Literal["any", "upright", "free"]
 Bounds = Literal["viewport", "thesis", "silhouette"]
-Loss = Literal["l1", "l2", "backgrounds"]
 Schedule = Literal["cosine", "growth"]
 
 _PRESETS: dict[str, dict[str, Any]] = {
