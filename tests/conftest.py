@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,18 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the folder with real trees is not here")
     return SHARED
+
+
+@pytest.fixture
+def poison() -> Iterator[None]:
+    """Memory that torch allocates without a value holds NaN, or the largest integer, so that reading it changes a result."""
+    before = torch.utils.deterministic.fill_uninitialized_memory
+    torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = True
+    assert torch.empty(1).isnan().all() and torch.empty(1, dtype=torch.int32) == torch.iinfo(torch.int32).max
+    yield
+    torch.use_deterministic_algorithms(False)
+    torch.utils.deterministic.fill_uninitialized_memory = before
 
 
 def smooth_texture(height: int, width: int, seed: int) -> torch.Tensor:

