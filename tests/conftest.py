@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
 from bbfit.images import to_bytes, unpremultiply, write_png
 from bbfit.layout import split_views, write_transforms
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.drawing.reference import render_reference
 
 torch.set_num_threads(1)  # the suite runs in as many processes as there are cores
 
@@ -86,6 +87,18 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the folder with real trees is not here")
     return SHARED
+
+
+@pytest.fixture
+def poison() -> Iterator[None]:
+    """Memory that torch allocates without a value holds NaN, or the largest integer, so that reading it changes a result."""
+    before = torch.utils.deterministic.fill_uninitialized_memory
+    torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = True
+    assert torch.empty(1).isnan().all() and torch.empty(1, dtype=torch.int32) == torch.iinfo(torch.int32).max
+    yield
+    torch.use_deterministic_algorithms(False)
+    torch.utils.deterministic.fill_uninitialized_memory = before
 
 
 def smooth_texture(height: int, width: int, seed: int) -> torch.Tensor:

@@ -17,7 +17,7 @@ from bbfit.checks import InputError, MissingFileError
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, write_png
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.drawing.reference import render_reference
 from bbfit.views import ViewDataset
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.rendering.config import Backend
+from bbfit.operators.config import Backend
 from bbfit.rendering.dispatch import render
 from bbfit.views import ViewSet
 

@@ -24,7 +24,7 @@ from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.points import hull_points, mesh_points
 from bbfit.fitting.search import find_placement
-from bbfit.fitting.steps import BLEND, HARDEST, make_stepper
+from bbfit.fitting.steps import BLEND, HARDEST, Stepper
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
@@ -153,7 +153,7 @@ def fit(
         cloud = random_textures(start, sizes, config.seed) if fitted is None else resampled(fitted, start, sizes)
         movement = Movement(cloud, radius) if config.placement_learning_rate and (level.halvings or len(levels) == 1) else None
         level_config = config.coarse() if level.halvings else config
-        stepper = make_stepper(cloud.to(device), Targets.at(views.train, level.halvings), level_config, movement)
+        stepper = Stepper(cloud.to(device), Targets.at(views.train, level.halvings), level_config, movement)
         del cloud  # the stepper has its own copy of the texels, which can take hundreds of megabytes
         fitted = None
         if state.tensors and len(losses) > level.begin:

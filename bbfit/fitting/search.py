@@ -15,11 +15,11 @@ from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments,
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_a_meter, tree_radius
 from bbfit.fitting.levels import Targets
-from bbfit.fitting.losses import pixel_losses
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.points import pixels_of, point_colors
-from bbfit.fitting.steps import make_stepper
+from bbfit.fitting.steps import Stepper
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.operators.image_loss.reference import pixel_loss_reference
 from bbfit.rendering.dispatch import render
 from bbfit.views import ViewSet
 
@@ -231,7 +231,7 @@ class _Search:
         """Fit clouds of equal size side by side, placement and textures. Return the clouds and their losses over all views."""
         config, joined = self._config, BillboardCloud.joined(clouds)
         movement = Movement(joined, self._radius) if config.placement_learning_rate else None
-        stepper = make_stepper(joined.to(config.device), self._targets, config, movement, groups=len(clouds))
+        stepper = Stepper(joined.to(config.device), self._targets, config, movement, groups=len(clouds))
         for step in range(steps):
             decay = 0.5 * (1 + math.cos(math.pi * step / steps))
             batch = torch.randperm(len(self._targets.cameras), generator=self._generator)[:_BATCH].tolist()
@@ -246,7 +246,7 @@ class _Search:
         assert self._config.loss is not None
         device = self._config.device
         image = render(cloud.to(device), self._targets.cameras.to(device), backend=self._config.backend)
-        return pixel_losses(image.cpu(), self._pictures, self._config.loss)
+        return pixel_loss_reference(image.cpu(), self._pictures, self._config.loss)
 
     def _weights(self, losses: Tensor) -> Tensor:
         """Average the losses of the pixels that show each point, float64 [P]."""

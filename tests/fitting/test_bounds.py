@@ -15,7 +15,7 @@ from bbfit.fitting.initialize import start_cloud
 from bbfit.geometry.camera import Camera, convergence_point
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.homography import texel_to_pixel
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.drawing.reference import render_reference
 from bbfit.views import ViewDataset
 
 

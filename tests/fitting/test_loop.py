@@ -18,7 +18,7 @@ from bbfit.fitting.loop import FitResult, ResolutionLevel, Step, fit, learning_r
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.drawing.reference import render_reference
 from bbfit.views import ViewDataset, ViewSet
 
 

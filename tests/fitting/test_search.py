@@ -13,11 +13,11 @@ from bbfit.fitting.clusters import best_planes, moments
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import tree_radius
 from bbfit.fitting.levels import Targets
-from bbfit.fitting.losses import pixel_losses
 from bbfit.fitting.points import mesh_points
 from bbfit.fitting.search import SIDE, Effort, _Search, find_placement
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.drawing.reference import render_reference
+from bbfit.operators.image_loss.reference import pixel_loss_reference
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset
 
@@ -42,7 +42,7 @@ def config(**asked: object) -> FitConfig:
 def loss(cloud: BillboardCloud, views: ViewDataset) -> float:
     targets = Targets.at(views.train, 1)  # 64 x 64
     chosen = range(len(views.train))
-    return float(pixel_losses(render_reference(cloud, targets.cameras), targets.pictures(chosen), "backgrounds").mean())
+    return float(pixel_loss_reference(render_reference(cloud, targets.cameras), targets.pictures(chosen), "backgrounds").mean())
 
 
 def same(a: BillboardCloud, b: BillboardCloud) -> bool:

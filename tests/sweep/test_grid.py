@@ -62,9 +62,7 @@ def test_axes_and_variants_can_be_narrowed() -> None:
         ("double", 6, "l1"),
         ("base", 6, "l1"),
     ]
-    with pytest.raises(
-        InputError, match="this grid has no variant 'triple'; its variants are base, bounded, double, double bounded"
-    ):
+    with pytest.raises(InputError, match="this grid has no variant 'triple'; its variants are base, bounded, double, double bounded"):
         Grid.load("thesis").narrowed(SweepConfig(variants=("triple",)))
 
 
