@@ -32,6 +32,7 @@ GROUPS = (
     ("tree_files",),
     ("trees", "blender"),
     ("views",),
+    ("operators",),
     ("rendering",),
     ("fitting", "rivals"),
     ("exporting",),
@@ -46,14 +47,20 @@ GROUPS = (
 )
 LEVEL = {name: level for level, group in enumerate(GROUPS) for name in group}
 
+
+def relative(path: Path) -> str:
+    return path.relative_to(PACKAGE).as_posix()
+
+
 # Heavy or optional modules, and the only files that import them.
 ONLY_IN = {
     "bpy": {f"blender/{name}.py" for name in ("worker", "worker_scene", "worker_glb")},
     "cv2": {"images.py", "fitting/bounds.py"},
     "xatlas": {"exporting/packing.py"},
     "warp": {
-        *(f"rendering/{name}.py" for name in ("launching", "sampling", "kernels", "fused", "fused_projection")),
-        *(f"fitting/{name}.py" for name in ("adam", "fused_sharpness", "fused_ssim", "ssim_kernels")),
+        "operators/launching.py",
+        "operators/drawing/projector.py",
+        *(relative(path) for name in ("fused", "*kernels") for path in PACKAGE.glob(f"operators/*/{name}.py")),
     },
     "ray": {"sweep/cluster.py"},
     "yaml": {"sweep/grid.py"},
@@ -65,10 +72,6 @@ ONLY_IN = {
     "DracoPy": {"rivals/draco.py"},
 }
 NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "viser", "jinja2")
-
-
-def relative(path: Path) -> str:
-    return path.relative_to(PACKAGE).as_posix()
 
 
 def unit(path: Path) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
 
-from bbfit.budget.choice import Trial, choose, within_bytes
+from bbfit.budget.choice import Trial, choose, lookup, within_bytes
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
@@ -39,7 +39,7 @@ def budget_stage(
 
         on_progress("budget", 0, 1)
         known = _known_trials(path, stage.key)
-        choice = choose(views, fit_config, budget, tree=tree, export=export, known=known, on_trial=on_trial)
+        choice = choose(views, fit_config, budget, tree=tree, export=export, known=lookup(known), on_trial=on_trial)
         limits = {name: value for name, value in asdict(budget).items() if value}
         write_json(path, {"inputs": stage.key, "budget": limits, "config": asdict(choice.config), **choice.to_json()})
         cost: Cost = "bytes" if budget.bytes else "texels" if budget.texels else "vertices"

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import struct
-from collections.abc import Callable
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -235,8 +234,7 @@ def test_unusable_panorama_and_device(thing_glb: Path, tmp_path: Path) -> None:
 
 
 def test_without_blender(thing_glb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    find: Callable[..., Any] = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "bpy" else find(name, *rest))
+    monkeypatch.setitem(sys.modules, "bpy", None)  # by which Python says that a module cannot be imported
     with pytest.raises(
         InputError, match=r'bpy is not installed; install bbfit with its extra, pip install "bbfit\[blender\]".*Python 3\.11'
     ):

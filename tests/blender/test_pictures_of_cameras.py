@@ -10,7 +10,6 @@ import pytest
 import torch
 import trimesh
 
-from bbfit.blender import pictures
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.pictures import PICTURES_FILE, render_pictures, vertical_axis
 from bbfit.checks import InputError
@@ -97,7 +96,7 @@ def test_what_is_clipped_still_casts_its_shadow(tmp_path: Path) -> None:
 
 
 def test_finished_pictures_are_kept_and_missing_or_damaged_ones_rendered(
-    thing_glb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    thing_glb: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     told: list[tuple[int, int]] = []
     paths = render_pictures(thing_glb, front(3), tmp_path, CONFIG, on_progress=lambda *at: told.append(at))
@@ -114,10 +113,7 @@ def test_finished_pictures_are_kept_and_missing_or_damaged_ones_rendered(
     assert paths[1].stat().st_mtime_ns == before[1][0]
     assert not list(tmp_path.glob(".*"))
 
-    def no_blender(job: dict) -> None:
-        raise AssertionError("Blender was started")
-
-    monkeypatch.setattr(pictures, "BlenderPool", no_blender)
+    request.getfixturevalue("broken_blender")  # which is not needed
     other = replace(CONFIG, count=50, size=64, elevations=(10.0,), fov_degrees=20.0, orthographic=True, axis="center")
     assert render_pictures(thing_glb, front(3), tmp_path, other) == paths
 

@@ -21,7 +21,7 @@ from playwright.sync_api import Frame, Page
 from bbfit.blender.config import ViewsConfig
 from bbfit.evaluation.metrics import psnr
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import shipped_cards
+from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
@@ -173,7 +173,7 @@ def test_pictures_are_the_views_and_the_renders(visit: Visit, result: RunResult)
     views = ViewDataset.load(Path(json.loads((result.folder / "run.json").read_text())["source"])).test
     for name, *uris in visit(act):
         index = views.names.index(name)
-        for truth, uri in zip(held_out(result.cloud, views, index), uris[:2], strict=True):
+        for truth, uri in zip(held_out(shipped_model(result.cloud).draw, views, index), uris[:2], strict=True):
             image = np.asarray(Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1]))).convert("RGBA")) / 255
             premultiplied = torch.tensor(np.concatenate([image[..., :3] * image[..., 3:], image[..., 3:]], -1))
             assert psnr(over_color(truth).numpy(), over_color(premultiplied).numpy()) > 33  # lossy, for its size
@@ -232,7 +232,7 @@ def test_the_worst_views_are_marked_and_shown(visit: Visit, result: RunResult) -
 def test_the_model_is_drawn_as_bbfit_draws_it(visit: Visit, result: RunResult, scheme: str) -> None:
     image, camera = visit(lambda page: drawn(page.frames[1]), scheme=scheme, width=700)
     paper = torch.tensor([1.0, 1.0, 1.0] if scheme == "light" else [0x1D / 255, 0x21 / 255, 0x26 / 255])
-    drawing = draw_cards(shipped_cards(result.cloud, ExportConfig()), camera).double()
+    drawing = draw_cards(shipped_model(result.cloud).cards, camera).double()
     wanted = over_color(drawing, paper.double()).numpy()
     assert psnr(wanted, over_color(torch.zeros_like(drawing), paper.double()).numpy()) < 22  # there is something to see
     assert psnr(wanted, image) > 28  # antialiased edges differ
