@@ -102,7 +102,7 @@ def draw_pages(run: Path) -> None:
         tab = browser.new_page(viewport={"width": 1180, "height": 640})
         tab.goto(page.url)
         tab.locator(".mantine-Notification-closeButton").click(timeout=60_000)  # viser's remark on a browser without a graphics card
-        tab.wait_for_timeout(20_000)  # until what is measured is there
+        tab.wait_for_timeout(20_000)  # until the measurements are finished
         tab.screenshot(path=DOCS / "view.png")
         browser.close()
 
