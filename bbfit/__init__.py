@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from bbfit.trees.growth import grow
     from bbfit.trees.species import Species, load_species
     from bbfit.trees.tree_file import write_tree
-    from bbfit.viewing.opening import view
+    from bbfit.viewing.server import view
     from bbfit.views import ViewDataset
 
 # Names are imported when they are first used, so that `bbfit --help` need not wait for torch.
@@ -66,7 +66,7 @@ _HOMES = {
     "render_views": "bbfit.blender.views_folder",
     "run": "bbfit.pipeline",
     "run_sweep": "bbfit.sweep.scheduling",
-    "view": "bbfit.viewing.opening",
+    "view": "bbfit.viewing.server",
     "write_tree": "bbfit.trees.tree_file",
 }
 
