@@ -19,7 +19,7 @@ from bbfit.fitting.config import FitConfig
 
 if TYPE_CHECKING:
     from bbfit.fitting.loop import Step
-    from bbfit.pipeline import Progress
+    from bbfit.stages.stage import OnProgress
     from bbfit.viewing.watching import Watch
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
@@ -84,7 +84,7 @@ class RunDisplay:
         return None if self._watch is None else self._watch.on_step
 
     @contextlib.contextmanager
-    def progress(self) -> Iterator[Progress]:
+    def progress(self) -> Iterator[OnProgress]:
         """The progress bars of :func:`bbfit.cli.console.progress`, and a line in the viewer."""
         with progress() as show:
 

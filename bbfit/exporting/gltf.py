@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bbfit.exporting.cards import Card, Cards
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.encoders import encode_ktx2, encode_webp
 from bbfit.exporting.splitting import centerd
+from bbfit.geometry.cards import Card, Cards
 from bbfit.images import encode_png
 from bbfit.model_files import glb_of_scene, joined_glb, split_glb
 

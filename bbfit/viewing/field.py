@@ -51,5 +51,9 @@ def plant(count: int, bounds: NDArray[np.float64], *, seed: int = 0) -> NDArray[
     yaw[0], scales[0] = 0.0, 1.0
     # Trees turn and grow about their foot, models about their origin.
     turned_x, turned_z = foot_x * np.cos(yaw) + foot_z * np.sin(yaw), foot_z * np.cos(yaw) - foot_x * np.sin(yaw)
-    positions = [foot_x + spacing * grid[:, 0] - scales * turned_x, low[1] * (1 - scales), foot_z + spacing * grid[:, 1] - scales * turned_z]
+    positions = [
+        foot_x + spacing * grid[:, 0] - scales * turned_x,
+        low[1] * (1 - scales),
+        foot_z + spacing * grid[:, 1] - scales * turned_z,
+    ]
     return np.stack([*positions, yaw, scales], -1).astype(np.float32)

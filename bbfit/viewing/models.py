@@ -6,8 +6,7 @@ import threading
 from dataclasses import dataclass, replace
 
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.gltf import glb_bytes
-from bbfit.exporting.model import shipped_cards
+from bbfit.exporting.model import shipped_model
 from bbfit.geometry.alpha import AlphaKind
 from bbfit.geometry.cloud import BillboardCloud
 
@@ -45,7 +44,7 @@ class ModelCache:
             with self._lock:
                 if key not in self._models:
                     config = replace(self._export, alpha=options.alpha, split=options.split)
-                    self._models[key] = glb_bytes(shipped_cards(self._clouds[index], config, options.halvings), config)
+                    self._models[key] = shipped_model(self._clouds[index], config, options.halvings).glb
         return self._models[key]
 
     def close(self, seconds: float = 60.0) -> None:

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bbfit.blender.meshes import MESH_SUFFIXES, tree_scene
-from bbfit.blender.sources import UP_AXIS, check_tree
 from bbfit.checks import InputError
 from bbfit.exporting.lod import stands_alone
+from bbfit.tree_files.tree_file import MESH_SUFFIXES, TreeFile
 
 MAX_BYTES = 64 << 20
 """The default for the largest original that is sent to browsers."""
@@ -42,17 +41,20 @@ def find_original(candidates: Sequence[Path | None], max_bytes: int = MAX_BYTES)
     known = [path for path in candidates if path is not None]
     path = next((path for path in known if path.is_file()), None)
     if path is None:
-        return Original.missing(f"the original no longer exists: {known[0]}" if known else "made from views alone: there is no mesh of the original")
+        return Original.missing(
+            f"the original no longer exists: {known[0]}" if known else "made from views alone: there is no mesh of the original"
+        )
     ending = path.suffix.lower()
     if ending not in MESH_SUFFIXES:
         return Original.missing(f"only Blender reads {path.name}; convert it to .glb to see it here")
     try:
-        size = sum(file.stat().st_size for file in check_tree(path))
+        tree = TreeFile.open(path)
+        size = tree.bytes
         if size > max_bytes:
             return Original.missing(_too_large(path.name, size, max_bytes))
         if ending == ".glb" and stands_alone(path):
             return _unchanged(path.read_bytes(), path.name)
-        glb = _converted(path)
+        glb = _converted(tree)
     except (InputError, OSError) as error:
         return Original.missing(f"the original cannot be shown: {error}")
     if len(glb) > max_bytes:
@@ -68,9 +70,9 @@ def _unchanged(glb: bytes, name: str) -> Original:
     return Original(glb, "")
 
 
-def _converted(path: Path) -> bytes:
-    scene = tree_scene(path)
-    if UP_AXIS[path.suffix.lower()] == "z":
+def _converted(tree: TreeFile) -> bytes:
+    scene = tree.scene()
+    if tree.up_axis == "z":
         import trimesh
 
         scene.apply_transform(trimesh.transformations.rotation_matrix(-3.141592653589793 / 2, [1, 0, 0]))

@@ -17,7 +17,7 @@ from bbfit.files import read_json
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
 from bbfit.layout import REQUEST_FILE
-from bbfit.records import RECORD_FILE
+from bbfit.stages.stage import RECORD_FILE
 from bbfit.viewing.levels import ViewerLevel
 from bbfit.viewing.originals import MAX_BYTES, Original, find_original
 
@@ -95,7 +95,10 @@ def open_results(folder: str | Path, *, original_bytes: int = MAX_BYTES) -> View
     record = _record(folder)
     views = _views(folder, record)
     tree = live_tree(
-        BillboardCloud.load(folder / CLOUD_FILE), folder.resolve().name, find_original(sources(folder, record), original_bytes), light_of(views)
+        BillboardCloud.load(folder / CLOUD_FILE),
+        folder.resolve().name,
+        find_original(sources(folder, record), original_bytes),
+        light_of(views),
     )
     notes = () if record else (f"there is no {RECORD_FILE}, so the tree that it was made from is not known",)
     return replace(tree, export=_export(record), views=views, notes=notes, live=False)

@@ -60,7 +60,8 @@ def test_levels_take_over_where_their_error_is_within_the_bound(built: LodResult
     points = trimesh.load(TREE, force="mesh").vertices
     radius, height = np.linalg.norm(np.ptp(points, axis=0)) / 2, np.ptp(points[:, 1])
     # The cameras look at the axis, from as far as they are from it.
-    axis = views.request["camera"]["distance"]
+    assert views.request and views.request.camera
+    axis = views.request.camera["distance"]
     scale = float(views.train.cameras.intrinsics[0, 0, 0]) / axis
     before: LodLevel = built.levels[0]
     assert before.distance_meters == before.error_meters == 0 and before.tree_pixels is None

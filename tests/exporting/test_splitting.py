@@ -12,10 +12,11 @@ import torch
 from numpy.typing import NDArray
 
 from bbfit.checks import InputError
-from bbfit.exporting.cards import Card, Cards, cloud_cards
+from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.node_order import Misordered, misordered
 from bbfit.exporting.splitting import centerd, split
 from bbfit.geometry.camera import Camera, look_at
+from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
 
