@@ -77,7 +77,7 @@ def is_own_request(server_host: str, port: int, host: str | None, origin: str | 
         name, its_port = parts.hostname, parts.port or 80
     except ValueError:
         return False
-    if name is None or parts.netloc != host or its_port != port:
+    if name is None or parts.username is not None or parts.netloc != host or its_port != port:
         return False
     return (name in ("localhost", server_host.lower()) or _is_address(name)) and origin in (None, f"http://{host}")
 

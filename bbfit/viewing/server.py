@@ -72,6 +72,7 @@ class Viewer:
     def __init__(self, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         self._lock, self._closed = threading.RLock(), threading.Event()
         self._shown: _Shown | None = None
+        self._previous: _Shown | None = None  # a page may still load its models
         self._status, self._serial = "", 0
         self._slots = threading.BoundedSemaphore(_MAX_CONNECTIONS)
         self._measuring: threading.Thread | None = None
@@ -104,7 +105,7 @@ class Viewer:
         """Show a tree. ``models`` are the models of its clouds, if some are made already."""
         with self._lock:
             self._serial += 1
-            self._shown = _Shown(tree, models or ModelCache(tree.clouds, tree.export), self._serial)
+            self._previous, self._shown = self._shown, _Shown(tree, models or ModelCache(tree.clouds, tree.export), self._serial)
         if not (tree.is_measured or tree.live or tree.views is None):
             self._measuring = threading.Thread(target=self._measure, args=(tree,), daemon=True)
             self._measuring.start()
@@ -150,11 +151,12 @@ class Viewer:
         if path == "/drawing.js":
             return "text/javascript", drawing_script().encode()
         with self._lock:
-            shown = self._shown
-            if path == "/state":
-                return "application/json", json.dumps({"serial": self._serial, "status": self._status, **_state(shown)}).encode()
+            serial, status, recent = self._serial, self._status, (self._shown, self._previous)
+        if path == "/state":
+            return "application/json", json.dumps({"serial": serial, "status": status, "tree": _state(recent[0])}).encode()
         match = _MODEL.fullmatch(path) or _FIELD.fullmatch(path) or _ORIGINAL.fullmatch(path)
-        if match is None or shown is None or int(match[1]) != shown.generation:
+        shown = next((each for each in recent if match and each and each.generation == int(match[1])), None)
+        if match is None or shown is None:
             return None
         if match.re is _FIELD:
             try:
@@ -270,41 +272,34 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing: the terminal belongs to the command."""
 
 
-def _state(shown: _Shown | None) -> dict[str, Any]:
-    """What the page knows of a tree; scales are null where they are not known or infinite, and then the level is the first."""
+def _state(shown: _Shown | None) -> dict[str, Any] | None:
+    """What the page knows of a tree. A scale is null if it is not known, and for the first level, which has none."""
     if shown is None:
-        return {"tree": None}
-    tree, clouds = shown.tree, shown.tree.clouds
+        return None
+    tree, clouds, light = shown.tree, shown.tree.clouds, shown.tree.light
 
     def described(level: ViewerLevel) -> dict[str, Any]:
         scale = None if level.scale is None or math.isinf(level.scale) else level.scale
         cloud = next((index for index, cloud in enumerate(clouds) if cloud is level.cloud), None)
         return {"name": level.name, "scale": scale, "cloud": cloud, "halvings": level.halvings}
 
-    light = tree.light
     azimuth, elevation = math.radians(light.sun_azimuth), math.radians(light.sun_elevation)
     return {
-        "tree": {
-            "name": tree.name,
-            "generation": shown.generation,
-            "live": tree.live,
-            "measuring": not tree.is_measured and tree.views is not None,
-            "notes": list(filter(None, (*tree.notes, tree.original.note))),
-            "original": tree.original.glb is not None,
-            "levels": [described(level) for level in tree.levels],
-            "field": [described(level) for level in field_levels(tree.levels)],
-            "outlines": [corners(cloud).tolist() for cloud in clouds],
-            "colors": [billboard_color(index) for index in range(max(map(len, clouds)))],
-            "alpha": tree.export.alpha or clouds[0].alpha.kind,
-            "split": bool(tree.export.resolve().split),
-            "bounds": tree.bounds.tolist(),
-            # A white matte surface returns its irradiance over pi, in Blender's sun and sky as in three.js's lights.
-            "sky": _SKY * math.pi * light.ambient_strength,
-            "sun": _SUN * light.sun_strength,
-            "sunward": [
-                math.cos(elevation) * math.sin(azimuth),
-                math.sin(elevation),
-                math.cos(elevation) * math.cos(azimuth),
-            ],
-        }
+        "name": tree.name,
+        "generation": shown.generation,
+        "live": tree.live,
+        "measuring": not tree.is_measured and tree.views is not None,
+        "notes": [note for note in (*tree.notes, tree.original.note) if note],
+        "original": tree.original.glb is not None,
+        "levels": [described(level) for level in tree.levels],
+        "field": [described(level) for level in field_levels(tree.levels)],
+        "outlines": [corners(cloud).tolist() for cloud in clouds],
+        "colors": [billboard_color(index) for index in range(max(map(len, clouds)))],
+        "alpha": tree.export.alpha or clouds[0].alpha.kind,
+        "split": bool(tree.export.resolve().split),
+        "bounds": tree.bounds.tolist(),
+        # A white matte surface returns its irradiance over pi, in Blender's sun and sky as in three.js's lights.
+        "sky": _SKY * math.pi * light.ambient_strength,
+        "sun": _SUN * light.sun_strength,
+        "sunward": [math.cos(elevation) * math.sin(azimuth), math.sin(elevation), math.cos(elevation) * math.cos(azimuth)],
     }

@@ -93,13 +93,9 @@ def open_results(folder: str | Path, *, original_bytes: int = MAX_BYTES) -> View
         done = " yet" if (folder / RECORD_FILE).is_file() or (folder / "fit.checkpoint").is_file() else ""
         fail("run", f"{folder} holds no {CLOUD_FILE}{done}", "give the folder that bbfit run, bbfit fit or bbfit lod wrote")
     record = _record(folder)
-    views = _views(folder, record)
-    tree = live_tree(
-        BillboardCloud.load(folder / CLOUD_FILE),
-        folder.resolve().name,
-        find_original(sources(folder, record), original_bytes),
-        light_of(views),
-    )
+    views, cloud = _views(folder, record), BillboardCloud.load(folder / CLOUD_FILE)
+    original = find_original(sources(folder, record), original_bytes)
+    tree = live_tree(cloud, folder.resolve().name, original, light_of(views))
     notes = () if record else (f"there is no {RECORD_FILE}, so the tree that it was made from is not known",)
     return replace(tree, export=_export(record), views=views, notes=notes, live=False)
 

@@ -62,7 +62,7 @@ class Watch:
         return self._spent
 
     def on_progress(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Show how far a stage is (:class:`bbfit.pipeline.Progress`)."""
+        """Show how far a stage is (:class:`bbfit.stages.stage.OnProgress`)."""
         if stage != "fit":  # each preview reports the step of the fit
             self._viewer.show_status(f"{stage} {done}/{total} {note}".rstrip())
 

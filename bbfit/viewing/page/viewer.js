@@ -1,7 +1,7 @@
 "use strict";
 // The viewer's page. It asks the server for its state and for models; everything else, such as the choice of levels, happens here.
 (async () => {
-  const SLIDER_STEPS = 200, MEASURED_FRAMES = 20, KEPT_TIMES = 60;
+  const SLIDER_STEPS = 200, MEASURED_FRAMES = 8, KEPT_TIMES = 60;
   const $ = (id) => document.getElementById(id);
   const stage = $("stage"), panes = [$("left"), $("right")], form = document.forms[0], controls = form.elements;
   const THREE = await bbfit.library($("library"));
@@ -54,7 +54,10 @@
         const vertices = new Map(meshes.map(({ geometry }) => [geometry, geometry.attributes.position.count]));
         models.set(address, { root, meshes, bytes: buffer.byteLength, vertices: [...vertices.values()].reduce((a, b) => a + b, 0) });
       };
-      load().catch((failure) => { models.set(address, false); error = String(failure.message ?? failure); }).finally(() => {
+      load().catch((failure) => {
+        models.set(address, false);
+        error = failure.message;
+      }).finally(() => {
         loading -= 1;
         measure();
       });
@@ -153,7 +156,7 @@
         const xs = places.map(([x]) => x), side = Math.max(...xs) - Math.min(...xs) + height();
         field = { address, places, matrices, side, counts: [], vertices: 0 };
       } catch (failure) {
-        error = String(failure.message);
+        error = failure.message;
       } finally {
         loading -= 1;
       }
