@@ -65,13 +65,12 @@ ONLY_IN = {
     "ray": {"sweep/cluster.py"},
     "yaml": {"sweep/grid.py"},
     "jinja2": {"reporting/html.py"},
-    "viser": {"viewing/page.py", "viewing/panel.py", "viewing/planted.py", "viewing/visitor.py"},
     "mitsuba": {"rivals/mesh_rays.py"},
     "drjit": {"rivals/mesh_rays.py"},
     "fast_simplification": {"rivals/decimation.py", "rivals/learned_mesh.py"},
     "DracoPy": {"rivals/draco.py"},
 }
-NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "viser", "jinja2")
+NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "jinja2")
 
 
 def unit(path: Path) -> str:
