@@ -186,12 +186,12 @@ def _head(source: str, config: RunConfig, *, grown: Species | None = None, rende
 def _facts(record: Record) -> dict[str, Any]:
     """The parts of the record that the report shows: options and their defaults, seeds and versions."""
     head = record.head
-    usual = RunConfig(fit=FitConfig(preset=head["config"]["fit"]["preset"]).resolve())
+    defaults = RunConfig(fit=FitConfig(preset=head["config"]["fit"]["preset"]).resolve())
     stages = ("grow", "views", "fit", "budget", "export")
     return {
         "source": Path(head["source"]).name,
-        "asked": {stage: options for stage in stages if (options := head["config"][stage]) is not None},
-        "usual": _plain(asdict(usual)),
+        "options": {stage: options for stage in stages if (options := head["config"][stage]) is not None},
+        "defaults": _plain(asdict(defaults)),
         "seeds": head["seeds"],
         "versions": head["versions"],
     }

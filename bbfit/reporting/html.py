@@ -38,10 +38,10 @@ class RunFacts:
 
     source: str
     """What it was made of: a file's or folder's name, or a species. May hold anything; the page escapes it."""
-    asked: Mapping[str, Mapping[str, Any]]
-    """Every option of each stage, resolved."""
-    usual: Mapping[str, Mapping[str, Any]]
-    """What the options are if nothing is said."""
+    options: Mapping[str, Mapping[str, Any]]
+    """The resolved options of each stage."""
+    defaults: Mapping[str, Mapping[str, Any]]
+    """The default options of each stage."""
     seeds: Mapping[str, int]
     """Seeds by what they are of."""
     versions: Mapping[str, str | None]
@@ -182,12 +182,12 @@ def _costs(report: Report) -> list[tuple[str, Cost]]:
 
 
 def _changed(facts: RunFacts) -> list[tuple[str, Any]]:
-    """The options that are not as usual, by stage and name."""
+    """The options that differ from their defaults, by stage and name."""
     return [
         (f"{stage}.{name}", value)
-        for stage, options in facts.asked.items()
+        for stage, options in facts.options.items()
         for name, value in options.items()
-        if value != facts.usual.get(stage, {}).get(name)
+        if value != facts.defaults.get(stage, {}).get(name)
     ]
 
 

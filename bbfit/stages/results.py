@@ -84,7 +84,7 @@ def report_stage(
     facts
         The fields of :class:`~bbfit.reporting.html.RunFacts` that come from the record of the run.
     """
-    pareto = folder / "pareto.png" if any(facts["asked"].get("budget", {}).values()) else None
+    pareto = folder / "pareto.png" if any(facts["options"].get("budget", {}).values()) else None
 
     def work(on_progress: OnProgress) -> None:
         on_progress("report", 0, 1)
