@@ -48,7 +48,7 @@ LEVEL = {name: level for level, group in enumerate(GROUPS) for name in group}
 
 # Heavy or optional modules, and the only files that import them.
 ONLY_IN = {
-    "bpy": {"blender/worker.py", "blender/worker_glb.py"},
+    "bpy": {f"blender/{name}.py" for name in ("worker", "worker_scene", "worker_glb")},
     "cv2": {"images.py", "fitting/bounds.py"},
     "xatlas": {"exporting/packing.py"},
     "warp": {

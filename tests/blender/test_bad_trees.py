@@ -230,7 +230,7 @@ def test_unusable_panorama_and_device(thing_glb: Path, tmp_path: Path) -> None:
     tree.write_bytes(thing_glb.read_bytes())
     refused(tree, r"hdri: .*sky\.hdr cannot be read; give an \.hdr or \.exr file", ViewsConfig(**SMALL, hdri=tmp_path / "sky.hdr"))
     refused(tree, "hdri: .*none.hdr does not exist", ViewsConfig(**SMALL, hdri=tmp_path / "none.hdr"))
-    refused(tree, "device: metal is not known to this Blender; choose another one, or cpu", ViewsConfig(**SMALL, device="metal"))
+    refused(tree, "device: this Blender does not support metal; choose another device, or cpu", ViewsConfig(**SMALL, device="metal"))
 
 
 def test_without_blender(thing_glb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -312,7 +312,7 @@ def test_bad_places_for_the_file_are_refused(thing_glb: Path, tmp_path: Path) ->
 
 @pytest.mark.usefixtures("broken_blender")
 def test_a_crash_is_told(thing_glb: Path, tmp_path: Path) -> None:
-    with pytest.raises(BlenderError, match=r"crashed while converting .*thing\.glb \(signal 6; its last words: out of luck\)"):
+    with pytest.raises(BlenderError, match=r"crashed while converting .*thing\.glb \(signal 6; its last output: out of luck\)"):
         tree_as_glb(thing_glb, tmp_path / "out.glb")
     assert not (tmp_path / "out.glb").exists()
 

@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.pictures import RECORD_FILE, render_pictures, vertical_axis
+from bbfit.blender.pictures import PICTURES_FILE, render_pictures, vertical_axis
 from bbfit.checks import InputError
 from bbfit.files import read_json, write_json
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinhole_intrinsics
@@ -134,7 +134,7 @@ def one(thing_glb: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ({"clips": [(4.0, 6.5)]}, "other clips"),
         ({"clips": None}, "other clips"),
         ({"config": replace(CONFIG, samples=5)}, "samples 4, not 5"),
-        ({"config": replace(CONFIG, sun_azimuth=31.0)}, "sun_azimuth 30.0, not 31.0"),
+        ({"config": replace(CONFIG, sun_azimuth=31.0)}, "sun_azimuth 30, not 31"),
     ],
 )
 def test_a_folder_of_another_request_is_refused_and_left_alone(thing_glb: Path, one: Path, changed: dict, says: str) -> None:
@@ -154,13 +154,13 @@ def test_a_folder_of_another_tree_or_from_elsewhere_is_refused(thing_glb: Path, 
     (strange / "0000.png").write_bytes((one / "0000.png").read_bytes())
     with pytest.raises(InputError, match="from elsewhere"):
         render_pictures(thing_glb, front(), strange, CONFIG)
-    write_json(strange / RECORD_FILE, [])
+    write_json(strange / PICTURES_FILE, [])
     with pytest.raises(InputError, match="not written by bbfit"):
         render_pictures(thing_glb, front(), strange, CONFIG)
 
 
 def test_what_stands_in_the_record(one: Path, thing_glb: Path) -> None:
-    record = read_json("record", one / RECORD_FILE)
+    record = read_json("record", one / PICTURES_FILE)
     assert record["tree"]["name"] == "thing.glb" and record["clips"] == [[4.0, 6.0]]
     assert record["config"]["samples"] == 4 and "count" not in record["config"]
     assert record["cameras"]["size"] == 32 and record["cameras"]["orthographic"] is True

@@ -199,7 +199,7 @@ def test_blender_that_crashes_again_and_again(thing_glb: Path, unbroken: Path, t
 
 @pytest.mark.usefixtures("broken_blender")
 def test_crash_while_reading(thing_glb: Path, tmp_path: Path) -> None:
-    with pytest.raises(BlenderError, match=r"crashed while reading .*thing\.glb \(signal 6; its last words: out of luck\)"):
+    with pytest.raises(BlenderError, match=r"crashed while reading .*thing\.glb \(signal 6; its last output: out of luck\)"):
         render_views(thing_glb, tmp_path / "views", CONFIG)
     assert not (tmp_path / "views").exists()
 
