@@ -168,10 +168,10 @@ def look(words: list[str]) -> None:
                 line = process.stdout.readline()
                 assert line, f"bbfit view ended: {said}"
                 said += line
-            with urllib.request.urlopen(address[0], timeout=30) as answer:
+            with urllib.request.urlopen(address[0]) as answer:
                 assert b"<html" in answer.read().lower()
             process.send_signal(signal.SIGINT)
-            rest = process.communicate(timeout=60)[0]
+            rest = process.communicate()[0]
             assert process.returncode == 0, rest
         finally:
             process.kill()
