@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bbfit.checks import InputError
-from bbfit.exporting.lod import glb_counts, stands_alone
+from bbfit.exporting.lod import glb_counts, is_self_contained
 from bbfit.glb import gltf_parts
 from bbfit.tree_files.tree_file import MESH_SUFFIXES, TreeFile
 
@@ -53,7 +53,7 @@ def find_original(candidates: Sequence[Path | None], most_bytes: int = MOST_BYTE
         size = tree.bytes
         if size > most_bytes:
             return Original.missing(_too_large(path.name, size, most_bytes))
-        if ending == ".glb" and stands_alone(path):
+        if ending == ".glb" and is_self_contained(path):
             return _as_it_is(path.read_bytes(), path.name)
         glb = _converted(tree)
     except (InputError, OSError) as error:
