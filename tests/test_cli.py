@@ -228,8 +228,8 @@ def test_a_budget_that_cannot_be_is_one_line(
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--vertices", "8", "--billboards", "2"], "bbfit: billboards: 2 are asked for and a budget as well; leave one of them out"),
-        (["--auto", "--preset", "thesis"], "bbfit: preset: 'thesis' is a schedule of its own"),
+        (["--vertices", "8", "--billboards", "2"], "bbfit: billboards: 2 are requested in addition to a budget; leave out one of them"),
+        (["--auto", "--preset", "thesis"], "bbfit: preset: 'thesis' cannot be combined with a budget"),
         (["--vertices", "4", "--sides", "two"], "bbfit: vertices: 4 are too few for one billboard"),
         (["--bytes", "10"], "bbfit: budget: 1 billboard with "),
     ],

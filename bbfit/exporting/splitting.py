@@ -13,7 +13,7 @@ from bbfit.exporting.node_order import Overlaps, fit_origins, measure_order, ove
 from bbfit.exporting.visibility import VisibilitySamples, bounding_sphere, check_rig, fit_rig, sample_visibility, visible_cards
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.polygons import kept_half
-from bbfit.rendering.compositing import TIE
+from bbfit.operators.drawing.compositing import TIE
 
 # Share of the pieces that are split before origins are fitted again.
 _AT_ONCE = 0.2

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bbfit.exporting.hulls import bilinear, rimmed_alpha, texel_corners
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.polygons import sides
-from bbfit.rendering.compositing import TIE
+from bbfit.operators.drawing.compositing import TIE
 
 # Pairs of layers with a smaller weight are left out.
 _LEAST_WEIGHT = 1e-4
@@ -90,7 +90,7 @@ def sample_visibility(cards: Cards, cameras: Rig, across: int = 32) -> Visibilit
     """Trace a grid of ``across`` x ``across`` rays from every camera over the cards.
 
     Cards of one texture are parts of one sheet, which a ray meets once. Layers whose depths differ by less than a relative
-    :data:`~bbfit.rendering.compositing.TIE` have no order.
+    :data:`~bbfit.operators.drawing.compositing.TIE` have no order.
     """
     eyes = cameras.eyes
     rays, cell = _rays(np.concatenate([card.corners for card in cards.cards]), cameras, across)
