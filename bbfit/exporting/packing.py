@@ -1,7 +1,7 @@
-"""Rectangles packed by xatlas, in a process of its own.
+"""Rectangles packed by xatlas in a separate process.
 
-When xatlas (0.0.11) is torn down it tells its threads to end without taking their lock; one that is just about to wait never hears of
-it, and the caller waits for it forever: on a busy machine once in some thousand times. This process ends without tearing anything down.
+The destructor of xatlas (0.0.11) signals its threads to end without holding their lock. A thread that is about to wait misses the signal,
+and the caller waits forever: about once in a few thousand calls on a busy machine. The separate process exits without the destructor.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 
 def packed(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Non-overlapping places, int64 [R, 2] from 0 on, for rectangles of given whole widths and heights (at least 2), int64 [R, 2].
+    """Pack rectangles of integer widths and heights of at least 2, int64 [R, 2]; return their corners, int64 [R, 2] from 0 on.
 
     Raises
     ------
     CalledProcessError
-        if the process fails; what it printed has gone to this process's standard error.
+        if the process fails; its messages are on this process's standard error.
     """
-    # It finds its modules wherever this process does.
+    # It imports modules from the same places as this process.
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     command = [sys.executable, "-c", f"from {__name__} import _main; _main()"]
     done = subprocess.run(command, input=json.dumps(cells.tolist()).encode(), stdout=subprocess.PIPE, env=environment, check=True)
@@ -37,9 +37,9 @@ def _main() -> None:
 
     cells = json.load(sys.stdin)
     atlas = xatlas.Atlas()
-    # xatlas rounds a chart's extent up to whole texels and takes one texel more, for the half texels on either side of its outline.
+    # xatlas rounds a chart's extent up to whole texels and adds one texel for the half texels on either side of its outline.
     charts = [np.array([[0, 0], [w, 0], [w, h], [0, h]], np.float32) for w, h in np.array(cells) - 1]
-    # It takes charts at equal addresses for copies of one mesh, so all of them must stay alive until it has packed them.
+    # It treats charts at equal addresses as copies of one mesh, so all arrays must stay alive until it has packed them.
     triangles = [np.array([[0, 1, 2], [0, 2, 3]], np.uint32) for _ in charts]
     for chart, triangle in zip(charts, triangles, strict=True):
         atlas.add_uv_mesh(chart, triangle)
