@@ -25,7 +25,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in MODULES}
 GROUPS = (
     ("checks",),
     ("provenance",),
-    ("files", "glb", "model_files"),
+    ("files", "glb", "model_files", "xatlas_process"),
     ("geometry",),
     ("layout",),
     ("images",),
@@ -50,7 +50,7 @@ LEVEL = {name: level for level, group in enumerate(GROUPS) for name in group}
 ONLY_IN = {
     "bpy": {"blender/worker.py", "blender/worker_glb.py"},
     "cv2": {"images.py", "fitting/bounds.py"},
-    "xatlas": {"exporting/packing.py"},
+    "xatlas": {"xatlas_process.py"},
     "warp": {
         *(f"rendering/{name}.py" for name in ("launching", "sampling", "kernels", "fused", "fused_projection")),
         *(f"fitting/{name}.py" for name in ("adam", "fused_sharpness", "fused_ssim", "ssim_kernels")),

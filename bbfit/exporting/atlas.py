@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bbfit.exporting.packing import packed
 from bbfit.geometry.cards import Atlas
 from bbfit.images import bleed_color
+from bbfit.xatlas_process import packed
 
 # Graphics cards compress textures in blocks of 4 x 4 texels.
 BLOCK = 4
