@@ -51,12 +51,12 @@ def run_command(
     from bbfit.pipeline import RunConfig, run
 
     config = RunConfig(species=species, grow=grow, views=views, fit=fit, budget=budget, export=export)
-    with watched(page, out, tree, None, fit) as onlooker:
-        with onlooker.progress() as tell:
-            result = run(tree, out, config, on_progress=tell, on_step=onlooker.on_step)
+    with watched(page, out, tree, None, fit) as display:
+        with display.progress() as tell:
+            result = run(tree, out, config, on_progress=tell, on_step=display.on_step)
         show(result, thesis=fit.preset == "thesis")
         show_missed(export)
-        onlooker.finish()
+        display.finish()
 
 
 def grow_command(
@@ -155,12 +155,12 @@ def fit_command(
         fail("views", f"{views} is a file", "give a folder of views; bbfit run takes a tree")
     check_folder("views", views)
     stages = RunConfig(tree=tree, fit=config, budget=budget, export=export)
-    with watched(page, out, views, tree, config) as onlooker:
-        with onlooker.progress() as tell:
-            result = run(views, out, stages, on_progress=tell, on_step=onlooker.on_step)
+    with watched(page, out, views, tree, config) as display:
+        with display.progress() as tell:
+            result = run(views, out, stages, on_progress=tell, on_step=display.on_step)
         show(result, thesis=config.preset == "thesis")
         show_missed(export)
-        onlooker.finish()
+        display.finish()
 
 
 def evaluate_command(

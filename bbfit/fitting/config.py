@@ -7,15 +7,14 @@ from typing import Any, Literal, get_args
 
 from bbfit.checks import check_choice, check_count, check_range, fail
 from bbfit.geometry.alpha import AlphaKind, check_cutoff
+from bbfit.operators.config import Backend, Loss
 from bbfit.provenance import EXECUTION
-from bbfit.rendering.config import Backend
 
 Preset = Literal["default", "thesis"]
 Sides = Literal["one", "two", "pair"]
 Placement = Literal["even", "clusters"]
 Orientation = Literal["any", "upright", "free"]
 Bounds = Literal["viewport", "thesis", "silhouette"]
-Loss = Literal["l1", "l2", "backgrounds"]
 Schedule = Literal["cosine", "growth"]
 
 _PRESETS: dict[str, dict[str, Any]] = {

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from bbfit.budget.config import amount
 from bbfit.checks import check_count, check_range, fail
-from bbfit.fitting.config import Loss
+from bbfit.operators.config import Loss
 
 
 @dataclass(frozen=True)
