@@ -22,7 +22,7 @@ from bbfit.trees.growth import grow
 from bbfit.trees.leaf_shapes import leaf_shape
 from bbfit.trees.mesh import count_vertices
 from bbfit.trees.species import Species, known_species, load_species
-from bbfit.trees.tree_file import write_tree
+from bbfit.trees.tree_writer import write_tree
 from bbfit.trees.weber_penn import grow_skeleton
 
 CHEAP = {"detail": 0.1, "leaves": 0.02}
@@ -30,7 +30,7 @@ CHEAP = {"detail": 0.1, "leaves": 0.02}
 ELSEWHERE = """
 import sys
 from bbfit.trees.growth import grow
-from bbfit.trees.tree_file import write_tree
+from bbfit.trees.tree_writer import write_tree
 for name in sys.argv[2:]:
     write_tree(grow(name, seed=4, detail=0.1, leaves=0.02), f"{sys.argv[1]}/{name}.glb")
 """

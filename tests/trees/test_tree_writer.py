@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from bbfit.checks import InputError, MissingFileError
 from bbfit.trees.parts import Material, Part
-from bbfit.trees.tree_file import scene_of, write_tree
+from bbfit.trees.tree_writer import scene_of, write_tree
 
 BARK = Material("bark", (0.0221, 1 / 3, 0.1), 0.85, double_sided=False)
 LEAVES = (Material("leaf_0", (0.0225, 0.3, 0.05), 0.6, double_sided=True), Material("leaf_1", (0.5, 0.25, 0.0), 0.6, double_sided=True))
