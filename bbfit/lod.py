@@ -10,7 +10,7 @@ from pathlib import Path
 from bbfit.checks import fail
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import ExportConfig, LodConfig
-from bbfit.exporting.lod import LodLevel, glb_counts, lod_glb, stands_alone
+from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_a_meter
@@ -149,7 +149,7 @@ def _fitted(folder: Path, stages: RunConfig, planes: int, on_progress: OnProgres
 
 def _original(record: Record, tree: TreeFile, config: LodConfig, on_progress: OnProgress) -> Path:
     """The tree as a GLB that others can be joined to."""
-    if config.triangles is None and stands_alone(tree.path):
+    if config.triangles is None and is_self_contained(tree.path):
         return tree.path
     record.run(convert_stage(record.folder, tree, "original.glb", triangles=config.triangles), on_progress)
     return record.folder / "original.glb"

@@ -1,7 +1,10 @@
 """Write the pictures in docs/: python scripts/make_pictures.py [species] [acer] [pages]
 
-species.png has one view of every species that bbfit grows; acer.png held-out views of an acer, what the thesis preset makes of them, and
-what the default preset does with as many vertices; report.png and view.png the report of a run and the same run in ``bbfit view``.
+All pictures need Blender. ``pages`` also needs Chromium and playwright.
+
+species    species.png: one view of every species that bbfit grows
+acer       acer.png: held-out views of an acer, and the results of the thesis preset and of the default preset with equal vertices
+pages      report.png and view.png: the report of a run, and its page in ``bbfit view``
 """
 
 from __future__ import annotations
