@@ -189,8 +189,8 @@ def _facts(record: Record) -> dict[str, Any]:
     stages = ("grow", "views", "fit", "budget", "export")
     return {
         "source": Path(head["source"]).name,
-        "asked": {stage: options for stage in stages if (options := head["config"][stage]) is not None},
-        "usual": _plain(asdict(usual)),
+        "options": {stage: options for stage in stages if (options := head["config"][stage]) is not None},
+        "defaults": _plain(asdict(usual)),
         "seeds": head["seeds"],
         "versions": head["versions"],
     }
