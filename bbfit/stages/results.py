@@ -91,7 +91,7 @@ def report_stage(
         losses = [float(row["loss"]) for row in csv.DictReader((folder / "loss.csv").read_text().splitlines())]
         picture = pareto.read_bytes() if pareto else None
         readable = replace(model.config, textures="webp", fallback=False, mip_files=False)  # browsers read WebP
-        known = RunFacts(**facts, losses=losses, pareto=picture, cut_up=bool(model.config.split))
+        known = RunFacts(**facts, losses=losses, pareto=picture)
         page = report_page(report, model, views.test, known, glb_bytes(model.cards, readable))
         write_bytes(folder / "report.html", page.encode())
         on_progress("report", 1, 1)
