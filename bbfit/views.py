@@ -9,14 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from bbfit.blender.request import ViewsRequest
 from bbfit.checks import MissingFileError, check_folder, fail
-from bbfit.files import read_json
 from bbfit.geometry.camera import Camera
 from bbfit.images import premultiply, read_rgba
 from bbfit.layout import REQUEST_FILE, Frame, cameras_of, read_frames, split_views
@@ -127,8 +126,8 @@ class ViewDataset:
     """Views to fit to."""
     test: ViewSet
     """Held-out views, for the final score only."""
-    request: dict[str, Any] = field(default_factory=dict)
-    """What ``bbfit views`` wrote into ``views.json`` about the tree and the rendering; empty for views from elsewhere."""
+    request: ViewsRequest | None = None
+    """The request that ``bbfit views`` recorded in ``views.json``; ``None`` for views from elsewhere."""
 
     @staticmethod
     def load(folder: str | Path, *, seed: int = 0, cache_bytes: int = CACHE_BYTES) -> ViewDataset:
@@ -160,8 +159,8 @@ class ViewDataset:
         def view_set(frames: list[Frame]) -> ViewSet:
             return ViewSet(tuple(frame.image for frame in frames), cameras_of(frames, width, height), cache)
 
-        request = read_json("views", folder / REQUEST_FILE) if (folder / REQUEST_FILE).is_file() else {}
-        return ViewDataset(folder, view_set(train), view_set(test), request if isinstance(request, dict) else {})
+        request = ViewsRequest.load(folder / REQUEST_FILE) if (folder / REQUEST_FILE).is_file() else None
+        return ViewDataset(folder, view_set(train), view_set(test), request)
 
     @property
     def fingerprint(self) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from bbfit.checks import InputTypeError, check_choice, check_count, check_range, fail
+from bbfit.provenance import EXECUTION
 
 Device = Literal["cpu", "cuda", "optix", "hip", "oneapi", "metal"]
 Axis = Literal["auto", "origin", "center"]
@@ -40,9 +41,9 @@ class ViewsConfig:
     """Strength of the light from everywhere: at 1, without sun, an open white matt surface is just white. Scales an HDRI too."""
     hdri: Path | None = None
     """Panorama (.hdr or .exr) that lights the tree in place of even white; set the sun's strength to 0 when it has its own sun."""
-    device: Device = "cpu"
+    device: Device = field(default="cpu", metadata=EXECUTION)
     """What Blender renders on."""
-    workers: int = 1
+    workers: int = field(default=1, metadata=EXECUTION)
     """Blender processes at a time; the processor's threads are shared out among them."""
     seed: int = 0
     """Another seed gives other noise, and holds out other views."""

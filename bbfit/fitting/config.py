@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from bbfit.checks import check_choice, check_count, check_range, fail
 from bbfit.geometry.alpha import AlphaKind, check_cutoff
 from bbfit.operators.config import Backend, Loss
+from bbfit.provenance import EXECUTION
 
 Preset = Literal["default", "thesis"]
 Sides = Literal["one", "two", "pair"]
@@ -134,9 +135,9 @@ class FitConfig:
     """Another seed gives another search, other start textures and another order of views."""
     backend: Backend = "auto"
     """What draws while fitting: the kernels (fused, auto), or the reference, which is many times slower."""
-    device: str = "cpu"
+    device: str = field(default="cpu", metadata=EXECUTION)
     """Torch device to fit on, such as cpu or cuda."""
-    checkpoint_every: int = 250
+    checkpoint_every: int = field(default=250, metadata=EXECUTION)
     """Steps between two checkpoints; a fit that was stopped goes on from the last."""
 
     def __post_init__(self) -> None:

@@ -71,6 +71,11 @@ class Cards:
         """Vertices of all cards, with the two that center the bounds of each that has an origin."""
         return sum(len(card.corners) + 2 * (card.origin is not None) for card in self.cards)
 
+    @property
+    def visible_alpha(self) -> float:
+        """The least alpha that is visible: the cutoff of mask, and 0 for the other modes, which show any alpha above 0."""
+        return self.alpha.cutoff if self.alpha.kind == "mask" else 0.0
+
     def with_cards(self, cards: list[Card]) -> Cards:
         """Other cards of the same textures."""
         return replace(self, cards=tuple(cards))

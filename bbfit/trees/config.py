@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from bbfit.checks import check_count, check_range
+from bbfit.provenance import EXECUTION
 
 VERTEX_LIMIT = 20_000_000
 """Most vertices that a tree may have unless asked otherwise; a willow has half as many."""
@@ -21,9 +22,9 @@ class GrowConfig:
     """How fine the bark is, in [0.1, 10]: factor on the rings along stems and on each ring's corners; vertices go by its square."""
     leaves: float = 1.0
     """Share of the leaves that grow, in [0, 1]; fewer are larger, so that their area stays."""
-    max_vertices: int = VERTEX_LIMIT
+    max_vertices: int = field(default=VERTEX_LIMIT, metadata=EXECUTION)
     """Refuse to grow a tree of more vertices than this."""
-    species_file: Path | None = None
+    species_file: Path | None = field(default=None, metadata=EXECUTION)
     """Species of your own, laid out like those that come with bbfit (`bbfit grow --list` says where they are)."""
 
     def __post_init__(self) -> None:

@@ -288,7 +288,7 @@ def test_bounds_are_centerd_on_the_origin_without_other_triangles(name: str) -> 
 
 
 def test_the_same_cards_give_the_same_pieces() -> None:
-    cards, pieces = scene("leaning")
+    cards, pieces = scene("mutually crossing")
     for one, other in zip(pieces.cards, split(cards, WRONG).cards, strict=True):
         np.testing.assert_array_equal(one.corners, other.corners)
         np.testing.assert_array_equal(one.origin, other.origin)
