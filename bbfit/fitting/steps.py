@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
@@ -55,7 +55,7 @@ class Stepper:
         assert config.beta1 is not None and config.beta2 is not None
         self._cloud, self._movement, self._betas = cloud.without_textures(), movement, (config.beta1, config.beta2)
         self._binarization = (config.binarization_weight or 0.0) / (targets.cameras.width * targets.cameras.height)
-        self._pass = _pass_of(config)(self._cloud, targets, config, movement, groups)
+        self._pass: Any = _pass_of(config)(self._cloud, targets, config, movement, groups)
         self._begin, self.steps = self._pass.adam.padded(cloud.texels), 0
 
     @cached_property
@@ -80,22 +80,7 @@ class Stepper:
         return self._movement.now(texels) if self._movement else self._cloud.to("cpu").with_texels(texels)
 
     def step(self, chosen: Sequence[int], rate: float, placement_learning_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
-        """Take the next step.
-
-        Parameters
-        ----------
-        chosen : Sequence[int]
-            Indices of the views to compare with.
-        rate, placement_learning_rate : float
-            Learning rates of texels and placement.
-        alpha : AlphaMode
-            Alpha mode in which views are drawn.
-
-        Returns
-        -------
-        Tensor
-            The loss before the update, a scalar.
-        """
+        """Take the next step with the chosen views, drawn in an alpha mode; return the loss before the update, a scalar."""
         movement = self._movement if placement_learning_rate > 0 else None
         loss, of_parameters = self._pass.differentiate(self.state, chosen, alpha, movement is not None)
         if movement is not None and of_parameters is not None:
