@@ -8,7 +8,7 @@ from bbfit.checks import InputTypeError, fail
 from bbfit.trees.config import VERTEX_LIMIT, GrowConfig
 from bbfit.trees.mesh import count_vertices, leaf_vertices, stem_vertices, tree_parts
 from bbfit.trees.species import Species, load_species
-from bbfit.trees.tree_file import scene_of
+from bbfit.trees.tree_writer import scene_of
 from bbfit.trees.weber_penn import grow_skeleton
 
 if TYPE_CHECKING:
