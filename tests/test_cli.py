@@ -182,7 +182,7 @@ def test_a_missed_target_is_said_and_no_failure(views_folder: Path, tmp_path: Pa
         (["--bytes", "60kb"], "bytes: '60kb' is no number"),
         (["--target-psnr", "0"], "target_psnr: expected a value in (0, 100], got 0"),
         (["--target-psnr", "nan"], "target_psnr: expected a value in (0, 100], got nan"),
-        (["--target-psnr", "30", "--auto"], "auto: it and a target PSNR both say when to stop"),
+        (["--target-psnr", "30", "--auto"], "auto: auto and a target PSNR both decide when to stop"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -322,7 +322,7 @@ def test_sweep_shows_its_runs_and_what_failed(views_folder: Path, tmp_path: Path
         ([], "no trees"),
         (["--grid", "none", "--species", "acer"], "neither built in nor"),
         (["--species", "cactus"], "species: expected one of"),
-        (["--species", "acer", "--gpus", "1"], "gpus: it is Ray"),
+        (["--species", "acer", "--gpus", "1"], "gpus: only Ray"),
         (["--species", "acer", "--ray", "127.0.0.1:1"], "no cluster answers at 127.0.0.1:1"),
     ],
 )

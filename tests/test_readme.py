@@ -266,7 +266,7 @@ def work_small(patch: pytest.MonkeyPatch, size: int = SMALL_VIEWS["size"]) -> No
         "choose": lambda data, config, budget: real["choose"](data, fit(config), budget),
         "run": lambda source, out, config=None: real["run"](source, out, stages(config)),
         "run_sweep": lambda out, config, **given: real["run_sweep"](
-            out, replace(config, billboards=(2,), loss=("l2",), variants=("base",), steps=4, workers=1), grown, **given
+            out, replace(config, billboards=(2,), loss=("l2",), variants=("base",), workers=1), grown, **given
         ),
         "compare": lambda tree, out: real["compare"](tree, out, few, stages(None)),
         "build_lod": lambda tree, out, config: real["build_lod"](tree, out, replace(config, planes=(2, 1)), stages(None)),

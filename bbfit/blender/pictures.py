@@ -25,7 +25,7 @@ from bbfit.images import read_rgba
 
 RECORD_FILE = "pictures.json"
 """What :func:`render_pictures` notes beside its pictures: the tree, the light, the cameras and the clip distances."""
-FREE = ("workers", "device")
+FREE = ("render_workers", "render_device")
 """Settings that may differ between two starts on one folder: they change how long the pictures take, not what they show."""
 FILTER_REACH = 2.0
 """Pixels that a surface's picture reaches beyond it, rounded up: Cycles' filter (Blackman-Harris) spreads it 1.5 pixels about a pixel's
@@ -93,7 +93,7 @@ def render_pictures(
         write_json(out / RECORD_FILE, asked)
         seen = clips or [whole(points, position) for position in cameras.position]
         pool.render(
-            frames(cameras, paths, missing, seen, config.seed), config.workers, count - len(missing), lambda done: tell(done, count)
+            frames(cameras, paths, missing, seen, config.seed), config.render_workers, count - len(missing), lambda done: tell(done, count)
         )
     return paths
 
@@ -158,8 +158,8 @@ def job(tree: Path, config: ViewsConfig, size: int, count: int) -> dict[str, Any
         "sun_strength": config.sun_strength,
         "ambient_strength": config.ambient_strength,
         "hdri": None if config.hdri is None else str(Path(config.hdri).resolve()),
-        "device": config.device,
-        "threads": max(1, (os.cpu_count() or 1) // max(1, min(config.workers, count))),
+        "device": config.render_device,
+        "threads": max(1, (os.cpu_count() or 1) // max(1, min(config.render_workers, count))),
     }
 
 

@@ -92,7 +92,7 @@ def render_views(
         kept = config.count - len(missing)
         record(kept)
         clips = [whole(points, camera.position[0])] * config.count
-        pool.render(frames(camera, paths, missing, clips, config.seed), config.workers, kept, record)
+        pool.render(frames(camera, paths, missing, clips, config.seed), config.render_workers, kept, record)
     train, test = split_views(config.count, config.seed)
     write_transforms(out, camera, [f"images/{path.name}" for path in paths], train, test)
     write_json(out / REQUEST_FILE, request | {"seconds": round(spent + time.monotonic() - started, 3), "complete": True})

@@ -18,7 +18,7 @@ from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.model import shipped_cards
-from bbfit.fitting.config import FitConfig, Placement, Sides
+from bbfit.fitting.config import FitConfig, Placement, ResolvedFit, Sides
 from bbfit.fitting.levels import resize_textures
 from bbfit.fitting.loop import fit
 from bbfit.geometry.cloud import BillboardCloud
@@ -70,8 +70,8 @@ class Trial:
 class Choice:
     """What was tried, and what is to be fitted."""
 
-    config: FitConfig
-    """The configuration to fit with, resolved."""
+    config: ResolvedFit
+    """The configuration to fit with."""
     trials: tuple[Trial, ...]
     """In order."""
     chosen: int

@@ -37,8 +37,8 @@ def show(result: RunResult, *, thesis: bool) -> None:
 
 def show_missed(config: ExportConfig) -> None:
     """Say if a texture format was left out for want of a package."""
-    if config.missed is not None:
-        out_console.print(f"textures are PNG alone, without mip levels; for KTX2 {config.missed}", style="yellow", soft_wrap=True)
+    if config.missing_encoder is not None:
+        out_console.print(f"textures are PNG alone, without mip levels; for KTX2 {config.missing_encoder}", style="yellow", soft_wrap=True)
 
 
 def progress() -> contextlib.AbstractContextManager[Progress]:

@@ -116,7 +116,6 @@ def watched(config: WatchConfig, out: Path, source: Path | None, tree: Path | No
     from bbfit.viewing.watching import Watch
 
     alpha = fit.resolve().alpha
-    assert alpha is not None
     with Page(host=config.host, port=config.port) as page, contextlib.closing(Watch(page, out, source, tree, alpha)) as watch:
         _announce(page.url, config.port, open=config.open)
         yield Onlooker(watch, page.url)

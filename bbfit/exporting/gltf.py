@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.exporting.cards import Card, Cards
-from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.encoders import encode_ktx2, encode_webp
 from bbfit.exporting.splitting import centerd
 from bbfit.images import encode_png
@@ -30,7 +30,7 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
     import trimesh
     from PIL import Image
 
-    config = config.resolve()
+    resolved = config.resolve()
     standin = Image.new("RGBA", (1, 1))  # trimesh writes texture coordinates for textured materials only
     scene = trimesh.Scene(base_frame="billboard_cloud")
     for name, chosen in _meshes(cards).items():
@@ -56,8 +56,8 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
         origin = chosen[0].origin
         place = None if origin is None else trimesh.transformations.translation_matrix(origin)
         scene.add_geometry(mesh, node_name=name, geom_name=name, transform=place)
-    tree, views = split_glb(glb_of_scene(scene, lambda tree: _complete(tree, cards, config)))
-    return joined_glb(tree, _with_pictures(tree, views, cards, config))
+    tree, views = split_glb(glb_of_scene(scene, lambda tree: _complete(tree, cards, resolved)))
+    return joined_glb(tree, _with_pictures(tree, views, cards, resolved))
 
 
 def _vertices(card: Card) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -81,7 +81,7 @@ def _meshes(cards: Cards) -> dict[str, list[Card]]:
     return meshes
 
 
-def _complete(tree: dict[str, Any], cards: Cards, config: ExportConfig) -> None:
+def _complete(tree: dict[str, Any], cards: Cards, config: ResolvedExport) -> None:
     """Add to trimesh's glTF what it has no means to say, but for the pictures."""
     # trimesh lists the picture once for each material.
     assert len({image["bufferView"] for image in tree["images"]}) == 1
@@ -100,7 +100,7 @@ def _complete(tree: dict[str, Any], cards: Cards, config: ExportConfig) -> None:
         tree["extensionsUsed"] = sorted(used)
 
 
-def _with_pictures(tree: dict[str, Any], views: list[bytes], cards: Cards, config: ExportConfig) -> list[bytes]:
+def _with_pictures(tree: dict[str, Any], views: list[bytes], cards: Cards, config: ResolvedExport) -> list[bytes]:
     """The contents of the buffer views with those of the pictures, which the JSON is made to name."""
     pictures = {"image/png": encode_png(cards.atlas.image)}
     if config.textures in _EXTENSIONS:

@@ -74,14 +74,14 @@ def shipped_cards(cloud: BillboardCloud, config: ExportConfig, halvings: int = 0
     InputError
         if the cloud is empty or has values that are not finite.
     """
-    config = config.resolve()
-    cards = cloud_cards(as_shipped(cloud, config), config.padding << halvings)
-    if config.split and cards.alpha.kind == "blend":
+    resolved = config.resolve()
+    cards = cloud_cards(as_shipped(cloud, resolved), resolved.padding << halvings)
+    if resolved.split and cards.alpha.kind == "blend":
         cards = split(cards)
-    if config.hull is not None:
-        cards = with_hulls(cards, config.hull, shows_from(cards))
+    if resolved.hull is not None:
+        cards = with_hulls(cards, resolved.hull, shows_from(cards))
     cards = reduced(cards, halvings)
-    return with_mips(cards) if config.brings_mips else cards
+    return with_mips(cards) if resolved.has_mips else cards
 
 
 def shows_from(cards: Cards) -> float:

@@ -18,7 +18,7 @@ from torch import Tensor
 from bbfit.checks import InputTypeError, check_file, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.coverage import matched_coverage
 from bbfit.fitting.initialize import bounded, pixels_a_meter, random_textures, sized, start_cloud, tree_radius
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
@@ -61,7 +61,7 @@ class FitResult:
     """The result, float32 on the CPU."""
     losses: list[float]
     """Loss of every step."""
-    config: FitConfig
+    config: ResolvedFit
     """The configuration, resolved."""
     seconds: float
     """Time spent fitting, over all attempts when resumed."""
@@ -117,7 +117,6 @@ def fit(
     if not isinstance(views, ViewDataset):
         raise InputTypeError(f"views: expected a ViewDataset, got {views!r}; ViewDataset.load(folder) reads one")
     config = (config or FitConfig()).resolve()
-    assert config.steps is not None and config.views_per_step is not None and config.learning_rate is not None
     device = _device(config.device)
     begun = time.perf_counter()
     views.train.check()
@@ -134,7 +133,6 @@ def fit(
     begun -= done.seconds
 
     start, fitted, losses = done.start, done.found, done.losses
-    assert config.texel_density is not None
     density, radius = config.texel_density * float(pixels_a_meter(views.train.cameras)), tree_radius(views.train)
     for level in (levels := levels_of(config, views.train.cameras)):
         if len(losses) > level.end:
@@ -150,7 +148,7 @@ def fit(
             stepper.restore(done.tensors, len(losses) - level.begin)
         for index in range(len(losses), level.end):
             rate = learning_rate(config, index)
-            placement_learning_rate = (config.placement_learning_rate or 0.0) * rate / config.learning_rate
+            placement_learning_rate = config.placement_learning_rate * rate / config.learning_rate
             chosen = sample_views(config, len(views.train), index, level.halvings)
             losses.append(float(stepper.step(chosen, rate, placement_learning_rate, drawn_as(config, level, index))))
             if on_step is not None:
@@ -161,7 +159,7 @@ def fit(
         del stepper
         if movement is not None:
             start = bounded(fitted, opaque_bounds(fitted), density, config.max_texels).to(torch.float32)
-    assert fitted is not None and config.alpha is not None
+    assert fitted is not None
     fitted = replace(fitted, alpha=AlphaMode(config.alpha, config.alpha_cutoff))
     if config.alpha == "mask":
         fitted = matched_coverage(fitted, views.train, config.backend)
@@ -172,7 +170,7 @@ def fit(
     return FitResult(fitted if stand else trimmed(fitted), losses, config, time.perf_counter() - begun)
 
 
-def _begin(views: ViewDataset, config: FitConfig, tree: str | Path | None, on_place: Callable[[int, int], None] | None) -> _FitState:
+def _begin(views: ViewDataset, config: ResolvedFit, tree: str | Path | None, on_place: Callable[[int, int], None] | None) -> _FitState:
     """Before the first step: evenly placed billboards, or what the search finds."""
     if config.placement == "even":
         return _FitState([], start_cloud(views.train, config), None, {}, 0.0)
@@ -180,7 +178,6 @@ def _begin(views: ViewDataset, config: FitConfig, tree: str | Path | None, on_pl
         points = hull_points(views.train, seed=config.seed)
     else:
         points = mesh_points(tree, views.train, seed=config.seed)
-    assert config.texel_density is not None
     found = find_placement(views.train, points, config, on_place)
     density = config.texel_density * float(pixels_a_meter(views.train.cameras))
     return _FitState([], sized(found, density, config.max_texels), found, {}, 0.0)
@@ -202,16 +199,15 @@ class ResolutionLevel:
     """Steps after the level."""
 
 
-def levels_of(config: FitConfig, cameras: Camera) -> list[ResolutionLevel]:
+def levels_of(config: ResolvedFit, cameras: Camera) -> list[ResolutionLevel]:
     """The levels of a resolved configuration, coarse to fine; levels of very small pictures are left out."""
-    assert config.levels is not None and config.steps is not None
     side = min(cameras.width, cameras.height)
     halvings = [h for h in reversed(range(config.levels)) if h == 0 or side >> h >= LEAST_SIDE]
     edges = [config.steps * i // len(halvings) for i in range(len(halvings) + 1)]
     return [ResolutionLevel(*level) for level in zip(halvings, edges, edges[1:], strict=False)]
 
 
-def drawn_as(config: FitConfig, level: ResolutionLevel, index: int) -> AlphaMode:
+def drawn_as(config: ResolvedFit, level: ResolutionLevel, index: int) -> AlphaMode:
     """How step ``index`` (from 0) of a resolved configuration draws: as blend, but for a mask at full resolution.
 
     There the ramp about the cutoff hardens over the first third of the level's steps, and then is a step. At lower resolutions what is cut
@@ -225,24 +221,22 @@ def drawn_as(config: FitConfig, level: ResolutionLevel, index: int) -> AlphaMode
     return AlphaMode("mask", config.alpha_cutoff, hardness)
 
 
-def learning_rate(config: FitConfig, index: int) -> float:
+def learning_rate(config: ResolvedFit, index: int) -> float:
     """Adam's rate in step ``index`` (from 0) of a resolved configuration.
 
     ``growth`` is the thesis's schedule, lr_i = lr_(i-1) * (1 + 0.1 / n): over n steps the rate grows by about a tenth.
     """
-    assert config.learning_rate is not None and config.steps is not None
     if config.schedule == "growth":
         return config.learning_rate * (1 + 0.1 / config.steps) ** index
     return config.learning_rate * 0.5 * (1 + math.cos(math.pi * index / config.steps))
 
 
-def sample_views(config: FitConfig, count: int, index: int, halvings: int = 0) -> list[int]:
+def sample_views(config: ResolvedFit, count: int, index: int, halvings: int = 0) -> list[int]:
     """The training views of step ``index``, of ``count``: a function of the seed and the step alone, so that any step can be resumed.
 
     One view a step is drawn at random with replacement (thesis, algorithm 1); several are dealt from reshuffled decks, so that all
     views come up equally often. Every halving of the resolution doubles their number.
     """
-    assert config.views_per_step is not None
     wanted = config.views_per_step << halvings
     if wanted == 1:
         return np.random.default_rng([config.seed, index]).integers(count, size=1).tolist()

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, seen_across, splatted, split_planes
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.initialize import pixels_a_meter, tree_radius
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.losses import pixel_losses
@@ -39,7 +39,9 @@ _NEAR, _TRIALS = 0.08, 150
 _MARGIN = 0.06
 
 
-def find_placement(views: ViewSet, points: Tensor, config: FitConfig, on_work: Callable[[int, int], None] | None = None) -> BillboardCloud:
+def find_placement(
+    views: ViewSet, points: Tensor, config: ResolvedFit, on_work: Callable[[int, int], None] | None = None
+) -> BillboardCloud:
     """Billboards placed where the tree is, with textures fitted at a low resolution.
 
     Clusterings of the points from different random starts, upright and free, are fitted for a few steps each in which billboards move with
@@ -63,14 +65,12 @@ def find_placement(views: ViewSet, points: Tensor, config: FitConfig, on_work: C
 
 
 class _Search:
-    def __init__(self, views: ViewSet, points: Tensor, config: FitConfig, on_work: Callable[[int, int], None]) -> None:
+    def __init__(self, views: ViewSet, points: Tensor, config: ResolvedFit, on_work: Callable[[int, int], None]) -> None:
         self._config, self._points, self._on_work = replace(config.coarse(), ssim_weight=0.0), points, on_work
         side = min(views.cameras.width, views.cameras.height)
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))
         cameras = self._targets.cameras
-        assert config.texel_density is not None and config.billboards is not None
-        assert config.restarts is not None and config.refinement_rounds is not None
         self._density = float(pixels_a_meter(cameras)) * config.texel_density
         self._seen = seen_across(cameras)
         self._pixels = [pixels_of(points, cameras[index]) for index in range(len(cameras))]
@@ -88,7 +88,6 @@ class _Search:
 
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
-        assert self._config.restarts is not None and self._config.refinement_rounds is not None
         best = min((self._searched(number) for number in range(self._config.restarts)), key=itemgetter(1))
         for turn in range(self._config.refinement_rounds):
             best = min(best, self._best_of([best[0], *self._revised(best[0], turn)]), key=itemgetter(1))
@@ -199,7 +198,7 @@ class _Search:
         for step in range(steps):
             fall = 0.5 * (1 + math.cos(math.pi * step / steps))
             chosen = torch.randperm(len(self._targets.cameras), generator=self._generator)[:_BATCH].tolist()
-            stepper.step(chosen, rate * fall, (config.placement_learning_rate or 0.0) * fall)
+            stepper.step(chosen, rate * fall, config.placement_learning_rate * fall)
             self._done += len(clouds)
             self._on_work(self._done, self._total)
         clouds = stepper.finish().parts(len(clouds))
@@ -207,7 +206,6 @@ class _Search:
 
     def _losses(self, cloud: BillboardCloud) -> Tensor:
         """The loss of every pixel of every training view, [V, H, W]."""
-        assert self._config.loss is not None
         device = self._config.device
         image = render(cloud.to(device), self._targets.cameras.to(device), backend=self._config.backend)
         return pixel_losses(image.cpu(), self._pictures, self._config.loss)

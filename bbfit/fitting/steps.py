@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.losses import binarization_loss, image_loss
 from bbfit.fitting.movement import Movement
@@ -60,7 +60,7 @@ class Stepper(Protocol):
 
 
 def make_stepper(
-    cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None, *, groups: int = 1
+    cloud: BillboardCloud, targets: Targets, config: ResolvedFit, movement: Movement | None = None, *, groups: int = 1
 ) -> Stepper:
     """A stepper for a resolved configuration, which starts from the cloud's texels on their device.
 
@@ -77,14 +77,13 @@ class ReferenceStepper:
     """The specification: kornia's warp, autograd and torch's Adam."""
 
     def __init__(
-        self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None, groups: int = 1
+        self, cloud: BillboardCloud, targets: Targets, config: ResolvedFit, movement: Movement | None = None, groups: int = 1
     ) -> None:
         self._cloud, self._targets, self._config, self._movement, self._groups = cloud.without_textures(), targets, config, movement, groups
         self._start(cloud.texels.clone(), torch.zeros_like(cloud.texels), torch.zeros_like(cloud.texels), 0)
 
     def _start(self, texels: Tensor, first_moment: Tensor, second_moment: Tensor, steps: int) -> None:
         self.texels = texels.to(self._cloud.texels.device).requires_grad_()
-        assert self._config.beta1 is not None and self._config.beta2 is not None
         self._adam = torch.optim.Adam([self.texels], betas=(self._config.beta1, self._config.beta2), fused=True)
         self._adam.state[self.texels] = {
             "step": torch.tensor(float(steps), device=self.texels.device),
@@ -123,13 +122,12 @@ class ReferenceStepper:
             moved = self._movement.parameters.clone().requires_grad_(bool(placement_learning_rate))
             cloud = replace(self._movement.placed(moved, self.texels).to(torch.float32).to(device), alpha=alpha)
         config, cameras = self._config, self._targets.cameras[list(chosen)].to(device)
-        assert config.loss is not None
         target, loss = self._targets.pictures(chosen).to(device), torch.zeros((), device=device)
         for group in cloud.parts(self._groups):
             image = render_reference(group, cameras)
-            loss = loss + image_loss(image, target, config.loss, config.ssim_weight or 0.0, config.sharpness_weight or 0.0)
+            loss = loss + image_loss(image, target, config.loss, config.ssim_weight, config.sharpness_weight)
         self._adam.zero_grad()
-        (loss + (config.binarization_weight or 0.0) * binarization_loss(self.texels) / (target.shape[1] * target.shape[2])).backward()
+        (loss + config.binarization_weight * binarization_loss(self.texels) / (target.shape[1] * target.shape[2])).backward()
         before = self.texels.detach()[:, 3].clone()
         self._adam.step()
         with torch.no_grad():
@@ -145,7 +143,7 @@ class FusedStepper:
     """The same by Warp kernels: one pass over the pixels and one over the texels."""
 
     def __init__(
-        self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None, groups: int = 1
+        self, cloud: BillboardCloud, targets: Targets, config: ResolvedFit, movement: Movement | None = None, groups: int = 1
     ) -> None:
         from bbfit.fitting.adam import padded
         from bbfit.rendering.fused_projection import Projector
@@ -203,7 +201,6 @@ class FusedStepper:
             projection = self._standing.take(torch.tensor(chosen, device=device))
         projection, groups = replace(projection, alpha=alpha).grouped(self._groups), self._groups
         pixels = len(chosen) * projection.width * projection.height
-        assert config.loss is not None
         target = self._targets.packed(chosen).to(device)
         if groups > 1:
             target = target.repeat(groups, 1, 1, 1)
@@ -225,8 +222,7 @@ class FusedStepper:
             of_matrices = of_matrices.unflatten(0, (groups, -1)).transpose(0, 1).flatten(1, 2)
             movement.update(movement.pull_back(placement, self._projector.pull_back(of_matrices).cpu()), placement_learning_rate)
         self.steps += 1
-        assert config.beta1 is not None and config.beta2 is not None
-        binarization = (config.binarization_weight or 0.0) / (projection.width * projection.height)
+        binarization = config.binarization_weight / (projection.width * projection.height)
         state.update(self.steps, rate, (config.beta1, config.beta2), binarization, alpha_rate(alpha))
         return sums.sum() / pixels + lost
 
@@ -237,9 +233,7 @@ class FusedStepper:
         from bbfit.rendering.fused import draw, unpacked
 
         # Both are means over views, and groups are to be added up.
-        ssim_weight, sharpness_weight = (
-            self._groups * (weight or 0.0) for weight in (self._config.ssim_weight, self._config.sharpness_weight)
-        )
+        ssim_weight, sharpness_weight = (self._groups * weight for weight in (self._config.ssim_weight, self._config.sharpness_weight))
         if not ssim_weight and not sharpness_weight:
             return 0.0, None
         # Memory that is kept: fresh pages for a few large pictures a step would cost as much as drawing them.

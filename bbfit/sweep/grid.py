@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from bbfit.checks import InputError, check_file, fail
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.sweep.config import SweepConfig
 
 VARIANT = "variant"
@@ -26,8 +26,8 @@ class Cell:
 
     labels: Mapping[str, str]
     """What sets it apart from the others: the variant, if the grid has any, and a value for each axis."""
-    config: FitConfig
-    """Resolved."""
+    config: ResolvedFit
+    """What to fit."""
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ def run_sweep(
     if stages.budget.given:
         fail("budget", "a sweep tries what its grid says", "leave the budget out")
     grid = Grid.load(config.grid).narrowed(config)
-    cells = grid.cells(stages.fit if config.steps is None else replace(stages.fit, steps=config.steps))
+    cells = grid.cells(stages.fit)
     found = sources(species if species or trees or views else grid.trees, trees, views, stages.grow.species_file)
     sweep = _Sweep(output_folder("out", out), found, cells, config, stages)
     workers: Workers = LocalWorkers(config.workers, config.retries) if config.ray is None else RayWorkers(config)
@@ -201,7 +201,7 @@ class _Sweep:
         growth, light = self._stages.grow, self._stages.views
         made_of = fingerprint(list(files)) if grown is None else [asdict(grown), {**asdict(growth), "species_file": None}]
         panorama = None if light.hdri is None else fingerprint([check_file("hdri", light.hdri)])
-        views = {**asdict(light), "workers": None, "device": None, "hdri": panorama}
+        views = {**asdict(light), "render_workers": None, "render_device": None, "hdri": panorama}
         key = hash_inputs("grow", made_of, views)[:_DIGITS]
         earlier = self._results.get(key)
         if earlier and self._stands(earlier) and (earlier.reason or (self._folder_of(source) / "views" / TEST_FILE).is_file()):
@@ -264,7 +264,7 @@ class _Sweep:
             SweepRow(
                 tree=source.name,
                 labels=cell.labels,
-                steps=cell.config.steps or 0,
+                steps=cell.config.steps,
                 facts=outcome.facts,
                 reason=outcome.reason,
                 seconds=outcome.seconds,
