@@ -156,7 +156,7 @@ def _prepare(source: str | Path | None, out: str | Path, config: RunConfig, tell
         tree = _grow(species, record, config.grow, tell)
         return record, tree, _render(tree, record, config.views, tell)
     source = Path(source)
-    if config.species is not None or config.grow != RunConfig().grow:
+    if config.species is not None or replace(config.grow, seed=0) != RunConfig().grow:
         fail("run", f"{source} is given, so that no tree is grown", "leave out the species and the options of growing one")
     # What cannot be used is refused before a folder is made for it.
     given = ViewDataset.load(source, seed=config.fit.seed) if source.is_dir() else None
