@@ -641,18 +641,15 @@ def test_a_choice_survives_the_disk(choosing: Choosing) -> None:
 # The real thing.
 
 
-class Sealed:
-    """Pictures that may not be looked at."""
-
-    def get(self, path: Path) -> torch.Tensor:
-        """Fails."""
-        raise AssertionError(f"{path} was looked at")
+def refuse(path: Path) -> torch.Tensor:
+    """Reads no picture."""
+    raise AssertionError(f"{path} was read")
 
 
 def sealed(folder: Path) -> ViewDataset:
     """Views whose test pictures may not be looked at."""
     views = ViewDataset.load(folder)
-    return dataclasses.replace(views, test=dataclasses.replace(views.test, _cache=Sealed()))
+    return dataclasses.replace(views, test=dataclasses.replace(views.test, read=refuse))
 
 
 QUICK = FitConfig(candidates=2, refinement_rounds=0, steps=4, views_per_step=1)
