@@ -11,25 +11,21 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from bbfit.blender.conversion import converted_once, tree_as_glb
+from bbfit.blender.conversion import tree_as_glb
 from bbfit.blender.pictures import render_pictures
-from bbfit.blender.sources import check_tree, fingerprint
-from bbfit.blender.views_folder import render_views
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, fail
 from bbfit.evaluation.report import Measures, mean_measures
 from bbfit.evaluation.scoring import held_out, score_views
-from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.lod import glb_counts
-from bbfit.exporting.model import as_shipped, shipped_cards
+from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_a_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, read_rgba, to_bytes, unpremultiply, write_png
-from bbfit.pipeline import Progress, RunConfig, original_tree, run
-from bbfit.records import STAGE_VERSIONS, hash_inputs, plain
+from bbfit.pipeline import RunConfig, run
+from bbfit.provenance import VERSIONS
 from bbfit.reporting.comparison_tables import CompareRow, compare_csv, compare_markdown, compare_picture, compare_plot
 from bbfit.rivals.baking import BakeConfig
 from bbfit.rivals.billboard_clouds import billboard_cloud
@@ -39,10 +35,14 @@ from bbfit.rivals.decimation import decimate
 from bbfit.rivals.draco import draco_size
 from bbfit.rivals.learned_mesh import learn_mesh, mesh_glb
 from bbfit.rivals.slicing import slicing
+from bbfit.stages.results import original_tree
+from bbfit.stages.stage import OnProgress, Record, Stage, silent
+from bbfit.stages.trees import convert_stage, views_stage
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset
 
-_VERSION = 1
-"""Raised when a rival's results change for the same inputs."""
+# Besides the comparison itself, these algorithms decide the results of every system.
+_VERSIONS = {name: VERSIONS[name] for name in ("fit", "export", "evaluate")}
 # Files that all rivals read as they are: Y up, with materials.
 _READABLE = (".glb", ".gltf", ".obj")
 # Blender thins a tree to about as many triangles as it is told; a few tries find how many fit into so many bytes.
@@ -76,12 +76,12 @@ class _Made:
 
 
 def compare(
-    tree: str | Path,
+    tree: str | Path | TreeFile,
     out: str | Path,
     config: CompareConfig | None = None,
     stages: RunConfig | None = None,
     *,
-    on_progress: Progress | None = None,
+    on_progress: OnProgress | None = None,
 ) -> CompareResult:
     """Give a tree to bbfit and to the systems that it is an alternative to, and score all on the same held-out views.
 
@@ -103,23 +103,24 @@ def compare(
     InputError, OSError
         if the tree cannot be used or something cannot be written. A system that lacks a package is left out, and the row says so.
     """
-    config, stages = config or CompareConfig(), stages or RunConfig()
-    files = check_tree(tree)
+    config, stages, on_progress = config or CompareConfig(), stages or RunConfig(), on_progress or silent
+    tree = TreeFile.open(tree)
     if stages.fit.billboards is not None or stages.budget.given:
-        fail("billboards", "the comparison says how many", "leave out billboards and budgets of the fit")
-    tell = on_progress or (lambda stage, done, total, note="": None)
+        fail("billboards", "the comparison sets their numbers", "leave out billboards and budgets of the fit")
     folder = output_folder("out", out)
-    views = ViewDataset.load(render_views(tree, folder / "views", stages.views, on_progress=lambda done, total: tell("views", done, total)))
+    record = Record(folder)
+    record.run(views_stage(folder, tree, stages.views), on_progress)
+    views = ViewDataset.load(folder / "views")
     chosen = [system for system in SYSTEMS if system in config.systems or not config.systems]
-    if files[0].suffix.lower() not in _READABLE:
-        converted_once(tree, folder / "tree.glb", on_begin=lambda: tell("tree", 0, 1))
-        files = [folder / "tree.glb"]
-    comparison = _Comparison(files, views, folder, config, stages, tell)
+    if tree.suffix not in _READABLE:
+        record.run(convert_stage(folder, tree, "tree.glb"), on_progress)
+        tree = TreeFile.open(folder / "tree.glb")
+    comparison = _Comparison(tree, views, record, config, stages, on_progress)
     rows = []
-    tell("systems", 0, len(chosen))
+    on_progress("systems", 0, len(chosen))
     for number, system in enumerate(chosen, 1):
         rows.append(comparison.row(system))
-        tell("systems", number, len(chosen), system)
+        on_progress("systems", number, len(chosen), system)
     write_bytes(folder / "compare.csv", compare_csv(rows))
     write_bytes(folder / "compare.md", compare_markdown(rows, original_tree(views)).encode())
     write_json(folder / "compare.json", [row.to_json() for row in rows])
@@ -132,10 +133,10 @@ class _Comparison:
     """One tree and the systems that it is given to."""
 
     def __init__(
-        self, files: list[Path], views: ViewDataset, folder: Path, config: CompareConfig, stages: RunConfig, tell: Progress
+        self, tree: TreeFile, views: ViewDataset, record: Record, config: CompareConfig, stages: RunConfig, on_progress: OnProgress
     ) -> None:
-        self._files, self._views, self._folder, self._config, self._stages, self._tell = files, views, folder, config, stages, tell
-        self._hash = [fingerprint(files), views.fingerprint]
+        self._tree, self._views, self._record, self._config, self._stages = tree, views, record, config, stages
+        self._folder, self._on_progress = record.folder, on_progress
         self._bake = BakeConfig(float(pixels_a_meter(views.train.cameras)), views=stages.views)
         self._size: int | None = None
         count, many, crossed = config.billboards, config.many, config.crossed
@@ -161,28 +162,29 @@ class _Comparison:
         }
 
     def row(self, system: str) -> CompareRow:
-        """A system's score and costs, by an earlier start where that stands."""
+        """The score and the costs of a system."""
         title, make = self._systems[system]
         folder = output_folder("out", self._folder / system)
-        settings = {**asdict(self._config), "systems": None}
-        fit, export = ({**asdict(part), "checkpoint_every": None} for part in (self._stages.fit, self._stages.export))
-        inputs = hash_inputs("fit", _VERSION, system, self._hash, plain(settings), plain(fit), plain(export), STAGE_VERSIONS["evaluate"])
-        record = folder / "result.json"
-        if record.is_file() and isinstance(earlier := read_json("result", record), dict) and earlier.get("inputs") == inputs:
-            return replace(CompareRow.from_json(earlier["row"]), title=title)
-        try:
+
+        def work(on_progress: OnProgress) -> None:
             made = make(folder)
+            if made.model is not None:
+                write_bytes(folder / "model.glb", made.model)
+            measures = None if made.draw is None else self._scored(system, made.draw, output_folder("out", folder / "held_out"))
+            size = made.size if made.model is None else len(made.model)
+            row = CompareRow(system, title, made.planes, made.vertices, size, round(made.seconds, 1), measures, made.note)
+            write_json(folder / "result.json", row.to_json())
+
+        settings = replace(self._config, systems=())
+        inputs = (system, self._tree.digest, self._views.fingerprint, settings, self._stages.fit, self._stages.export, _VERSIONS)
+        outputs = (f"{system}/result.json", f"{system}/model*.glb", f"{system}/held_out/*.png")
+        try:
+            self._record.run(Stage(system, inputs, outputs, work, algorithm="compare"))
         except InputError as error:
             if "is not installed" not in str(error) and "LLVM" not in str(error):
                 raise
             return CompareRow(system, title, None, None, None, None, None, str(error))
-        if made.model is not None:
-            write_bytes(folder / "model.glb", made.model)
-        measures = None if made.draw is None else self._scored(system, made.draw, output_folder("out", folder / "held_out"))
-        size = made.size if made.model is None else len(made.model)
-        row = CompareRow(system, title, made.planes, made.vertices, size, round(made.seconds, 1), measures, made.note)
-        write_json(record, {"inputs": inputs, "row": row.to_json()})
-        return row
+        return replace(CompareRow.from_json(read_json("result", folder / "result.json")), title=title)
 
     def _scored(self, system: str, draw: Callable[[int], Tensor], folder: Path) -> Measures:
         """Means over the held-out views, of which the pictures are kept."""
@@ -192,7 +194,8 @@ class _Comparison:
             write_png(folder / f"{self._views.test.names[index]}.png", to_bytes(unpremultiply(image)))
             return image
 
-        return mean_measures(score_views(drawn, self._views.test, on_view=lambda done, total: self._tell(f"{system} score", done, total)))
+        on_view = partial(self._on_progress, f"{system} score")
+        return mean_measures(score_views(drawn, self._views.test, on_view=on_view))
 
     def _bbfit(self, folder: Path) -> _Made:
         return self._fitted(FitConfig(billboards=self._config.billboards), folder)
@@ -210,42 +213,43 @@ class _Comparison:
         return self._run(RunConfig(fit=fit, budget=BudgetConfig(bytes=self._bytes()), export=self._stages.export), folder)
 
     def _run(self, stages: RunConfig, folder: Path) -> _Made:
-        def told(stage: str, done: int, total: int, note: str = "") -> None:
-            self._tell(f"{folder.name} {stage}", done, total, note)
+        def report(stage: str, done: int, total: int, note: str = "") -> None:
+            self._on_progress(f"{folder.name} {stage}", done, total, note)
 
-        result = run(self._folder / "views", folder / "run", replace(stages, tree=self._files[0]), on_progress=told)
-        shipped = as_shipped(result.cloud, self._stages.export)
+        result = run(self._folder / "views", folder / "run", replace(stages, tree=self._tree.path), on_progress=report)
+        shipped = shipped_model(result.cloud, self._stages.export)
         seconds = sum(result.report.seconds.get(stage, 0.0) for stage in ("budget", "fit", "export"))
         model = (folder / "run" / "model.glb").read_bytes()
         return _Made(model, result.report.vertices.model or 0, seconds, lambda index: self._drawn(shipped, index), len(result.cloud))
 
-    def _drawn(self, cloud: BillboardCloud, index: int) -> Tensor:
-        return held_out(cloud, self._views.test, index)[1]
+    def _drawn(self, model: ShippedModel, index: int) -> Tensor:
+        return held_out(model.draw, self._views.test, index)[1]
 
     def _baked(self, bake: Callable[..., BillboardCloud], folder: Path) -> _Made:
         begun = time.perf_counter()
-        cloud = bake(self._files[0], config=self._bake, folder=folder / "baked", on_progress=self._on(folder, "bake"))
-        model = _model(cloud)
-        return _Made(model, glb_counts(model)[0], time.perf_counter() - begun, lambda index: self._drawn(cloud, index), len(cloud))
+        cloud = bake(self._tree, config=self._bake, folder=folder / "baked", on_progress=self._on(folder, "bake"))
+        model = shipped_model(cloud)
+        vertices = glb_counts(model.glb)[0]
+        return _Made(model.glb, vertices, time.perf_counter() - begun, lambda index: self._drawn(model, index), len(cloud))
 
     def _sliced(self, folder: Path) -> _Made:
         begun = time.perf_counter()
         made = slicing(
-            self._files[0],
+            self._tree,
             self._bake,
             directions=self._config.directions,
             slices=self._config.slices,
             folder=folder / "baked",
             on_progress=self._on(folder, "bake"),
         )
-        model = _model(BillboardCloud.joined(made.clouds))
+        model = shipped_model(BillboardCloud.joined(made.clouds)).glb
         cameras, planes = self._views.test.cameras, sum(map(len, made.clouds))
         note = "two slicings of the six are drawn at a time and their pictures mixed, which takes a shader"
         return _Made(model, made.vertex_count, time.perf_counter() - begun, lambda index: made.draw(cameras[index]), planes, note)
 
     def _decimated(self, folder: Path, *, vertices: int | None = None, size: int | None = None) -> _Made:
         begun = time.perf_counter()
-        made = decimate(self._files[0], vertices=vertices, size=size)
+        made = decimate(self._tree, vertices=vertices, size=size)
         note = "by collapsing edges, and beyond that by clustering vertices" if made.clustered else "by collapsing edges"
         return _Made(made.glb, made.vertices, time.perf_counter() - begun, self._rendered(made.glb, folder), None, note)
 
@@ -255,9 +259,10 @@ class _Comparison:
     def _thinned(self, folder: Path) -> _Made:
         """Blender's decimation that enlarges the leaves it keeps (Cook et al. 2007), to at most as many bytes as bbfit's model has."""
         begun, path, limit = time.perf_counter(), folder / "thinned.glb", self._bytes()
-        triangles = max(1, self._views.request["tree"]["faces"] * limit // sum(file.stat().st_size for file in self._files))
+        assert self._views.request and self._views.request.tree.faces
+        triangles = max(1, self._views.request.tree.faces * limit // self._tree.bytes)
         for _ in range(_TRIES):
-            tree_as_glb(self._files[0], path, triangles=triangles)
+            tree_as_glb(self._tree, path, triangles=triangles)
             if path.stat().st_size <= limit:
                 break
             triangles = max(1, int(0.97 * triangles * limit / path.stat().st_size))
@@ -268,19 +273,19 @@ class _Comparison:
 
     def _draco(self, folder: Path) -> _Made:
         begun = time.perf_counter()
-        found = draco_size(self._files[0])
+        found = draco_size(self._tree)
         note = "looks like the tree, up to 14 bits a coordinate; not drawn"
         return _Made(None, found.vertices, time.perf_counter() - begun, None, None, note, found.bytes)
 
     def _learned(self, vertices: int, folder: Path) -> _Made:
-        begun, tell = time.perf_counter(), self._on(folder, "learn")
+        begun, on_progress = time.perf_counter(), self._on(folder, "learn")
         steps = self._config.mesh_steps
         made = learn_mesh(
             self._views.train,
             vertices=vertices,
             steps=steps,
             seed=self._stages.fit.seed,
-            on_step=lambda step, loss: tell(step, steps),
+            on_step=lambda step, loss: on_progress(step, steps),
         )
         model, cameras = mesh_glb(made), self._views.test.cameras
         note = "blended, so its triangles have to be sorted"
@@ -305,10 +310,4 @@ class _Comparison:
         return self._size
 
     def _on(self, folder: Path, what: str) -> Callable[[int, int], None]:
-        return lambda done, total: self._tell(f"{folder.name} {what}", done, total)
-
-
-def _model(cloud: BillboardCloud) -> bytes:
-    """A cloud as GLB, as bbfit writes its own."""
-    export = ExportConfig()
-    return glb_bytes(shipped_cards(cloud, export), export)
+        return lambda done, total: self._on_progress(f"{folder.name} {what}", done, total)

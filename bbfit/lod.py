@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from bbfit.blender.conversion import converted_once
-from bbfit.blender.meshes import MESH_SUFFIXES
-from bbfit.blender.sources import check_tree
-from bbfit.blender.views_folder import render_views
 from bbfit.checks import fail
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
-from bbfit.exporting.cards import Cards
-from bbfit.exporting.config import LodConfig
-from bbfit.exporting.gltf import glb_bytes
+from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.exporting.lod import LodLevel, glb_counts, lod_glb, stands_alone
-from bbfit.exporting.model import shipped_cards
-from bbfit.files import output_folder, write_bytes, write_json
+from bbfit.exporting.model import ShippedModel, shipped_model
+from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_a_meter
-from bbfit.pipeline import Progress, RunConfig, RunResult, export_config, run
+from bbfit.pipeline import RunConfig, RunResult, run
+from bbfit.provenance import digest_file
 from bbfit.reporting.plots import lod_picture
+from bbfit.stages.results import export_config
+from bbfit.stages.stage import OnProgress, Record, Stage, silent
+from bbfit.stages.trees import convert_stage, views_stage
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset
 
 
@@ -37,76 +37,95 @@ class LodResult:
 
 
 def build_lod(
-    tree: str | Path,
+    tree: str | Path | TreeFile,
     out: str | Path,
     config: LodConfig | None = None,
     stages: RunConfig | None = None,
     *,
     work: str | Path | None = None,
-    on_progress: Progress | None = None,
+    on_progress: OnProgress | None = None,
 ) -> LodResult:
     """Render a tree, fit billboard clouds of several sizes, and write them and the tree as levels of detail in one GLB.
 
-    Each level takes over at the distance from which on its error stays below ``config.error_pixels``. The error is that of its silhouette,
-    in meters at the tree's axis, by the training view in which it is largest, and a margin for views between those; it shrinks with
-    distance as everything does. No level is shown larger than the views that it was fitted to. Its textures are as fine as the screen can
-    show from there. Where the exports' format of textures is left open it is auto: KTX2 with mip levels if its encoder is there, and PNG.
+    Each level reswitches the finer one at the distance from which its error stays below ``config.error_pixels``. The error is that of its
+    silhouette, in meters at the tree's axis, in the worst training view, with a margin for views between those. It shrinks in proportion
+    to the distance. No level is shown larger than the views that it was fitted to. Its textures are as fine as the screen can show at that
+    distance. Where the format of textures is left open it is ``auto``: KTX2 with mip levels if its encoder is installed, and PNG.
 
-    Started again, it goes on where it stopped; what stands and has unchanged inputs is not done again.
+    A killed build continues where it stopped. Results with unchanged inputs are not made again.
 
     Parameters
     ----------
-    tree : the tree's file, of any kind that :func:`~bbfit.blender.views_folder.render_views` takes.
-    out : the GLB to write.
-    stages : how views are rendered, and billboards fitted and exported; the number of billboards is the levels' to say.
-    work : folder for views, one run a level (named by its planes), ``lod.json`` and ``lod.png``; left out, it is called as ``out`` is
-        without its ending.
-    on_progress : told how far each stage is; the stages of a level are called by its number of planes first.
+    tree
+        The tree, of any format that :func:`~bbfit.blender.views_folder.render_views` takes.
+    out
+        The GLB to write.
+    stages
+        How views are rendered, and billboards fitted and exported. ``config.planes`` sets the numbers of billboards.
+    work
+        Folder for views, one run for each level (named by its number of planes), ``lod.json`` and ``lod.png``. Default: ``out`` without
+        its ending.
+    on_progress
+        Called with the progress of each stage. The names of a level's stages start with its number of planes.
 
     Raises
     ------
     InputError, OSError
-        if an input cannot be used or something cannot be written; earlier results stay as they were.
+        If an input cannot be used or something cannot be written. Earlier results stay as they were.
     """
-    config, stages = config or LodConfig(), stages or RunConfig()
+    config, stages, on_progress = config or LodConfig(), stages or RunConfig(), on_progress or silent
     out = Path(out)
     if out.suffix.lower() != ".glb":
-        fail("out", f"{out} ends in {out.suffix or 'nothing'}", "levels of detail stand in one .glb file")
+        fail("out", f"{out} ends in {out.suffix or 'nothing'}", "levels of detail are one .glb file")
     output_folder("out's folder", out.parent)
     if stages.fit.billboards is not None or stages.budget.given:
-        fail("billboards", "the levels have their own numbers of them", "leave out billboards and budgets, and say planes")
-    files = check_tree(tree)
+        fail("billboards", "planes sets the number of billboards of each level", "leave out billboards and budgets")
+    tree = TreeFile.open(tree)
     folder = output_folder("work", work or out.with_suffix(""))
-    tell = on_progress or (lambda stage, done, total, note="": None)
-    views = ViewDataset.load(render_views(tree, folder / "views", stages.views, on_progress=lambda done, total: tell("views", done, total)))
-    original = _original(files, folder, config, tell) if config.original else None
-    mesh = files[0] if files[0].suffix.lower() in MESH_SUFFIXES else None
-    runs = [_fitted(folder, replace(stages, tree=mesh), planes, tell) for planes in config.planes]
-
+    record = Record(folder)
+    record.run(views_stage(folder, tree, stages.views), on_progress)
+    views = ViewDataset.load(folder / "views")
+    original = _original(record, tree, config, on_progress) if config.original else None
+    stages = replace(stages, tree=tree.path if tree.is_mesh else None)
+    runs = [_fitted(folder, stages, planes, on_progress) for planes in config.planes]
     export = export_config(views, stages.export)
     if export.textures is None:
-        export = replace(export, textures="auto")  # from afar is where mip levels matter
-    places = _places(views, runs, config)
-    tell("join", 0, len(runs) + 1)
-    cards = list[Cards]()
-    for number, (fitted, place) in enumerate(zip(runs, places, strict=True), 1):
-        cards.append(shipped_cards(fitted.cloud, export, place.halvings))
-        tell("join", number, len(runs) + 1)
-    models = ([original.read_bytes()] if original else []) + [glb_bytes(each, export) for each in cards]
-    if original:
-        places.insert(0, _Place(math.inf, 0.0, 0.0, 0))
-    fits = [None] * (len(models) - len(runs)) + runs
-    levels = _levels(views, models, fits, places, config, out.stem)
-    write_bytes(out, lod_glb(models, levels))
-    write_json(folder / "lod.json", {"config": asdict(config), "levels": [asdict(level) for level in levels]})
-    lod_picture(list(zip(levels[-len(cards) :], cards, strict=True)), views.test, folder / "lod.png")
-    tell("join", len(runs) + 1, len(runs) + 1)
-    return LodResult(out, folder, levels)
+        export = replace(export, textures="auto")  # mip levels matter most at a distance
+    record.run(_join_stage(folder, out, original, runs, views, config, export), on_progress)
+    levels = read_json("levels of detail", folder / "lod.json")["levels"]
+    return LodResult(out, folder, tuple(LodLevel(**level) for level in levels))
+
+
+def _join_stage(
+    folder: Path, out: Path, original: Path | None, runs: list[RunResult], views: ViewDataset, config: LodConfig, export: ExportConfig
+) -> Stage:
+    """Join the original and the models of all runs to one file."""
+
+    def work(on_progress: OnProgress) -> None:
+        switches = _switches(views, runs, config)
+        on_progress("join", 0, len(runs) + 1)
+        models, shipped = [original.read_bytes()] if original else [], list[ShippedModel]()
+        for number, (fitted, switch) in enumerate(zip(runs, switches, strict=True), 1):
+            shipped.append(shipped_model(fitted.cloud, export, switch.halvings))
+            models.append(shipped[-1].glb)
+            on_progress("join", number, len(runs) + 1)
+        if original:
+            switches.insert(0, _Switch(math.inf, 0.0, 0.0, 0))
+        fits = [None] * (len(models) - len(runs)) + runs
+        levels = _levels(views, models, fits, switches, config, out.stem)
+        write_bytes(out, lod_glb(models, levels))
+        write_json(folder / "lod.json", {"config": asdict(config), "levels": [asdict(level) for level in levels]})
+        lod_picture(list(zip(levels[-len(shipped) :], shipped, strict=True)), views.test, folder / "lod.png")
+        on_progress("join", len(runs) + 1, len(runs) + 1)
+
+    clouds = [digest_file(fitted.folder / name) for fitted in runs for name in ("cloud.safetensors", "metrics.json")]
+    inputs = (original and digest_file(original), clouds, views.fingerprint, config, export.resolve(), out.stem)
+    return Stage("join", inputs, ("lod.json", "lod.png", os.path.relpath(out, folder)), work, algorithm="lod")
 
 
 @dataclass(frozen=True)
-class _Place:
-    """Where a level takes over."""
+class _Switch:
+    """Where a level reswitches the finer one."""
 
     scale: float
     """Pixels a meter on the screen below which it is shown; infinity for the finest level."""
@@ -118,56 +137,49 @@ class _Place:
     """How often the sides of its textures can be halved and still have a texel for each pixel."""
 
 
-def _fitted(folder: Path, stages: RunConfig, planes: int, tell: Progress) -> RunResult:
-    def told(stage: str, done: int, total: int, note: str = "") -> None:
-        tell(f"{planes} {stage}", done, total, note)
+def _fitted(folder: Path, stages: RunConfig, planes: int, on_progress: OnProgress) -> RunResult:
+    def report(stage: str, done: int, total: int, note: str = "") -> None:
+        on_progress(f"{planes} {stage}", done, total, note)
 
     stages = replace(stages, fit=replace(stages.fit, billboards=planes))
-    return run(folder / "views", folder / str(planes), stages, on_progress=told)
+    return run(folder / "views", folder / str(planes), stages, on_progress=report)
 
 
-def _original(files: list[Path], folder: Path, config: LodConfig, tell: Progress) -> Path:
+def _original(record: Record, tree: TreeFile, config: LodConfig, on_progress: OnProgress) -> Path:
     """The tree as a GLB that others can be joined to."""
-    if config.triangles is None and stands_alone(files[0]):
-        return files[0]
-    begun = list[bool]()
-
-    def on_begin() -> None:
-        begun.append(True)
-        tell("original", 0, 1)
-
-    path = converted_once(files[0], folder / "original.glb", triangles=config.triangles, on_begin=on_begin)
-    if begun:
-        tell("original", 1, 1)
-    return path
+    if config.triangles is None and stands_alone(tree.path):
+        return tree.path
+    record.run(convert_stage(record.folder, tree, "original.glb", triangles=config.triangles), on_progress)
+    return record.folder / "original.glb"
 
 
-def _places(views: ViewDataset, runs: list[RunResult], config: LodConfig) -> list[_Place]:
+def _switches(views: ViewDataset, runs: list[RunResult], config: LodConfig) -> list[_Switch]:
     """Where billboard clouds take over; the first from the start if it is the finest level."""
     view_scale = float(pixels_a_meter(views.train.cameras))
-    places = list[_Place]()
+    switches = list[_Switch]()
     for fitted in runs:
         error, unseen = (worst_silhouette(fitted.cloud, split) / view_scale for split in (views.train, views.test))
-        scale = min([view_scale, scale_within(error, config.error_pixels), *(place.scale for place in places)])
-        places.append(_Place(scale, error, unseen, max(0, math.floor(math.log2(fitted.cloud.texel_density / scale)))))
+        scale = min([view_scale, scale_within(error, config.error_pixels), *(switch.scale for switch in switches)])
+        switches.append(_Switch(scale, error, unseen, max(0, math.floor(math.log2(fitted.cloud.texel_density / scale)))))
     if not config.original:
-        places[0] = replace(places[0], scale=math.inf, halvings=0)
-    return places
+        switches[0] = replace(switches[0], scale=math.inf, halvings=0)
+    return switches
 
 
 def _levels(
-    views: ViewDataset, models: list[bytes], fits: list[RunResult | None], places: list[_Place], config: LodConfig, name: str
+    views: ViewDataset, models: list[bytes], fits: list[RunResult | None], switches: list[_Switch], config: LodConfig, name: str
 ) -> tuple[LodLevel, ...]:
     """What is known of the levels."""
     view_scale = float(pixels_a_meter(views.train.cameras))
-    low, high = views.request["tree"]["bounds"]
+    assert views.request and views.request.tree.bounds
+    low, high = views.request.tree.bounds
     height, radius = high[1] - low[1], math.dist(low, high) / 2
     focal = config.screen_height / 2 / math.tan(math.radians(config.screen_fov_degrees) / 2)
-    until = [*(place.scale for place in places[1:]), 0.0]
+    until = [*(switch.scale for switch in switches[1:]), 0.0]
     levels = list[LodLevel]()
-    for model, fitted, place, least in zip(models, fits, places, until, strict=True):
+    for model, fitted, switch, least in zip(models, fits, switches, until, strict=True):
         vertices, triangles = glb_counts(model)
-        shown = min(place.scale, view_scale)
+        shown = min(switch.scale, view_scale)
         levels.append(
             LodLevel(
                 name=f"{name}_LOD{len(levels)}",
@@ -175,12 +187,12 @@ def _levels(
                 vertices=vertices,
                 triangles=triangles,
                 bytes=len(model),
-                error_meters=place.error,
-                error_pixels=place.error * shown,
-                held_out_error_pixels=place.unseen * shown,
+                error_meters=switch.error,
+                error_pixels=switch.error * shown,
+                held_out_error_pixels=switch.unseen * shown,
                 psnr=None if fitted is None else fitted.report.mean.over_white.psnr,
-                tree_pixels=None if math.isinf(place.scale) else height * place.scale,
-                distance_meters=focal / place.scale,
+                tree_pixels=None if math.isinf(switch.scale) else height * switch.scale,
+                distance_meters=focal / switch.scale,
                 screen_coverage=min(1.0, math.pi * (radius * least) ** 2 / (config.screen_width * config.screen_height)),
             )
         )

@@ -1,10 +1,8 @@
-"""What model files of every kind share: the endings they may have, and the GLB container as trimesh writes it."""
+"""What model files of every kind share: their endings, trimesh's glTF export, and the name of the program that wrote them."""
 
 from __future__ import annotations
 
-import json
-import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,26 +51,6 @@ def glb_of_scene(scene: trimesh.Scene, complete: Callable[[dict[str, Any]], None
         complete(tree)
 
     return trimesh.exchange.gltf.export_glb(scene, include_normals=True, unitize_normals=False, tree_postprocessor=finish)
-
-
-def split_glb(glb: bytes) -> tuple[dict[str, Any], list[bytes]]:
-    """The JSON of a GLB file and the contents of its buffer views."""
-    length = int.from_bytes(glb[12:16], "little")
-    tree, binary = json.loads(glb[20 : 20 + length]), glb[28 + length :]
-    views = tree["bufferViews"]
-    return tree, [binary[(start := view.get("byteOffset", 0)) : start + view["byteLength"]] for view in views]
-
-
-def joined_glb(tree: dict[str, Any], contents: Sequence[bytes]) -> bytes:
-    """The GLB file of a JSON and the contents of its buffer views, whose places and lengths are worked out anew."""
-    views, binary = list[dict[str, Any]](), bytearray()
-    for view, content in zip(tree["bufferViews"], contents, strict=True):
-        views.append(view | {"buffer": 0, "byteOffset": len(binary), "byteLength": len(content)})
-        binary += content + bytes(-len(content) % 4)
-    text = json.dumps(tree | {"bufferViews": views, "buffers": [{"byteLength": len(binary)}]}, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = b"".join(struct.pack("<I", len(chunk)) + kind + chunk for kind, chunk in ((b"JSON", text), (b"BIN\0", bytes(binary))))
-    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
 
 
 def generator() -> str:

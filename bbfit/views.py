@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputTypeError, MissingFileError, check_folder, check_shape, fail
-from bbfit.files import read_json
 from bbfit.geometry.camera import Camera
 from bbfit.images import premultiply, read_rgba, to_bytes
 from bbfit.layout import REQUEST_FILE, Frame, cameras_of, read_frames, split_views
@@ -133,8 +133,8 @@ class ViewDataset:
     """Views to fit to."""
     test: ViewSet
     """Held-out views, for the final score only."""
-    request: dict[str, Any] = field(default_factory=dict)
-    """What ``bbfit views`` wrote into ``views.json`` about the tree and the rendering; empty for views from elsewhere."""
+    request: ViewsRequest | None = None
+    """The request that ``bbfit views`` recorded in ``views.json``; ``None`` for views from elsewhere."""
 
     @staticmethod
     def load(folder: str | Path, *, seed: int = 0, cache_bytes: int = CACHE_BYTES) -> ViewDataset:
@@ -175,8 +175,8 @@ class ViewDataset:
         def view_set(frames: list[Frame]) -> ViewSet:
             return ViewSet(tuple(frame.image for frame in frames), cameras_of(frames, width, height), read)
 
-        request = read_json("views", folder / REQUEST_FILE) if (folder / REQUEST_FILE).is_file() else {}
-        return ViewDataset(folder, view_set(train), view_set(test), request if isinstance(request, dict) else {})
+        request = ViewsRequest.load(folder / REQUEST_FILE) if (folder / REQUEST_FILE).is_file() else None
+        return ViewDataset(folder, view_set(train), view_set(test), request)
 
     @staticmethod
     def from_arrays(images: NDArray[Any] | Tensor, cameras: Camera, *, test: Sequence[int] | None = None, seed: int = 0) -> ViewDataset:

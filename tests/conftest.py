@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from dead_workers import pytest_testnodedown, pytest_xdist_newgateway  # noqa: F401 (hooks)
+from own_process import pytest_runtest_protocol  # noqa: F401 (a hook)
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud, even_upright
@@ -16,7 +18,24 @@ from bbfit.rendering.reference import render_reference
 
 torch.set_num_threads(1)  # the suite runs in as many processes as there are cores
 
-SHARED = Path(__file__).resolve().parents[1] / "../shared"
+TESTS = Path(__file__).resolve().parent
+SHARED = TESTS.parent / "../shared"
+# What the tests of a folder or a module need, by their places below this folder; scripts/test --fast leaves all of them out. Modules of
+# which only some tests need something mark these themselves.
+NEEDS = {
+    "blender": ("blender", "rivals/test_baking.py", "test_comparison.py"),
+    "browser": ("viewers", "viewing"),
+    "ray": ("sweep/test_cluster.py",),
+}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests with what they need."""
+    for item in items:
+        place = item.path.relative_to(TESTS)
+        for need, places in NEEDS.items():
+            if any(place.is_relative_to(folder) for folder in places):
+                item.add_marker(need)
 
 
 @pytest.fixture

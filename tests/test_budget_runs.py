@@ -11,7 +11,6 @@ import cv2
 import pytest
 import torch
 
-from bbfit import pipeline
 from bbfit.budget import choice
 from bbfit.budget.choice import Trial
 from bbfit.budget.config import BudgetConfig
@@ -19,6 +18,7 @@ from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.pipeline import RunConfig, RunResult, run
+from bbfit.stages import billboards
 
 VIEWS = Path(__file__).resolve().parents[1] / "data" / "views"
 FIT = FitConfig(placement="even", steps=6, views_per_step=1)
@@ -69,7 +69,7 @@ def untimed(trials: list[Trial]) -> list[Trial]:
 def test_trials_and_their_picture_are_written(done: RunResult) -> None:
     assert done.skipped == () and done.missed is None
     content, trials = written(done.folder), trials_of(done.folder)
-    assert set(content) == {"inputs", "budget", "trials", "chosen", "met", "validation"}
+    assert set(content) == {"inputs", "budget", "config", "trials", "chosen", "met", "validation"}
     assert content["budget"] == {"vertices": 8} and content["met"] is True
     assert [(trial.billboards, trial.sides, trial.placement) for trial in trials] == [
         (1, "one", "even"),
@@ -184,13 +184,13 @@ def test_the_model_has_no_more_bytes_than_asked_for(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(choice, "COUNTS", (1, 2))
     monkeypatch.setattr(choice, "_CRISPER", crisper)
     sizes: list[int] = []
-    original = pipeline.within_bytes
+    original = billboards.within_bytes
 
     def watched(cloud: object, most: int | None, export: ExportConfig) -> object:
         sizes.append(choice.model_bytes(cloud, export))  # type: ignore[arg-type]
         return original(cloud, most, export)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(pipeline, "within_bytes", watched)
+    monkeypatch.setattr(billboards, "within_bytes", watched)
     config = RunConfig(fit=FIT, budget=BudgetConfig(bytes="20k"), export=ExportConfig(padding=48))
     result = run(VIEWS, tmp_path, config)
     size = (tmp_path / "model.glb").stat().st_size
@@ -204,7 +204,7 @@ def test_the_same_fit_within_fewer_bytes_is_another_result(tmp_path: Path, monke
     """Where trials speak for the same configuration the limit still counts, and so does how the model is written."""
     trial = Trial(1, "one", "even", None, 4, 5000, 15_000, 20.0, 1.0)
     same = choice.Choice(dataclasses.replace(FIT, billboards=1).resolve(), (trial,), 0, True, ("0002",))
-    monkeypatch.setattr(pipeline, "choose", lambda *arguments, **options: same)
+    monkeypatch.setattr(billboards, "choose", lambda *arguments, **options: same)
     texels = []
     for limit, export in (("20k", ExportConfig()), ("10k", ExportConfig()), ("10k", ExportConfig(padding=48))):
         result = run(VIEWS, tmp_path, RunConfig(fit=FIT, budget=BudgetConfig(bytes=limit), export=export))
@@ -233,7 +233,7 @@ def test_what_does_not_go_together_is_found_before_any_work(
 ) -> None:
     nothing: Callable[..., None] = lambda *arguments, **options: pytest.fail("work was begun")  # noqa: E731
     monkeypatch.setattr(choice, "fit", nothing)
-    monkeypatch.setattr(pipeline, "fit", nothing)
+    monkeypatch.setattr(billboards, "fit", nothing)
     with pytest.raises(InputError, match=says):
         run(VIEWS, tmp_path, config)
     assert not list(tmp_path.iterdir())

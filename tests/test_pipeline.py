@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import InputError
@@ -109,6 +110,25 @@ def test_a_fit_whose_result_cannot_be_saved_is_not_lost(views_folder: Path, tmp_
     run(views_folder, tmp_path, CONFIG, on_progress=lambda stage, *rest: told.append(stage))
     assert "fit" not in told
     assert not (tmp_path / "fit.checkpoint").exists()
+
+
+def test_a_fit_by_a_mesh_in_several_files_is_done_again_when_any_of_them_changes(views_folder: Path, tmp_path: Path) -> None:
+    """The triangles of a .gltf are in its .bin, which the digest of the .gltf alone would miss."""
+    corners = [[x, y, z] for x in (-0.6, 1.2) for y in (0.1, 2.3) for z in (-1.1, 0.7)]
+    mesh = trimesh.convex.convex_hull(np.array(corners) * 0.5 + [0.15, 0.6, -0.1])
+    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh), merge_buffers=True)
+    files = {name.replace("model.gltf", "tree.gltf"): content for name, content in files.items()}
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    config = dataclasses.replace(CONFIG, tree=tmp_path / "tree.gltf")
+    run(views_folder, tmp_path / "out", config)
+    assert "fit" in run(views_folder, tmp_path / "out", config).skipped
+    (buffer,) = [tmp_path / name for name in files if name.endswith(".bin")]
+    data = bytearray(buffer.read_bytes())
+    start = json.loads(files["tree.gltf"])["bufferViews"][-1].get("byteOffset", 0)
+    data[start : start + 4] = np.float32(np.frombuffer(data[start : start + 4], np.float32) * 0.99).tobytes()
+    buffer.write_bytes(data)
+    assert run(views_folder, tmp_path / "out", config).skipped == ()
 
 
 def test_bad_views_leave_earlier_results_as_they_were(views_folder: Path, tmp_path: Path, done: RunResult) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from bbfit.checks import Count, Range, Seed, check_fields, fail
+from bbfit.provenance import EXECUTION
 
 Device = Literal["cpu", "cuda", "optix", "hip", "oneapi", "metal"]
 Axis = Literal["auto", "origin", "center"]
@@ -42,9 +43,9 @@ class ViewsConfig:
     """Strength of the ambient light: at 1, without sun, an open white matte surface is exactly white. It scales a panorama too."""
     hdri: Path | None = None
     """Panorama (.hdr or .exr) that lights the tree in place of even white; set the sun's strength to 0 if it includes a sun."""
-    render_device: Device = "cpu"
+    render_device: Device = field(default="cpu", metadata=EXECUTION)
     """Device that Blender renders on."""
-    render_workers: Count = 1
+    render_workers: Count = field(default=1, metadata=EXECUTION)
     """Number of Blender processes; they divide the processor's threads among them."""
     seed: Seed = 0
     """Seed of the noise, and of the choice of held-out views."""

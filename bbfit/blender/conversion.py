@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from bbfit.blender.processes import BlenderPool, require_bpy
-from bbfit.blender.sources import check_tree, fingerprint
 from bbfit.checks import check_count, check_folder, fail
-from bbfit.files import read_json, write_json, write_pieces
+from bbfit.files import write_pieces
+from bbfit.tree_files.tree_file import TreeFile
 
 _PIECE = 1 << 20
 
 
-def tree_as_glb(tree: str | Path, out: str | Path, *, triangles: int | None = None) -> Path:
+def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int | None = None) -> Path:
     """Write a tree as one self-contained GLB file, Y up in meters, where and how large :func:`~bbfit.blender.render_views` sees it.
 
     What Blender's glTF exporter keeps is kept: materials, texture coordinates, textures with their alpha, and vertex colors that a
@@ -48,32 +48,17 @@ def tree_as_glb(tree: str | Path, out: str | Path, *, triangles: int | None = No
     """
     if triangles is not None:
         check_count("triangles", triangles)
-    files, out = check_tree(tree), Path(out)
+    tree, out = TreeFile.open(tree), Path(out)
     if out.suffix.lower() != ".glb":
         fail("out", f"{out} ends in {out.suffix or 'nothing'}", "choose a name that ends in .glb")
     check_folder("out's folder", out.parent)
     if out.is_dir():
         fail("out", f"{out} is a folder", "choose another name")
-    if out.exists() and any(out.samefile(file) for file in files):
+    if out.exists() and any(out.samefile(file) for file in tree.files):
         fail("out", f"{out} is the tree itself", "choose another name")
     require_bpy()
-    with BlenderPool({"tree": str(files[0].resolve())}) as pool:
+    with BlenderPool({"tree": str(tree.path.resolve())}) as pool:
         write_pieces(out, _pieces(pool.convert(triangles)))
-    return out
-
-
-def converted_once(tree: str | Path, out: str | Path, *, triangles: int | None = None, on_begin: Callable[[], None] | None = None) -> Path:
-    """As :func:`tree_as_glb`, unless ``out`` was made of the same tree with as many triangles before, as a JSON file beside it tells.
-
-    ``on_begin`` is called if there is anything to do.
-    """
-    out = Path(out)
-    record, inputs = out.with_suffix(".json"), {"tree": fingerprint(check_tree(tree)), "triangles": triangles}
-    if not (out.is_file() and record.is_file() and read_json("record", record) == inputs):
-        if on_begin is not None:
-            on_begin()
-        tree_as_glb(tree, out, triangles=triangles)
-        write_json(record, inputs)
     return out
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +16,15 @@ from torch import Tensor
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.processes import BlenderPool, require_bpy
-from bbfit.blender.sources import UP_AXIS, check_tree, fingerprint
-from bbfit.checks import InputError, check_file, check_range, fail
-from bbfit.files import output_folder, read_json, write_json
+from bbfit.blender.request import ViewsRequest
+from bbfit.checks import InputError, check_range, fail
+from bbfit.files import output_folder
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, camera_to_nerf
 from bbfit.images import read_rgba
+from bbfit.tree_files.tree_file import TreeFile
 
 RECORD_FILE = "pictures.json"
 """What :func:`render_pictures` notes beside its pictures: the tree, the light, the cameras and the clip distances."""
-FREE = ("render_workers", "render_device")
-"""Settings that may differ between two starts on one folder: they change how long the pictures take, not what they show."""
 FILTER_REACH = 2.0
 """Pixels that a surface's picture reaches beyond it, rounded up: Cycles' filter (Blackman-Harris) spreads it 1.5 pixels about a pixel's
 center."""
@@ -37,7 +35,7 @@ _CENTERD = 1e-6
 
 
 def render_pictures(
-    tree: str | Path,
+    tree: str | Path | TreeFile,
     cameras: Camera,
     out: str | Path,
     config: ViewsConfig,
@@ -74,50 +72,36 @@ def render_pictures(
     """
     cameras, out = cameras.batch().to(torch.float64), Path(out)
     _check(cameras, clips)
-    files = check_tree(tree)
-    asked = asked_for(files, config)
-    asked["config"] = {name: value for name, value in asked["config"].items() if name not in _UNUSED}
-    asked |= {"cameras": _described(cameras), "clips": None if clips is None else [[float(end) for end in clip] for clip in clips]}
-    _refuse_others(out, asked)
+    tree = TreeFile.open(tree)
+    request = ViewsRequest.of(tree, config)
+    request = replace(
+        request,
+        config={name: value for name, value in request.config.items() if name not in _UNUSED},
+        cameras=_described(cameras),
+        clips=None if clips is None else [[float(end) for end in clip] for clip in clips],
+    )
+    if request.check_same(out, RECORD_FILE) is None and out.is_dir() and any(out.glob("[0-9][0-9][0-9][0-9]*.png")):
+        fail("out", f"{out} holds pictures from elsewhere", f"choose another output folder, or remove {out} to render again")
     count, size = len(cameras), cameras.width
     paths = [out / f"{index:04}.png" for index in range(count)]
-    missing = [index for index, path in enumerate(paths) if not stands(path, size)]
-    tell = on_progress or (lambda done, total: None)
-    tell(count - len(missing), count)
+    missing = [index for index, path in enumerate(paths) if not is_whole(path, size)]
+    on_progress = on_progress or (lambda done, total: None)
+    on_progress(count - len(missing), count)
     if not missing:
         return paths
     require_bpy()
-    with BlenderPool(job(files[0], config, size, len(missing))) as pool:
+    with BlenderPool(job(tree, config, size, len(missing))) as pool:
         points = to_y_up(pool.load()["payload"])
         output_folder("out", out)
-        write_json(out / RECORD_FILE, asked)
+        request.save(out / RECORD_FILE)
         seen = clips or [whole(points, position) for position in cameras.position]
-        pool.render(
-            frames(cameras, paths, missing, seen, config.seed), config.render_workers, count - len(missing), lambda done: tell(done, count)
-        )
+        report, kept = on_progress, count - len(missing)
+        pool.render(frames(cameras, paths, missing, seen, config.seed), config.render_workers, kept, lambda done: report(done, count))
     return paths
 
 
-def asked_for(files: list[Path], config: ViewsConfig) -> dict[str, Any]:
-    """What is asked of a tree's files, as it is noted beside the pictures: ``bbfit``, ``config`` and ``tree``."""
-    asked: dict[str, Any] = asdict(config) | {"elevations": [float(angle) for angle in config.elevations], "hdri": None}
-    if config.hdri is not None:
-        panorama = check_file("hdri", config.hdri)
-        asked["hdri"] = {"name": panorama.name, "sha256": fingerprint([panorama])}
-    return {
-        "bbfit": _version(),
-        "config": asked,
-        "tree": {
-            "name": files[0].name,
-            "sha256": fingerprint(files),
-            "bytes": sum(file.stat().st_size for file in files),
-            "up_axis": UP_AXIS[files[0].suffix.lower()],
-        },
-    }
-
-
-def stands(path: Path, size: int) -> bool:
-    """Whether a picture is there, whole and of the right size."""
+def is_whole(path: Path, size: int) -> bool:
+    """Whether a picture exists, can be decoded, and has the right size."""
     try:
         return read_rgba(path).shape == (size, size, 4)
     except InputError:
@@ -144,12 +128,12 @@ def vertical_axis(low: NDArray[np.floating], high: NDArray[np.floating], axis: s
     return target
 
 
-def job(tree: Path, config: ViewsConfig, size: int, count: int) -> dict[str, Any]:
+def job(tree: TreeFile, config: ViewsConfig, size: int, count: int) -> dict[str, Any]:
     """What the worker needs to know for all of ``count`` pictures of ``size`` x ``size`` pixels."""
     azimuth, elevation = math.radians(config.sun_azimuth), math.radians(config.sun_elevation)
     across = math.cos(elevation)
     return {
-        "tree": str(tree.resolve()),
+        "tree": str(tree.path.resolve()),
         "size": size,
         "samples": config.samples,
         "denoise": config.denoise,
@@ -191,13 +175,6 @@ def frames(
     return found
 
 
-def _version() -> str:
-    try:
-        return version("bbfit")
-    except PackageNotFoundError:  # run from a source folder that is not installed
-        return "unknown"
-
-
 def _check(cameras: Camera, clips: Sequence[tuple[float, float]] | None) -> None:
     size, k = cameras.width, cameras.intrinsics
     if cameras.height != size:
@@ -223,24 +200,3 @@ def _described(cameras: Camera) -> dict[str, Any]:
         "world_to_camera": cameras.world_to_camera.tolist(),
         "focal": cameras.intrinsics[:, 0, 0].tolist(),
     }
-
-
-def _refuse_others(out: Path, asked: dict[str, Any]) -> None:
-    """Refuse a folder with pictures that were not rendered for the same request."""
-    path, hint = out / RECORD_FILE, f"choose another output folder, or remove {out} to render anew"
-    if not path.is_file():
-        if out.is_dir() and any(out.glob("[0-9][0-9][0-9][0-9]*.png")):
-            fail("out", f"{out} holds pictures from elsewhere", hint)
-        return
-    earlier = read_json("out", path)
-    if not isinstance(earlier, dict) or not isinstance(earlier.get("config"), dict) or not isinstance(earlier.get("tree"), dict):
-        fail("out", f"{path} was not written by bbfit", hint)
-    for name, value in asked["config"].items():
-        before = earlier["config"].get(name)
-        if name not in FREE and before != value:
-            fail("out", f"{out} holds pictures with {name} {before}, not {value}", hint)
-    if earlier["tree"].get("sha256") != asked["tree"]["sha256"]:
-        fail("out", f"{out} holds pictures of another tree, or an earlier version of it", hint)
-    for name in ("cameras", "clips"):
-        if earlier.get(name) != asked[name]:
-            fail("out", f"{out} holds pictures with other {name}", hint)

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,13 +15,13 @@ from bbfit.checks import fail
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.gltf import glb_bytes
-from bbfit.exporting.model import shipped_cards
+from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig, Placement, ResolvedFit, Sides
 from bbfit.fitting.levels import resize_textures
 from bbfit.fitting.loop import fit
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset, ViewSet
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
@@ -93,7 +92,7 @@ def choose(
     config: FitConfig,
     budget: BudgetConfig,
     *,
-    tree: Path | None = None,
+    tree: TreeFile | None = None,
     export: ExportConfig | None = None,
     known: Sequence[Trial] = (),
     on_trial: Callable[[list[Trial], int], None] | None = None,
@@ -149,7 +148,7 @@ def within_bytes(cloud: BillboardCloud, most: int | None, export: ExportConfig) 
 
 def model_bytes(cloud: BillboardCloud, export: ExportConfig) -> int:
     """Size of the cloud as GLB."""
-    return len(glb_bytes(shipped_cards(cloud, export), export))
+    return len(shipped_model(cloud, export).glb)
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -168,7 +167,7 @@ class _Trials:
         views: ViewDataset,
         config: FitConfig,
         budget: BudgetConfig,
-        tree: Path | None,
+        tree: TreeFile | None,
         export: ExportConfig,
         known: list[Trial],
         on_trial: Callable[[list[Trial], int], None] | None,
@@ -298,7 +297,7 @@ class _Trials:
 
 def mean_psnr(cloud: BillboardCloud, views: ViewSet) -> float:
     """Mean over views of the PSNR over white, in dB."""
-    pairs = (held_out(cloud, views, index) for index in range(len(views)))
+    pairs = (held_out(shipped_model(cloud).draw, views, index) for index in range(len(views)))
     return float(np.mean([metrics.psnr(*(over_color(picture).numpy() for picture in pair)) for pair in pairs]))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -168,6 +170,7 @@ def evaluate_command(
     views: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIEWS")],
     /,
     out: Path | None = None,
+    tree: Path | None = None,
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
     """Score fitted billboards on the held-out views of a folder, which they were not fitted to.
@@ -177,33 +180,27 @@ def evaluate_command(
     Args:
         cloud: The cloud.safetensors of a run's folder.
         views: Folder of views.
-        out: File for the measures as JSON. Default: metrics.json beside the cloud, which replaces that of its run.
-        export: How the model was written, if not as the cloud was fitted; the score is that of the model.
+        out: File for the measures as JSON. Default: metrics.json beside the cloud, which replaces the one of its run.
+        tree: The mesh that the views show, for its vertices and bytes, if the views were not rendered by bbfit.
+        export: How the model is exported, if not by default. The scores are those of the exported model.
     """
     from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
-    from bbfit.exporting.model import as_shipped, shipped_cards
     from bbfit.files import output_folder
     from bbfit.geometry.cloud import BillboardCloud
-    from bbfit.pipeline import original_tree, with_model
     from bbfit.reporting.tables import report_table
+    from bbfit.stages.results import original_tree
+    from bbfit.tree_files.tree_file import TreeFile
     from bbfit.views import ViewDataset
 
     billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
     out, earlier = out or cloud.with_name("metrics.json"), cloud.with_name("metrics.json")
+    seconds = Report.load(earlier).seconds if earlier.is_file() else {}
     output_folder("out", out.parent)
     with progress() as on_progress:
-        shipped = as_shipped(billboards, export)
-        report = evaluate(
-            shipped,
-            dataset.test,
-            original=original_tree(dataset),
-            model_bytes=model.stat().st_size if (model := cloud.with_name("model.glb")).is_file() else None,
-            seconds=Report.load(earlier).seconds if earlier.is_file() else None,
-            on_view=lambda done, total: on_progress("evaluate", done, total),
-        )
-        cards = shipped_cards(billboards, export)
-        report = with_model(report, shipped, cards, dataset.test, on_size=lambda done, total: on_progress("sizes", done, total))
+        original = original_tree(dataset, None if tree is None else TreeFile.open(tree))
+        report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=partial(on_progress, "evaluate"))
+    report = replace(report, seconds={**seconds, **report.seconds})
     report.save(out)
     out_console.print(report_table(report, thesis=False))
     out_console.print(f"measures in {out}", soft_wrap=True)

@@ -10,7 +10,8 @@ from rich.console import Console
 from bbfit.exporting.config import ExportConfig
 
 if TYPE_CHECKING:
-    from bbfit.pipeline import Progress, RunResult
+    from bbfit.pipeline import RunResult
+    from bbfit.stages.stage import OnProgress
 
 out_console = Console()
 """Standard output."""
@@ -41,7 +42,7 @@ def show_missed(config: ExportConfig) -> None:
         out_console.print(f"textures are PNG alone, without mip levels; for KTX2 {config.missing_encoder}", style="yellow", soft_wrap=True)
 
 
-def progress() -> contextlib.AbstractContextManager[Progress]:
+def progress() -> contextlib.AbstractContextManager[OnProgress]:
     """One bar a stage on standard error."""
     from bbfit.reporting.progress import progress_bars
 

@@ -7,12 +7,14 @@ import inspect
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, cast, get_type_hints
 
 import tyro
 
 from bbfit.checks import fail
 
+# Types that are made at run time, of which mypy would have to know the parts.
+_Annotated, _Hidden, _Flat = cast(Any, Annotated), cast(Any, tyro.conf.Suppress), cast(Any, tyro.conf.OmitArgPrefixes)
 # The help describes the default of an option that is None if it is not given.
 _NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")
 _DOTTED = re.compile(r"--(\w+)\.([\w-]+)(=.*)?$")
@@ -27,15 +29,15 @@ def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     ``seed``, it is that of all configurations, and each has an option ``--NAME.seed`` that overrides it.
     """
     signature, hints = inspect.signature(command), get_type_hints(command, include_extras=True)
-    stages = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    stages: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     taken, parameters = set(hints) - set(stages), []
     for parameter in signature.parameters.values():
         kind, default = hints[parameter.name], parameter.default
         if parameter.name in stages:
             default = _flattened(default, parameter.name, taken)
-            kind = tyro.conf.OmitArgPrefixes[type(default)]  # type: ignore[misc]
+            kind = _Flat[type(default)]
         elif default is None:
-            kind = Annotated[kind, _NO_DEFAULT]
+            kind = _Annotated[kind, _NO_DEFAULT]
         parameters.append(parameter.replace(annotation=kind, default=default))
 
     def bind(*args: Any, **options: Any) -> Callable[[], None]:
@@ -55,14 +57,15 @@ def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
 def _flattened(default: Any, name: str, taken: set[str]) -> Any:
     """A configuration of a type in which the options in ``taken`` are hidden; those of its fields are added to them."""
     kind, hints = type(default), get_type_hints(type(default), include_extras=True)
-    changed = {option: Annotated[hints[option], _NO_DEFAULT] for option, value in vars(default).items() if value is None}
-    changed |= {field.name: tyro.conf.Suppress[hints[field.name]] for field in fields(kind) if field.name in taken}
+    changed = {option: _Annotated[hints[option], _NO_DEFAULT] for option, value in vars(default).items() if value is None}
+    changed |= {field.name: _Hidden[hints[field.name]] for field in fields(kind) if field.name in taken}
     if "seed" in changed:
-        changed["seed"] = Annotated[int | None, tyro.conf.arg(name=f"{name}.seed"), _NO_DEFAULT]
+        changed["seed"] = _Annotated[int | None, tyro.conf.arg(name=f"{name}.seed"), _NO_DEFAULT]
     taken.update(hints)
     body = {"__annotations__": changed, "__doc__": kind.__doc__, "__module__": kind.__module__}
     values = vars(default) | dict.fromkeys(changed.keys() & {"seed"})
-    return dataclass(frozen=True)(type(kind.__name__, (kind,), body))(**values)
+    flat: Any = dataclass(frozen=True)(type(kind.__name__, (kind,), body))
+    return flat(**values)
 
 
 def refuse_dotted(arguments: Sequence[str]) -> None:

@@ -19,7 +19,7 @@ from bbfit.fitting.config import FitConfig
 
 if TYPE_CHECKING:
     from bbfit.fitting.loop import Step
-    from bbfit.pipeline import Progress
+    from bbfit.stages.stage import OnProgress
     from bbfit.viewing.watching import Watch
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
@@ -84,7 +84,7 @@ class Onlooker:
         return None if self._watch is None else self._watch.on_step
 
     @contextlib.contextmanager
-    def progress(self) -> Iterator[Progress]:
+    def progress(self) -> Iterator[OnProgress]:
         """As :func:`bbfit.cli.console.progress`, on the page too."""
         with progress() as tell:
 

@@ -1,10 +1,10 @@
-"""Scoring a billboard cloud on the held-out views of its tree."""
+"""The evaluation of a billboard cloud on the held-out views of its tree."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -13,21 +13,23 @@ from torch import Tensor
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.evaluation import metrics, thesis_scale
 from bbfit.evaluation.report import Cost, Measures, OverWhite, Report, Rgba, ThesisScale, ViewScore
+from bbfit.evaluation.sizes import HALVINGS, score_sizes
+from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
-from bbfit.rendering.dispatch import render
 from bbfit.views import ViewSet
 
 
 @dataclass(frozen=True)
 class OriginalTree:
-    """What the tree cost before it was compressed; ``None`` where it is not known."""
+    """The size of the tree before it was compressed; ``None`` where it is unknown."""
 
     vertices: int | None = None
     """Vertices of the mesh."""
     bytes: int | None = None
-    """Size of its file, with the files that it names."""
+    """Size of its file and of the files that it refers to."""
 
     def __post_init__(self) -> None:
         for name in ("vertices", "bytes"):
@@ -39,55 +41,76 @@ def evaluate(
     cloud: BillboardCloud,
     views: ViewSet,
     *,
+    export: ExportConfig | None = None,
     original: OriginalTree | None = None,
-    model_bytes: int | None = None,
-    seconds: Mapping[str, float] | None = None,
-    on_view: Callable[[int, int], None] | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> Report:
-    """Measure a billboard cloud against views that it was not fitted to.
+    """Measure a billboard cloud, as it is exported, against views that it was not fitted to.
 
     Renders are clamped to [0, 1] and not rounded to bytes; targets are the pictures' bytes over 255.
 
     Parameters
     ----------
-    cloud : N billboards, N >= 0, on any device.
-    views : V held-out views, ``ViewDataset.test``, of at least 11 x 11 pixels.
-    original : what the tree cost before; its ratios stay open when left out.
-    model_bytes : size of the exported file, if there is one yet.
-    seconds : seconds of earlier stages by name; this one is added as ``evaluate``.
-    on_view : called after each view with the number of views done and of all views.
+    cloud : BillboardCloud
+        N >= 1 billboards on any device.
+    views : ViewSet
+        V held-out views, ``ViewDataset.test``, of at least 11 x 11 pixels.
+    export : ExportConfig
+        How the model is exported. By default as ``bbfit export`` does without options, in the alpha mode that the cloud was fitted for.
+    original : OriginalTree
+        The size of the original tree. Without it the report has no ratios.
+    on_progress : callable
+        Called with the number of finished pictures or picture sizes and their total.
 
     Returns
     -------
-    :class:`Report` with every measure of each view.
+    Report
+        The measures of each view and of each picture size, and the costs of the GLB file; ``seconds`` holds the time of this evaluation.
 
     Raises
     ------
     InputError
-        if there are no views, they are too small, or the cloud draws numbers that are not finite.
+        if there are no views or they are too small, if the cloud is empty, or if it draws numbers that are not finite.
     """
-    began = time.perf_counter()
-    scores = score_views(lambda index: held_out(cloud, views, index)[1], views, on_view=on_view)
-    original = original or OriginalTree()
+    return evaluate_model(shipped_model(cloud, export), views, original=original, on_progress=on_progress)
+
+
+def evaluate_model(
+    model: ShippedModel,
+    views: ViewSet,
+    *,
+    original: OriginalTree | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> Report:
+    """Do what :func:`evaluate` does for a model whose polygons or file may have been computed before."""
+    started, original, on_progress = time.perf_counter(), original or OriginalTree(), on_progress or (lambda done, total: None)
+    total = len(views) + HALVINGS + 1
+    scores = score_views(lambda index: held_out(model.draw, views, index)[1], views, on_view=lambda done, _: on_progress(done, total))
+    sizes = score_sizes(model.draw, views, on_size=lambda done, _: on_progress(len(views) + done, total))
     return Report(
-        scores,
-        Cost(cloud.vertex_count, original.vertices),
-        Cost(model_bytes, original.bytes),
-        {**(seconds or {}), "evaluate": time.perf_counter() - began},
-        cloud.alpha,
+        views=scores,
+        vertices=Cost(model.cards.vertex_count, original.vertices),
+        bytes=Cost(len(model.glb), original.bytes),
+        alpha=model.cloud.alpha,
+        overdraw=model.overdraw,
+        sizes=sizes,
+        seconds={"evaluate": time.perf_counter() - started},
     )
 
 
 def score_views(
     draw: Callable[[int], Tensor], views: ViewSet, *, on_view: Callable[[int, int], None] | None = None
 ) -> tuple[ViewScore, ...]:
-    """Measure whatever draws a tree against held-out views.
+    """Measure pictures of a tree, whatever drew them, against held-out views.
 
     Parameters
     ----------
-    draw : premultiplied RGBA in [0, 1] of the view with a number, [H, W, 4].
-    views : V held-out views, of at least 11 x 11 pixels.
-    on_view : called after each view with the number of views done and of all views.
+    draw : callable
+        Returns the picture of the view with a given index: premultiplied RGBA in [0, 1], [H, W, 4].
+    views : ViewSet
+        V held-out views of at least 11 x 11 pixels.
+    on_view : callable
+        Called after each view with the number of finished views and V.
 
     Raises
     ------
@@ -107,28 +130,34 @@ def score_views(
     return tuple(scores)
 
 
-def held_out(cloud: BillboardCloud, views: ViewSet, index: int) -> tuple[Tensor, Tensor]:
-    """One view's target and render as they are measured: premultiplied RGBA in [0, 1], each float64 [H, W, 4] on the CPU.
+def held_out(draw: Callable[[Camera], Tensor], views: ViewSet, index: int) -> tuple[Tensor, Tensor]:
+    """The target and the render of one view as they are measured: premultiplied RGBA in [0, 1], each float64 [H, W, 4] on the CPU.
+
+    Parameters
+    ----------
+    draw : callable
+        Returns what one camera sees: premultiplied RGBA [H, W, 4], as :meth:`~bbfit.exporting.model.ShippedModel.draw` does.
 
     Raises
     ------
     InputError
-        if the picture cannot be read, or the cloud draws numbers that are not finite.
+        if the picture cannot be read, or the render has values that are not finite.
     """
     target = views.targets([index], torch.float64)[0]
     with torch.inference_mode():
-        image = render(cloud, views.cameras[index].to(cloud.texels.device)).double().cpu()
+        image = draw(views.cameras[index]).double().cpu()
     if not image.isfinite().all():
-        fail("cloud", f"what it draws in view {views.names[index]} holds numbers that are not finite", "fit it anew")
+        fail("cloud", f"its render of view {views.names[index]} has values that are not finite", "fit it again")
     return target, image.clamp(0, 1)
 
 
 def measure(target: Tensor, image: Tensor) -> Measures:
-    """Every measure of one view.
+    """All measures of one view.
 
     Parameters
     ----------
-    target, image : premultiplied RGBA in [0, 1], [H, W, 4], at least 11 x 11 pixels.
+    target, image : Tensor
+        Premultiplied RGBA in [0, 1], [H, W, 4], of at least 11 x 11 pixels.
     """
     check_shape("target", tuple(target.shape), (None, None, 4))
     check_shape("image", tuple(image.shape), tuple(target.shape))
@@ -149,10 +178,10 @@ def measure(target: Tensor, image: Tensor) -> Measures:
 
 
 def view_angles(camera: Camera) -> Tensor:
-    """Azimuth in [0, 360) and elevation in [-90, 90] that each camera looks from, in degrees, [V, 2] float64.
+    """The azimuth in [0, 360) and the elevation in [-90, 90] of each camera in degrees, float64 [V, 2].
 
-    By the viewing direction, so it does not matter where the tree stands: azimuth 0 looks from +Z, counter-clockwise seen from above
-    (as :class:`bbfit.geometry.orbit.Orbit`). A camera straight above or below has azimuth 0.
+    Both follow from the viewing direction alone, not from the tree's place. Azimuth 0 looks from +Z, and azimuths grow counter-clockwise
+    seen from above, as in :class:`bbfit.geometry.orbit.Orbit`. A camera straight above or below has azimuth 0.
     """
     x, y, z = (-camera.batch().forward.double().cpu()).unbind(-1)
     level = torch.hypot(x, z)

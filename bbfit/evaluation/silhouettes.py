@@ -1,4 +1,4 @@
-"""How far off a cloud's silhouette is, and from where on that does not show."""
+"""The error of a cloud's silhouette, and the scale up to which it stays invisible."""
 
 from __future__ import annotations
 
@@ -7,29 +7,34 @@ from collections.abc import Callable
 
 from bbfit.evaluation.metrics import silhouette_distance
 from bbfit.evaluation.scoring import held_out
+from bbfit.exporting.model import shipped_model
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.views import ViewSet
 
-# Between the training views errors are a little larger than in them: of an acer's four clouds by up to 11 % in the worst held-out view.
+# Errors are a little larger between the training views than in them: for four clouds of an acer by up to 11 % in the worst held-out view.
 _MARGIN = 1.15
 
 
 def worst_silhouette(cloud: BillboardCloud, views: ViewSet, *, stop: Callable[[], bool] = lambda: False) -> float:
-    """The largest distance between a cloud's silhouette and that of a view, in pixels of the views; 0 without any.
+    """The largest :func:`~bbfit.evaluation.metrics.silhouette_distance` between a cloud and a view, in pixels; 0 without views.
 
-    It is :func:`~bbfit.evaluation.metrics.silhouette_distance` in the view in which that is most.
-
-    Once ``stop`` says so, no more views are looked at.
+    Parameters
+    ----------
+    stop : callable
+        Called before each view. Once it returns True, the remaining views are left out.
     """
-    worst = 0.0
+    worst, draw = 0.0, shipped_model(cloud).draw
     for index in range(len(views)):
         if stop():
             break
-        target, render = (picture.numpy() for picture in held_out(cloud, views, index))
+        target, render = (picture.numpy() for picture in held_out(draw, views, index))
         worst = max(worst, silhouette_distance(target, render))
     return worst
 
 
 def scale_within(error: float, error_pixels: float) -> float:
-    """Pixels a meter up to which an error in meters, measured in training views, stays within so many pixels, also between those views."""
+    """The largest scale, in pixels per meter, at which an error stays within ``error_pixels`` pixels, also between the training views.
+
+    ``error`` is in meters, measured in the training views.
+    """
     return error_pixels / (_MARGIN * error) if error else math.inf

@@ -16,9 +16,12 @@ from bbfit.geometry.camera import Camera
 from bbfit.images import over_color
 from bbfit.views import ViewSet
 
+HALVINGS = 4
+"""How many times an evaluation halves the views' size."""
+
 
 def score_sizes(
-    draw: Callable[[Camera], Tensor], views: ViewSet, halvings: int = 4, *, on_size: Callable[[int, int], None] | None = None
+    draw: Callable[[Camera], Tensor], views: ViewSet, halvings: int = HALVINGS, *, on_size: Callable[[int, int], None] | None = None
 ) -> tuple[SizeScore, ...]:
     """Compare what is drawn at the views' size, at a half of it and so on with the views averaged to that size.
 

@@ -2,35 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from bbfit.exporting.packing import packed
+from bbfit.geometry.cards import Atlas
 from bbfit.images import bleed_color
 
 # Graphics cards compress textures in blocks of 4 x 4 texels.
 BLOCK = 4
-
-
-@dataclass(frozen=True)
-class Atlas:
-    """R textures side by side in one picture, texel for texel."""
-
-    image: NDArray[np.uint8]
-    """Straight-alpha RGBA, [H, W, 4]; both sides are multiples of 4."""
-    corners: NDArray[np.int64]
-    """Column and row of the top-left texel of each texture, [R, 2]."""
-    sizes: NDArray[np.int64]
-    """Width and height of each texture in texels, [R, 2]."""
-
-    @property
-    def used(self) -> float:
-        """Share of the picture that textures cover, in (0, 1]; the rest is padding and gaps."""
-        height, width = self.image.shape[:2]
-        return float(self.sizes.prod(-1).sum() / (height * width))
 
 
 def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bbfit.exporting.cards import Card, Cards
 from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.encoders import encode_ktx2, encode_webp
 from bbfit.exporting.splitting import centerd
+from bbfit.geometry.cards import Card, Cards
+from bbfit.glb import joined_glb, split_glb
 from bbfit.images import encode_png
-from bbfit.model_files import glb_of_scene, joined_glb, split_glb
+from bbfit.model_files import glb_of_scene
 
 # Numbers that glTF 2.0 borrows from OpenGL (specification, section 5.26).
 _SAMPLER = {"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}  # linear, clamped to the edge

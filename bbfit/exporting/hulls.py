@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.checks import check_count, check_range
-from bbfit.exporting.cards import Card, Cards
+from bbfit.geometry.cards import Card, Cards
+from bbfit.geometry.polygons import area, kept_half, sides
 
 # Texels that a polygon reaches beyond what shows: far more than float32 coordinates and graphics cards' snapping of vertices move it.
 _MARGIN = 1 / 64
@@ -44,22 +45,6 @@ def bilinear(rimmed: NDArray[np.float64], points: NDArray[np.float64]) -> NDArra
     upper = flat[start] * (1 - x) + flat[start + 1] * x
     lower = flat[start + width] * (1 - x) + flat[start + width + 1] * x
     return np.where(outside, 0.0, upper * (1 - y) + lower * y)
-
-
-def sides(polygon: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Unit normals n, [K, 2], and offsets d, [K], of a convex polygon's sides: inside is n . p <= d. Either winding will do."""
-    along = np.roll(polygon, -1, 0) - polygon
-    length = np.linalg.norm(along, axis=-1)
-    kept = length > 1e-12 * length.max()  # a doubled corner has no side
-    normals = np.stack([along[:, 1], -along[:, 0]], -1)[kept] / length[kept, None]
-    normals = normals if area(polygon) > 0 else -normals
-    return normals, (normals * polygon[kept]).sum(-1)
-
-
-def area(polygon: NDArray[np.float64]) -> float:
-    """Signed area, positive where x turns to y, [K, 2] ->."""
-    x, y = (polygon - polygon[0]).T
-    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
 def shown_cells(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], least: float) -> NDArray[np.int64]:
@@ -202,20 +187,6 @@ def _hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> N
     for normal, offset in zip(*sides(polygon), strict=True):
         hull = kept_half(hull, hull @ normal - offset)
     return hull
-
-
-def kept_half(polygon: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The part of a convex polygon, [K, D], where a height, given at the corners, is not positive, [L, D].
-
-    One side of a clip after Sutherland and Hodgman (1974, "Reentrant polygon clipping").
-    """
-    made = []
-    for here, there, low, high in zip(polygon, np.roll(polygon, -1, 0), heights, np.roll(heights, -1), strict=True):
-        if low <= 0:
-            made.append(here)
-        if (low < 0 < high) or (high < 0 < low):
-            made.append(here + (there - here) * (low / (low - high)))
-    return np.array(made).reshape(-1, polygon.shape[1])
 
 
 def _enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices: int) -> NDArray[np.float64] | None:

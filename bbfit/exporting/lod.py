@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bbfit.model_files import generator, joined_glb, split_glb
+from bbfit.glb import gltf_parts, is_glb, joined_glb, split_glb
+from bbfit.model_files import generator
 
 # The lists of a glTF that bbfit's own have.
 _ITEMS = ("bufferViews", "accessors", "images", "samplers", "textures", "materials", "meshes", "nodes")
@@ -79,12 +79,17 @@ def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel]) -> bytes:
 
 
 def stands_alone(path: Path) -> bool:
-    """Whether a file is a GLB of glTF 2.0 with all of its data in its one binary chunk, so that others can be joined to it."""
-    with path.open("rb") as file:
-        head = file.read(20)
-        if len(head) < 20 or head[:4] != b"glTF" or head[16:] != b"JSON" or int.from_bytes(head[4:8], "little") != 2:
-            return False
-        tree = json.loads(file.read(int.from_bytes(head[12:16], "little")))
+    """Whether a file is a GLB of glTF 2.0 with all of its data in its one binary chunk, so that others can be joined to it.
+
+    Raises
+    ------
+    InputError
+        If the file is a damaged GLB.
+    """
+    data = path.read_bytes()
+    if not is_glb(data):
+        return False
+    tree, _ = gltf_parts(data, "tree", path)
     uris = [item for kind in ("buffers", "images") for item in tree.get(kind, []) if "uri" in item]
     return len(tree.get("buffers", [])) == 1 and not uris and bool(tree.get("scenes"))
 

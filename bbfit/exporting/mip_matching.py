@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bbfit.checks import fail
-from bbfit.exporting.atlas import Atlas
-from bbfit.exporting.cards import Cards
-from bbfit.exporting.drawing import filtered, hits, joined, sheets_of
 from bbfit.exporting.mips import mip_chain
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
+from bbfit.geometry.cards import Atlas, Cards
 from bbfit.geometry.orbit import Orbit
+from bbfit.rendering.cards import filtered, hits, joined, sheets_of
 from bbfit.rendering.compositing import opacity
 
 # Pictures in which coverage is counted have so many pixels a side at most.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from bbfit.checks import check_range
-from bbfit.exporting.atlas import Atlas
+from bbfit.geometry.cards import Atlas
 
 # Alpha is looked up at so many points along a texel's side. Castano takes four, which give a single opaque texel three quarters of a
 # texel of coverage; it has 0.614, and by eight points 0.625.

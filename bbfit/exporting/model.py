@@ -1,89 +1,133 @@
-"""Writing a billboard cloud as a model that other programs open."""
+"""The model that ships: what the exported files of a billboard cloud contain, and what they show."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
-from bbfit.exporting.cards import Cards, cloud_cards
-from bbfit.exporting.config import ExportConfig
+from torch import Tensor
+
+from bbfit.exporting.cards import cloud_cards
+from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.gltf import glb_bytes
-from bbfit.exporting.hulls import with_hulls
+from bbfit.exporting.hulls import overdraw, with_hulls
 from bbfit.exporting.mip_matching import reduced, with_mips
 from bbfit.exporting.obj import mtl_bytes, obj_bytes
 from bbfit.exporting.splitting import split
 from bbfit.files import write_bytes
 from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png
 from bbfit.model_files import check_model_path
+from bbfit.rendering.cards import draw_cards
+from bbfit.rendering.dispatch import render
+
+
+@dataclass(frozen=True)
+class ShippedModel:
+    """A billboard cloud with the export options of its files; make one with :func:`shipped_model`.
+
+    The polygons and the GLB are computed when they are first used, and kept.
+
+    Raises
+    ------
+    InputError
+        when the polygons are computed, if the cloud is empty or has values that are not finite.
+    """
+
+    cloud: BillboardCloud
+    """The billboards, with the alpha mode of the files."""
+    config: ResolvedExport
+    """The export options."""
+    halvings: int = 0
+    """How many times the sides of the textures are halved, for a model that is only seen from afar."""
+
+    @cached_property
+    def cards(self) -> Cards:
+        """The polygons, split and trimmed as the options request, and the mip levels if the files bring any."""
+        cards = cloud_cards(self.cloud, self.config.padding << self.halvings)
+        if self.config.split and cards.alpha.kind == "blend":
+            cards = split(cards)
+        if self.config.hull is not None:
+            cards = with_hulls(cards, self.config.hull, cards.visible_alpha)
+        cards = reduced(cards, self.halvings)
+        return with_mips(cards) if self.config.has_mips else cards
+
+    @cached_property
+    def glb(self) -> bytes:
+        """The GLB file."""
+        return glb_bytes(self.cards, self.config)
+
+    @property
+    def overdraw(self) -> float:
+        """Share of the polygons' area that is shaded although nothing is visible there, in [0, 1]."""
+        return overdraw(self.cards, self.cards.visible_alpha)
+
+    def draw(self, camera: Camera) -> Tensor:
+        """Draw what the files show: premultiplied RGBA over nothing in [0, 1], [H, W, 4], or [V, H, W, 4] for a batch of cameras.
+
+        Without mip levels the polygons show what the cloud's renderer shows, but for the rounding of textures to 8 bits; the renderer is
+        faster and draws them. Trimmed outlines cut off nothing visible.
+        """
+        if self.config.has_mips or self.halvings:
+            return draw_cards(self.cards, camera)
+        return render(self.cloud, camera.to(self.cloud.texels.device))
+
+    def save(self, path: str | Path) -> list[Path]:
+        """Write the files as :func:`export` does, with the same results and errors."""
+        path = check_model_path("model file", path)
+        if path.suffix.lower() == ".glb":
+            contents = {path: self.glb}
+        else:
+            material, texture = path.with_suffix(".mtl"), path.with_suffix(".png")
+            contents = {
+                path: obj_bytes(self.cards, self.config, material_file=material.name),
+                material: mtl_bytes(texture_file=texture.name),
+                texture: encode_png(self.cards.atlas.image),
+            }
+        if self.config.mip_files:
+            levels = enumerate(self.cards.chain or [self.cards.atlas.image])
+            contents |= {path.with_name(f"{path.stem}_mip{level}.png"): encode_png(image) for level, image in levels}
+        for file, data in reversed(contents.items()):  # a file is written after the files that it refers to
+            write_bytes(file, data)
+        return list(contents)
+
+
+def shipped_model(cloud: BillboardCloud, config: ExportConfig | None = None, halvings: int = 0) -> ShippedModel:
+    """The model that the exported files of a billboard cloud contain.
+
+    Parameters
+    ----------
+    cloud : BillboardCloud
+    config : ExportConfig
+        The export options. An alpha mode or cutoff that they leave open is the cloud's own.
+    halvings : int
+        How many times the sides of the textures are halved, for a model that is only seen from afar.
+    """
+    resolved = (config or ExportConfig()).resolve()
+    alpha = AlphaMode(resolved.alpha or cloud.alpha.kind, resolved.alpha_cutoff or cloud.alpha.cutoff)
+    return ShippedModel(replace(cloud, alpha=alpha), resolved, halvings)
 
 
 def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None = None) -> list[Path]:
-    """Write a billboard cloud as GLB (one file) or as OBJ with an MTL and a PNG of the same stem, by the ending of ``path``.
+    """Write a billboard cloud as a GLB file, or as an OBJ file with an MTL and a PNG file of the same stem.
 
-    Textures are rounded to 8 bits and otherwise kept texel for texel. Coordinates keep the cloud's meters and origin.
+    The suffix of ``path`` selects the format. Textures are rounded to 8 bits and otherwise kept texel for texel. Coordinates keep the
+    cloud's meters and origin.
 
     Returns
     -------
-    The files written, the model first.
+    list of Path
+        The files written, the model first.
 
     Raises
     ------
     InputError
-        for another ending, an empty cloud or one with values that are not finite, or if an encoder is missing that was asked for.
+        for another suffix, for an empty cloud, for values that are not finite, or if the encoder of a requested format is missing.
     MissingFileError, OSError
-        if the folder does not exist or cannot be written to; files that were there stay as they were.
+        if the folder does not exist or cannot be written to; existing files stay as they were.
     """
-    path, config = check_model_path("model file", path), config or ExportConfig()
-    return write_model(shipped_cards(cloud, config), path, config)
-
-
-def write_model(cards: Cards, path: Path, config: ExportConfig) -> list[Path]:
-    """Write the cards that :func:`shipped_cards` gives, as :func:`export` does."""
-    if path.suffix.lower() == ".glb":
-        contents = {path: glb_bytes(cards, config)}
-    else:
-        material, texture = path.with_suffix(".mtl"), path.with_suffix(".png")
-        contents = {
-            path: obj_bytes(cards, config, material_file=material.name),
-            material: mtl_bytes(texture_file=texture.name),
-            texture: encode_png(cards.atlas.image),
-        }
-    if config.mip_files:
-        levels = enumerate(cards.chain or [cards.atlas.image])
-        contents |= {path.with_name(f"{path.stem}_mip{level}.png"): encode_png(image) for level, image in levels}
-    for file, data in reversed(contents.items()):  # what is referred to before what refers to it
-        write_bytes(file, data)
-    return list(contents)
-
-
-def as_shipped(cloud: BillboardCloud, config: ExportConfig) -> BillboardCloud:
-    """The cloud with the alpha mode that its model file has: what a render or a score of the file is to be taken of."""
-    kind, cutoff = config.alpha or cloud.alpha.kind, config.alpha_cutoff or cloud.alpha.cutoff
-    return replace(cloud, alpha=AlphaMode(kind, cutoff))
-
-
-def shipped_cards(cloud: BillboardCloud, config: ExportConfig, halvings: int = 0) -> Cards:
-    """The polygons that a model file of the cloud has, cut up and trimmed as asked for, and their mip levels if the file brings any.
-
-    With ``halvings`` the sides of the textures are halved so often, for a model that is never seen from near.
-
-    Raises
-    ------
-    InputError
-        if the cloud is empty or has values that are not finite.
-    """
-    resolved = config.resolve()
-    cards = cloud_cards(as_shipped(cloud, resolved), resolved.padding << halvings)
-    if resolved.split and cards.alpha.kind == "blend":
-        cards = split(cards)
-    if resolved.hull is not None:
-        cards = with_hulls(cards, resolved.hull, shows_from(cards))
-    cards = reduced(cards, halvings)
-    return with_mips(cards) if resolved.has_mips else cards
-
-
-def shows_from(cards: Cards) -> float:
-    """The alpha from which on something shows; 0 where it is anything above."""
-    return cards.alpha.cutoff if cards.alpha.kind == "mask" else 0.0
+    return shipped_model(cloud, config).save(path)

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bbfit.exporting.cards import Card, Cards
-from bbfit.exporting.hulls import bilinear, rimmed_alpha, sides, texel_corners
+from bbfit.exporting.hulls import bilinear, rimmed_alpha, texel_corners
 from bbfit.geometry.camera import Camera
+from bbfit.geometry.cards import Card, Cards
+from bbfit.geometry.polygons import sides
 from bbfit.rendering.compositing import TIE
 
 # A ray's pair of layers that matters less than this is left out.

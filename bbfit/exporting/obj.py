@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bbfit.exporting.cards import Cards
 from bbfit.exporting.config import ExportConfig
+from bbfit.geometry.cards import Cards
 
 _MATERIAL = "billboards"
 

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.checks import check_count, check_range
-from bbfit.exporting.cards import Card, Cards
-from bbfit.exporting.hulls import kept_half, rimmed_alpha, shown_cells, texel_corners
+from bbfit.exporting.hulls import rimmed_alpha, shown_cells, texel_corners
 from bbfit.exporting.node_order import (
     Overlaps,
     VisibilitySamples,
@@ -23,6 +22,8 @@ from bbfit.exporting.node_order import (
     sample_visibility,
     shown_by,
 )
+from bbfit.geometry.cards import Card, Cards
+from bbfit.geometry.polygons import kept_half
 from bbfit.rendering.compositing import TIE
 
 # Share of the pieces that are cut before origins are fitted again.

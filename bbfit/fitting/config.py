@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, TypeVar
 
 from bbfit.checks import Count, Range, Seed, check_fields, fail
 from bbfit.geometry.alpha import AlphaKind, Cutoff
+from bbfit.provenance import EXECUTION
 from bbfit.rendering.config import Backend
 
 Preset = Literal["default", "thesis"]
@@ -144,9 +145,9 @@ class FitConfig:
     """Seed of the search, of the initial textures and of the order of views."""
     backend: Backend = "auto"
     """Renderer of the fit: the kernels (fused, auto), or the reference, which is many times slower."""
-    device: str = "cpu"
+    device: str = field(default="cpu", metadata=EXECUTION)
     """Torch device to fit on, such as cpu or cuda."""
-    checkpoint_every: Count = 250
+    checkpoint_every: Count = field(default=250, metadata=EXECUTION)
     """Steps between two checkpoints; an interrupted fit resumes from the last one."""
 
     def __post_init__(self) -> None:

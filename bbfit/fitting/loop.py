@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from bbfit.checks import InputTypeError, check_file, fail
+from bbfit.checks import InputTypeError, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
 from bbfit.fitting.config import FitConfig, ResolvedFit
@@ -30,6 +29,8 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.images import bleed_color
+from bbfit.provenance import cache_key
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset
 
 _START, _FOUND = "start.", "found."
@@ -86,7 +87,7 @@ def fit(
     views: ViewDataset,
     config: FitConfig | None = None,
     *,
-    tree: str | Path | None = None,
+    tree: str | Path | TreeFile | None = None,
     checkpoint: str | Path | None = None,
     on_step: Callable[[Step], None] | None = None,
     on_place: Callable[[int, int], None] | None = None,
@@ -120,16 +121,14 @@ def fit(
     device = _device(config.device)
     begun = time.perf_counter()
     views.train.check()
-    if config.placement == "even":
-        tree = None  # it has no say
-    mesh = None if tree is None else sha256(check_file("tree", tree).read_bytes()).hexdigest()
-    mark = sha256(json.dumps([8, asdict(config), views.train.fingerprint, mesh], sort_keys=True).encode()).hexdigest()
+    opened = None if tree is None or config.placement == "even" else TreeFile.open(tree)
+    key = cache_key("fit", *fit_inputs(views, config, opened))
     checkpoint = Path(checkpoint) if checkpoint is not None else None
-    done = _load(checkpoint, mark) if checkpoint is not None else None
+    done = _load(checkpoint, key) if checkpoint is not None else None
     if done is None:
-        done = _begin(views, config, tree, on_place)
+        done = _begin(views, config, opened, on_place)
         if checkpoint is not None and done.found is not None:
-            _save(checkpoint, mark, replace(done, seconds=time.perf_counter() - begun))
+            _save(checkpoint, key, replace(done, seconds=time.perf_counter() - begun))
     begun -= done.seconds
 
     start, fitted, losses = done.start, done.found, done.losses
@@ -154,7 +153,7 @@ def fit(
             if on_step is not None:
                 on_step(Step(index + 1, config.steps, losses[-1], rate, partial(_cloud_of, stepper)))
             if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
-                _save(checkpoint, mark, _FitState(losses, start, None, stepper.tensors(), time.perf_counter() - begun))
+                _save(checkpoint, key, _FitState(losses, start, None, stepper.tensors(), time.perf_counter() - begun))
         fitted = stepper.finish()
         del stepper
         if movement is not None:
@@ -170,7 +169,12 @@ def fit(
     return FitResult(fitted if stand else trimmed(fitted), losses, config, time.perf_counter() - begun)
 
 
-def _begin(views: ViewDataset, config: ResolvedFit, tree: str | Path | None, on_place: Callable[[int, int], None] | None) -> _FitState:
+def fit_inputs(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> tuple[Any, ...]:
+    """What the result of :func:`fit` depends on: the configuration, the training views, and the mesh where billboards are placed by it."""
+    return config, views.train.fingerprint, None if tree is None or config.placement == "even" else tree.digest
+
+
+def _begin(views: ViewDataset, config: ResolvedFit, tree: TreeFile | None, on_place: Callable[[int, int], None] | None) -> _FitState:
     """Before the first step: evenly placed billboards, or what the search finds."""
     if config.placement == "even":
         return _FitState([], start_cloud(views.train, config), None, {}, 0.0)
@@ -254,17 +258,17 @@ def _device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def _save(path: Path, mark: str, progress: _FitState) -> None:
+def _save(path: Path, key: str, progress: _FitState) -> None:
     tensors = {name: tensor.detach().cpu() for name, tensor in progress.tensors.items()}
     tensors["losses"] = torch.tensor(progress.losses, dtype=torch.float64)
     for prefix, cloud in {_START: progress.start, _FOUND: progress.found}.items():
         for name in TENSORS if cloud is not None else ():
             if prefix == _FOUND or name != "texels":
                 tensors[prefix + name] = getattr(cloud, name).clone()  # no two may share memory
-    write_tensors(path, tensors, {"fit": mark, "seconds": repr(progress.seconds)})
+    write_tensors(path, tensors, {"fit": key, "seconds": repr(progress.seconds)})
 
 
-def _load(path: Path, mark: str) -> _FitState | None:
+def _load(path: Path, key: str) -> _FitState | None:
     """What is kept in a checkpoint, or ``None`` if there is none for this very fit."""
     from safetensors import SafetensorError, safe_open
 
@@ -273,7 +277,7 @@ def _load(path: Path, mark: str) -> _FitState | None:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            if metadata.get("fit") != mark:
+            if metadata.get("fit") != key:
                 return None
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except SafetensorError:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from bbfit.blender.meshes import tree_mesh
-from bbfit.blender.sources import UP_AXIS
 from bbfit.checks import fail
 from bbfit.fitting.initialize import pixels_a_meter
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, convergence_point
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewSet
 
 COUNT = 20_000
@@ -26,12 +24,13 @@ _CARVED, _ROUNDS = 1 << 18, 64
 _HULL_SIDE = 256
 
 
-def mesh_points(path: str | Path, views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
+def mesh_points(tree: TreeFile, views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
     """Points on the triangles of a tree's mesh, evenly by area, [P, 3] float64, in the world of the views.
 
     Parameters
     ----------
-    path : a file with one of :data:`~bbfit.blender.meshes.MESH_SUFFIXES`.
+    tree
+        A tree whose triangles can be read without Blender.
     views : views of the same tree, which the mesh is checked against.
 
     Raises
@@ -41,11 +40,9 @@ def mesh_points(path: str | Path, views: ViewSet, *, count: int = COUNT, seed: i
     """
     import trimesh
 
-    path = Path(path)
-    mesh = tree_mesh(path)
-    sampled, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    sampled, _ = trimesh.sample.sample_surface(tree.mesh(), count, seed=seed)
     points = torch.tensor(sampled, dtype=torch.float64)
-    if UP_AXIS[path.suffix.lower()] == "z":
+    if tree.up_axis == "z":
         points = points @ torch.tensor(Z_UP_TO_Y_UP, dtype=torch.float64)[:3, :3].mT
     seen = []
     for index in range(0, len(views), max(1, len(views) // 8)):
@@ -53,7 +50,7 @@ def mesh_points(path: str | Path, views: ViewSet, *, count: int = COUNT, seed: i
         mask = max_pool2d((views.image(index)[..., 3] > 0).float()[None], 3, 1, 1)[0] > 0
         seen.append(_inside(points, views.cameras[index], mask, beyond=True).double().mean())
     if float(torch.stack(seen).mean()) < _AGREEMENT:
-        fail("tree", f"{path} is not where the views show a tree", "give the mesh that they were rendered from, or no mesh")
+        fail("tree", f"{tree.path} is not where the views show a tree", "give the mesh that they were rendered from, or no mesh")
     return points
 
 

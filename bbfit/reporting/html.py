@@ -18,10 +18,12 @@ from bbfit.evaluation.report import Cost, Report, ViewScore
 from bbfit.evaluation.scoring import held_out
 from bbfit.evaluation.sizes import shrunk
 from bbfit.exporting.encoders import encode_webp
+from bbfit.exporting.model import ShippedModel
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
+from bbfit.glb import joined_glb, split_glb
 from bbfit.images import over_color, to_bytes, unpremultiply
-from bbfit.model_files import generator, joined_glb, split_glb
+from bbfit.model_files import generator
 from bbfit.reporting.charts import MEASURES, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
 from bbfit.reporting.plots import magma, spread_views
 from bbfit.views import ViewSet
@@ -52,7 +54,7 @@ class RunFacts:
     """Whether the model is cut up so that programs blend it in the right order."""
 
 
-def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: RunFacts, glb: bytes) -> str:
+def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunFacts, glb: bytes) -> str:
     """The page as text: everything that it shows is in it, and what users named is escaped.
 
     Shown are the key figures beside the tree's, held-out views (target, result, FLIP map) with a slider, every measure by azimuth with the
@@ -61,8 +63,8 @@ def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: Ru
 
     Parameters
     ----------
-    report : the scores of ``cloud`` on ``views``.
-    cloud : the billboards as they ship.
+    report : the scores of ``model`` on ``views``.
+    model : the billboards as they are exported.
     views : V held-out views; at most 36 of them and the worst ones are shown, no wider than 512 pixels.
     glb : the model for the 3D view, with pictures that browsers read (PNG or WebP).
 
@@ -74,7 +76,7 @@ def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: Ru
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
-    worst = _worst(report.views)
+    cloud, worst = model.cloud, _worst(report.views)
     angles = np.array([(view.azimuth_degrees, view.elevation_degrees) for view in report.views])
     shown = sorted({*spread_views(angles, _MOST_VIEWS), *(entry["index"] for entry in worst)}, key=lambda index: (*angles[index], index))
     layered = report.alpha.kind != "mask" and not facts.cut_up
@@ -91,7 +93,7 @@ def report_page(report: Report, cloud: BillboardCloud, views: ViewSet, facts: Ru
         script=Markup((own / "report.js").read_text(encoding="utf-8")),
         report=report,
         cloud=cloud,
-        views=[_view(cloud, views, report.views[index], index) for index in shown],
+        views=[_view(model, views, report.views[index], index) for index in shown],
         worst=worst,
         first=shown.index(sorted(shown, key=lambda index: report.views[index].measures.over_white.flip)[len(shown) // 2]),  # a typical one
         azimuth=Markup(azimuth.svg),
@@ -147,9 +149,9 @@ def _least_seen(cloud: BillboardCloud) -> float:
     return cloud.alpha.cutoff if cloud.alpha.kind == "mask" else 0.5
 
 
-def _view(cloud: BillboardCloud, views: ViewSet, score: ViewScore, index: int) -> dict[str, Any]:
+def _view(model: ShippedModel, views: ViewSet, score: ViewScore, index: int) -> dict[str, Any]:
     """A held-out view for the strip: its pictures and figures."""
-    target, result = held_out(cloud, views, index)
+    target, result = held_out(model.draw, views, index)
     error = metrics.flip_map(over_color(target).numpy(), over_color(result).numpy())
     height, width = error.shape
     size = (min(width, _WIDEST), max(1, height * min(width, _WIDEST) // width))

@@ -15,11 +15,9 @@ from bbfit.checks import check_count, fail
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import held_out, view_angles
 from bbfit.evaluation.sizes import shrunk
-from bbfit.exporting.cards import Cards
-from bbfit.exporting.drawing import draw_cards
 from bbfit.exporting.lod import LodLevel
+from bbfit.exporting.model import ShippedModel
 from bbfit.files import write_bytes
-from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png, over_color, to_bytes
 from bbfit.views import ViewSet
 
@@ -34,7 +32,7 @@ INK, FAINT, _LINE, PAPER = (32, 36, 42), (112, 118, 126), (214, 217, 222), (242,
 _CELL_LEAST = 220  # pixels: what the writing under a small picture needs
 
 
-def comparison_picture(cloud: BillboardCloud, views: ViewSet, path: str | Path, *, count: int = 4, title: str = "") -> None:
+def comparison_picture(model: ShippedModel, views: ViewSet, path: str | Path, *, count: int = 4, title: str = "") -> None:
     """Write a PNG of some views, a row each: target, result, and the perceived difference.
 
     Pictures are shown over white, pixel for pixel. The difference is the FLIP map (:func:`bbfit.evaluation.metrics.flip_map`) in the
@@ -42,7 +40,7 @@ def comparison_picture(cloud: BillboardCloud, views: ViewSet, path: str | Path, 
 
     Parameters
     ----------
-    cloud : the result.
+    model : the result as it is exported.
     views : held-out views; ``count`` of them are shown, spread evenly in azimuth (:func:`spread_views`).
     path : the PNG to write, completely or not at all.
     title : stands above the pictures.
@@ -74,17 +72,16 @@ def comparison_picture(cloud: BillboardCloud, views: ViewSet, path: str | Path, 
 
     if title:
         draw.text((gap, line // 2), title, INK, picture_font("DejaVuSans-Bold.ttf", text * 5 // 4))
-    noun = "billboard" if len(cloud) == 1 else "billboards"
-    for x, name, note in zip(
-        left, ("Target", "Result", "Difference"), ("", f"{len(cloud)} {noun}, {cloud.vertex_count} vertices", "FLIP"), strict=True
-    ):
+    count = len(model.cloud)
+    costs = f"{count} {'billboard' if count == 1 else 'billboards'}, {model.cards.vertex_count} vertices"
+    for x, name, note in zip(left, ("Target", "Result", "Difference"), ("", costs, "FLIP"), strict=True):
         draw.text((x, head - text * 3 // 2), name, INK, bold)
         draw.text((x + bold.getlength(name + "  "), head - text * 3 // 2), note, FAINT, font)
     _color_bar(sheet, draw, font, left[2] + cell, head - text * 3 // 2, text)
 
     for number, index in enumerate(rows):
         top = head + number * row + text // 4
-        target, result = (over_color(picture) for picture in held_out(cloud, views, index))
+        target, result = (over_color(picture) for picture in held_out(model.draw, views, index))
         pair = target.numpy(), result.numpy()
         error = metrics.flip_map(*pair)
         for x, picture in zip(left, (to_bytes(target), to_bytes(result), magma(error)), strict=True):
@@ -238,7 +235,7 @@ def _draw_front(axes: Any, choice: Choice, cost: Cost) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def lod_picture(levels: Sequence[tuple[LodLevel, Cards]], views: ViewSet, path: str | Path) -> None:
+def lod_picture(levels: Sequence[tuple[LodLevel, ShippedModel]], views: ViewSet, path: str | Path) -> None:
     """Write a PNG of levels of detail, a column each: one held-out view and the level, as large as where the level takes over.
 
     Both are enlarged without smoothing until they fill the column.
@@ -251,11 +248,11 @@ def lod_picture(levels: Sequence[tuple[LodLevel, Cards]], views: ViewSet, path: 
     side, gap, text = 384, 16, 14
     sheet = Image.new("RGB", (gap + len(levels) * (side + gap), 2 * (side + gap) + gap + 3 * text), PAPER)
     draw, font, bold = ImageDraw.Draw(sheet), picture_font("DejaVuSans.ttf", text), picture_font("DejaVuSans-Bold.ttf", text)
-    for column, (level, cards) in enumerate(levels):
+    for column, (level, model) in enumerate(levels):
         share = min(1.0, (level.tree_pixels or tall) / tall)
         size = max(metrics.SSIM_WINDOW, round(width * share)), max(metrics.SSIM_WINDOW, round(height * share))
         target = shrunk(views.targets([0])[0], *size)
-        image = draw_cards(cards, views.cameras[0].resized(*size))
+        image = model.draw(views.cameras[0].resized(*size))
         left = gap + column * (side + gap)
         draw.text((left, gap // 2), level.name, INK, bold)
         draw.text((left, gap // 2 + text * 5 // 4), f"the tree is {tall * share:.0f} pixels high", FAINT, font)

@@ -16,7 +16,7 @@ _EVERY = 60.0
 
 @contextlib.contextmanager
 def progress_bars(console: Console) -> Iterator[Callable[..., None]]:
-    """A bar for each stage, with rate and time left; yields what the work has to tell (:class:`bbfit.pipeline.Progress`).
+    """A bar for each stage, with rate and time left; yields what the work has to tell (:class:`bbfit.stages.stage.OnProgress`).
 
     What is no terminal, as a log, gets a line when a stage is finished and every minute on the way.
     """

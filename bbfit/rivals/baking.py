@@ -15,14 +15,13 @@ from torch import Tensor
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.conversion import tree_as_glb
-from bbfit.blender.meshes import tree_mesh
 from bbfit.blender.pictures import FILTER_REACH, render_pictures
-from bbfit.blender.sources import check_tree
 from bbfit.checks import check_range, check_shape, fail
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera, orthographic_intrinsics
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import bleed_color, read_rgba
+from bbfit.tree_files.tree_file import TreeFile
 
 # Endings of Y-up files whose triangles are read as they stand; others go through Blender.
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
@@ -81,7 +80,7 @@ class Slabs:
 
 
 def bake(
-    tree: str | Path,
+    tree: str | Path | TreeFile,
     slabs: Slabs,
     config: BakeConfig,
     *,
@@ -142,7 +141,7 @@ def bake(
     return _assembled(slabs, parts, config)
 
 
-def tree_triangles(tree: str | Path) -> NDArray[np.float64]:
+def tree_triangles(tree: str | Path | TreeFile) -> NDArray[np.float64]:
     """Corners of all triangles of a tree in the world of its views, [T, 3, 3] in meters.
 
     Raises
@@ -152,11 +151,11 @@ def tree_triangles(tree: str | Path) -> NDArray[np.float64]:
     BlenderError
         if Blender crashes over it.
     """
-    path = check_tree(tree)[0]
-    if path.suffix.lower() not in _MESH_SUFFIXES:
+    tree = TreeFile.open(tree)
+    if tree.suffix not in _MESH_SUFFIXES:
         with tempfile.TemporaryDirectory(prefix="bbfit-") as scratch:
-            return tree_triangles(tree_as_glb(path, Path(scratch) / "tree.glb"))
-    return np.asarray(tree_mesh(path).triangles, np.float64)
+            return tree_triangles(tree_as_glb(tree, Path(scratch) / "tree.glb"))
+    return np.asarray(tree.mesh().triangles, np.float64)
 
 
 def _whole_texels(lengths: Tensor) -> Tensor:

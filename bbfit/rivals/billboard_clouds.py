@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from bbfit.checks import check_count, check_range, check_shape, fail
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rivals.baking import BakeConfig, Slabs, bake, tree_triangles
+from bbfit.tree_files.tree_file import TreeFile
 
 # Degrees between neighboring directions of plane space, and how often the step is halved around the densest plane.
 _STEP, _HALVINGS = 9.0, 4
@@ -64,7 +65,7 @@ class PlaneChoice:
 
 
 def billboard_cloud(
-    tree: str | Path,
+    tree: str | Path | TreeFile,
     count: int,
     config: BakeConfig,
     *,

@@ -18,13 +18,14 @@ from bbfit.blender.pictures import vertical_axis
 from bbfit.checks import check_count
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rivals.baking import BakeConfig, Slabs, bake, tree_triangles
+from bbfit.tree_files.tree_file import TreeFile
 
 # What is added to a slab's depth on either side, as a share of the tree's size, so that what lies on its border is seen.
 _SLACK = 1e-4
 
 
 def crossed_planes(
-    tree: str | Path,
+    tree: str | Path | TreeFile,
     count: int,
     config: BakeConfig,
     *,

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bbfit.blender.meshes import tree_scene
 from bbfit.checks import check_count, fail
+from bbfit.tree_files.tree_file import TreeFile
 
 if TYPE_CHECKING:
     import trimesh
@@ -51,7 +51,7 @@ class _Part:
     material: Any
 
 
-def decimate(tree: str | Path, *, vertices: int | None = None, size: int | None = None) -> DecimatedTree:
+def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: int | None = None) -> DecimatedTree:
     """Reduce a tree to at most so many vertices, or bytes of its GLB.
 
     Parts of different materials stay apart and share what is allowed by their triangles. Vertices that lie in the same place with the same
@@ -74,7 +74,7 @@ def decimate(tree: str | Path, *, vertices: int | None = None, size: int | None 
     assert limit is not None
     check_count("vertices" if size is None else "size", limit, 4)
     collapse = _collapser()
-    parts = _parts(tree)
+    parts = _parts(TreeFile.open(tree))
 
     def cost(parts: list[_Part]) -> int:
         return sum(len(part.points) for part in parts) if size is None else len(_glb(parts))
@@ -118,12 +118,12 @@ def _collapser() -> Callable[[_Part, int], _Part]:
     return collapse
 
 
-def _parts(path: str | Path) -> list[_Part]:
+def _parts(tree: TreeFile) -> list[_Part]:
     """The file's triangles by material, placed and welded."""
     import trimesh
 
     parts = []
-    for mesh in tree_scene(path).dump():
+    for mesh in tree.scene().dump():
         assert isinstance(mesh, trimesh.Trimesh)
         mesh.merge_vertices(merge_norm=True)
         uv = getattr(mesh.visual, "uv", None)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bbfit.blender.meshes import tree_scene
 from bbfit.checks import check_range, fail
+from bbfit.tree_files.tree_file import TreeFile
 
 # What the frame of a glTF file takes: its JSON for a mesh with its material, and for the scene.
 _FRAME, _FRAME_A_MESH = 600, 700
@@ -25,7 +25,7 @@ class DracoSize:
     """That come out of it; quantization may have merged some."""
 
 
-def draco_size(tree: str | Path, *, position_bits: int = 14) -> DracoSize:
+def draco_size(tree: str | Path | TreeFile, *, position_bits: int = 14) -> DracoSize:
     """Compress every mesh of a tree, with its texture coordinates and normals, as glTF's KHR_draco_mesh_compression would.
 
     Parameters
@@ -46,7 +46,7 @@ def draco_size(tree: str | Path, *, position_bits: int = 14) -> DracoSize:
         fail("draco", "the package DracoPy is not installed", 'pip install "bbfit[rivals]"')
     total, vertices = _FRAME, 0
     textures: dict[int, int] = {}
-    for mesh in tree_scene(tree).geometry.values():
+    for mesh in TreeFile.open(tree).scene().geometry.values():
         uv = getattr(mesh.visual, "uv", None)
         normals = mesh.vertex_normals if "vertex_normals" in mesh._cache else None
         data = DracoPy.encode(

@@ -27,6 +27,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.dispatch import render
 from bbfit.rivals.baking import BakeConfig, Slabs, bake, tree_triangles
 from bbfit.rivals.crossed import upright_slabs
+from bbfit.tree_files.tree_file import TreeFile
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Slicings:
 
 
 def slicing(
-    tree: str | Path,
+    tree: str | Path | TreeFile,
     config: BakeConfig,
     *,
     directions: int = 6,

@@ -6,24 +6,26 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bbfit.blender.sources import check_tree, fingerprint
 from bbfit.checks import InputError, check_file, check_folder, fail
 from bbfit.files import output_folder, write_bytes
+from bbfit.fitting.loop import fit_inputs
 from bbfit.layout import TEST_FILE
-from bbfit.pipeline import Progress, RunConfig
-from bbfit.records import STAGE_VERSIONS, hash_inputs, plain
+from bbfit.pipeline import RunConfig
+from bbfit.provenance import VERSIONS, cache_key, identity
 from bbfit.reporting.sweep_plots import sweep_plot
 from bbfit.reporting.sweep_tables import SweepRow, table_csv, table_markdown
+from bbfit.stages.stage import OnProgress, silent
 from bbfit.sweep.cluster import RayWorkers
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.grid import Cell, Grid
 from bbfit.sweep.local import LocalWorkers
 from bbfit.sweep.results import Results
 from bbfit.sweep.tasks import Outcome, Task, Workers, fit_tree, prepare_tree
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.species import load_species
 from bbfit.views import ViewDataset
 
@@ -67,7 +69,7 @@ def run_sweep(
     species: Sequence[str] = (),
     trees: Sequence[str | Path] = (),
     views: Sequence[str | Path] = (),
-    on_progress: Progress | None = None,
+    on_progress: OnProgress | None = None,
 ) -> SweepResult:
     """Fit every configuration of a grid to every tree and compare them, on this machine or on a Ray cluster.
 
@@ -97,7 +99,7 @@ def run_sweep(
     sweep = _Sweep(output_folder("out", out), found, cells, config, stages)
     workers: Workers = LocalWorkers(config.workers, config.retries) if config.ray is None else RayWorkers(config)
     with workers:
-        sweep.carry_out(workers, on_progress or (lambda stage, done, total, note="": None))
+        sweep.carry_out(workers, on_progress or silent)
     return sweep.result()
 
 
@@ -140,10 +142,8 @@ class _Job:
 class _Tree:
     """A tree that can be fitted to."""
 
-    views: Path
-    fingerprint: str
-    mesh: tuple[Path, ...]
-    mesh_hash: str | None
+    views: ViewDataset
+    mesh: TreeFile | None
 
 
 class _Sweep:
@@ -156,12 +156,12 @@ class _Sweep:
         self._ready = self._kept = 0
         self._written = -math.inf
 
-    def carry_out(self, workers: Workers, tell: Progress) -> None:
+    def carry_out(self, workers: Workers, on_progress: OnProgress) -> None:
         """Prepare all trees and make all runs that no result stands for."""
         preparing = {f"views of {source.name}": source for source in self._sources}
         for name, source in preparing.items():
             self._prepare(name, source, workers)
-        self._tell(tell)
+        self._report(on_progress)
         while self._jobs:
             task, outcome = workers.next()
             job = self._jobs.pop(task.name)
@@ -170,7 +170,7 @@ class _Sweep:
                 self._prepared(preparing[task.name], outcome, workers)
             for source, cell in self._wanted_by.pop(job.key, ()):
                 self._outcomes[source, cell] = job.key, outcome
-            self._tell(tell, outcome.reason or "")
+            self._report(on_progress, outcome.reason or "")
 
     def result(self) -> SweepResult:
         """The rows, and the tables of them on disk."""
@@ -180,9 +180,9 @@ class _Sweep:
         sweep_plot(rows, self._folder / "table.png")
         return SweepResult(self._folder, tuple(rows), self._kept)
 
-    def _tell(self, tell: Progress, note: str = "") -> None:
-        tell("trees", self._ready, len(self._sources))
-        tell("runs", len(self._outcomes), len(self._sources) * len(self._cells), note)
+    def _report(self, on_progress: OnProgress, note: str = "") -> None:
+        on_progress("trees", self._ready, len(self._sources))
+        on_progress("runs", len(self._outcomes), len(self._sources) * len(self._cells), note)
         if time.monotonic() - self._written >= _EVERY:
             write_bytes(self._folder / "table.csv", table_csv(self._rows()))
             self._written = time.monotonic()
@@ -192,23 +192,20 @@ class _Sweep:
         if source.views is not None:
             self._prepared(source, Outcome({}, None, ""), workers)
             return
-        grown = None if source.species is None else load_species(source.species, self._stages.grow.species_file)
+        grow, views = self._stages.grow, self._stages.views
         try:
-            files = () if source.tree is None else tuple(check_tree(source.tree))
+            tree = None if source.tree is None else TreeFile.open(source.tree)
         except InputError as error:
             self._prepared(source, Outcome(None, str(error), ""), workers)
             return
-        growth, light = self._stages.grow, self._stages.views
-        made_of = fingerprint(list(files)) if grown is None else [asdict(grown), {**asdict(growth), "species_file": None}]
-        panorama = None if light.hdri is None else fingerprint([check_file("hdri", light.hdri)])
-        views = {**asdict(light), "render_workers": None, "render_device": None, "hdri": panorama}
-        key = hash_inputs("grow", made_of, views)[:_DIGITS]
+        made_of = tree.digest if tree else cache_key("grow", load_species(source.species, grow.species_file), grow)
+        key = cache_key("views", made_of, views)[:_DIGITS]
         earlier = self._results.get(key)
-        if earlier and self._stands(earlier) and (earlier.reason or (self._folder_of(source) / "views" / TEST_FILE).is_file()):
+        if earlier and self._is_final(earlier) and (earlier.reason or (self._folder_of(source) / "views" / TEST_FILE).is_file()):
             self._prepared(source, earlier, workers)
             return
-        self._jobs[name] = _Job(key, plain({"tree": source.species or str(source.tree), "views": views}))
-        named = {"tree": files, "species_file": grown and growth.species_file, "hdri": light.hdri}
+        self._jobs[name] = _Job(key, identity({"tree": source.species or str(source.tree), "views": views}))
+        named = {"tree": tree and tree.files, "species_file": source.species and grow.species_file, "hdri": views.hdri}
         inputs = {what: paths if isinstance(paths, tuple) else (paths,) for what, paths in named.items() if paths}
         workers.submit(Task(name, prepare_tree, inputs, self._folder_of(source), (self._stages, source.species), alone=True))
 
@@ -219,7 +216,9 @@ class _Sweep:
         reason = outcome.reason
         if reason is None:
             try:
-                views = ViewDataset.load(folder).fingerprint
+                views = ViewDataset.load(folder)
+                views.train.check()
+                views.test.check()
             except InputError as error:
                 reason = str(error)
         if reason is not None:
@@ -227,33 +226,30 @@ class _Sweep:
             self._outcomes |= {(source, cell): (None, failed) for cell in range(len(self._cells))}
             return
         mesh = self._folder_of(source) / "tree.glb" if source.species else source.tree
-        if not (outcome.facts or {}).get("mesh"):
-            mesh = None
-        files = () if mesh is None else tuple(check_tree(mesh))
-        tree = _Tree(folder, views, files, fingerprint(list(files)) if files else None)
+        tree = _Tree(views, TreeFile.open(mesh) if mesh and (outcome.facts or {}).get("mesh") else None)
         for number in range(len(self._cells)):
             self._run(source, number, tree, workers)
 
     def _run(self, source: Source, number: int, tree: _Tree, workers: Workers) -> None:
         """See to it that a run is made, unless its result stands or it is being made already."""
-        fit = self._cells[number].config
-        placed = fit.placement == "clusters"  # else the mesh has no say
-        settings = {"fit": {**asdict(fit), "checkpoint_every": None}, "export": asdict(self._stages.export)}
-        asked = plain({**settings, "views": tree.fingerprint, "mesh": tree.mesh_hash if placed else None})
-        key = hash_inputs("fit", asked, STAGE_VERSIONS["export"], STAGE_VERSIONS["evaluate"])[:_DIGITS]
+        fit, export = self._cells[number].config, self._stages.export
+        versions = {name: VERSIONS[name] for name in ("export", "evaluate")}
+        request = {"fit": fit_inputs(tree.views, fit, tree.mesh), "export": export, "views": tree.views.fingerprint, "versions": versions}
+        key = cache_key("fit", request)[:_DIGITS]
         earlier = self._results.get(key)
-        if earlier and self._stands(earlier):
+        if earlier and self._is_final(earlier):
             self._outcomes[source, number] = key, earlier
             self._kept += 1
             return
         self._wanted_by[key].append((source, number))
         if len(self._wanted_by[key]) > 1:
             return
-        inputs = {"views": (tree.views,)} | ({"tree": tree.mesh} if placed and tree.mesh else {})
-        self._jobs[key] = _Job(key, asked)
-        workers.submit(Task(key, fit_tree, inputs, self._folder / "runs" / key, (RunConfig(fit=fit, export=self._stages.export),)))
+        folder = source.views or self._folder_of(source) / "views"
+        inputs = {"views": (folder,)} | ({"tree": tree.mesh.files} if fit.placement == "clusters" and tree.mesh else {})
+        self._jobs[key] = _Job(key, identity(request))
+        workers.submit(Task(key, fit_tree, inputs, self._folder / "runs" / key, (RunConfig(fit=fit, export=export),)))
 
-    def _stands(self, outcome: Outcome) -> bool:
+    def _is_final(self, outcome: Outcome) -> bool:
         return outcome.reason is None or not self._config.retry_failed
 
     def _folder_of(self, source: Source) -> Path:

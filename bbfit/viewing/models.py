@@ -6,8 +6,7 @@ import threading
 from dataclasses import dataclass, replace
 
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.gltf import glb_bytes
-from bbfit.exporting.model import shipped_cards
+from bbfit.exporting.model import shipped_model
 from bbfit.geometry.alpha import AlphaKind
 from bbfit.viewing.levels import Level
 
@@ -68,5 +67,5 @@ def model_key(level: Level, look: Look) -> Key:
 def _model(level: Level, look: Look, export: ExportConfig) -> Model:
     assert level.cloud is not None, "the original is no model of ours"
     config = replace(export, alpha=look.alpha, split=look.split)
-    cards = shipped_cards(level.cloud, config, level.halvings)
-    return Model(glb_bytes(cards, config), cards.vertex_count)
+    model = shipped_model(level.cloud, config, level.halvings)
+    return Model(model.glb, model.cards.vertex_count)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bbfit.blender.meshes import MESH_SUFFIXES, tree_scene
-from bbfit.blender.sources import UP_AXIS, check_tree
 from bbfit.checks import InputError
 from bbfit.exporting.lod import glb_counts, stands_alone
+from bbfit.glb import gltf_parts
+from bbfit.tree_files.tree_file import MESH_SUFFIXES, TreeFile
 
 MOST_BYTES = 64 << 20
 """Size of an original up to which it is sent to the browser, if nothing else is said."""
@@ -50,12 +49,13 @@ def find_original(candidates: Sequence[Path | None], most_bytes: int = MOST_BYTE
     if ending not in MESH_SUFFIXES:
         return Original.missing(f"only Blender reads {path.name}; convert it to .glb to see it here")
     try:
-        size = sum(file.stat().st_size for file in check_tree(path))
+        tree = TreeFile.open(path)
+        size = tree.bytes
         if size > most_bytes:
             return Original.missing(_too_large(path.name, size, most_bytes))
         if ending == ".glb" and stands_alone(path):
             return _as_it_is(path.read_bytes(), path.name)
-        glb = _converted(path)
+        glb = _converted(tree)
     except (InputError, OSError) as error:
         return Original.missing(f"the original cannot be shown: {error}")
     if len(glb) > most_bytes:
@@ -64,16 +64,15 @@ def find_original(candidates: Sequence[Path | None], most_bytes: int = MOST_BYTE
 
 
 def _as_it_is(glb: bytes, name: str) -> Original:
-    length = int.from_bytes(glb[12:16], "little")
-    packed = sorted(_PACKED & set(json.loads(glb[20 : 20 + length]).get("extensionsRequired", ())))
+    packed = sorted(_PACKED & set(gltf_parts(glb)[0].get("extensionsRequired", ())))
     if packed:
         return Original.missing(f"{name} is packed by {' and '.join(packed)}, which the page cannot read")
     return Original(glb, "", _vertices(glb))
 
 
-def _converted(path: Path) -> bytes:
-    scene = tree_scene(path)
-    if UP_AXIS[path.suffix.lower()] == "z":
+def _converted(tree: TreeFile) -> bytes:
+    scene = tree.scene()
+    if tree.up_axis == "z":
         import trimesh
 
         scene.apply_transform(trimesh.transformations.rotation_matrix(-3.141592653589793 / 2, [1, 0, 0]))

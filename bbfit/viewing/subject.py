@@ -17,7 +17,7 @@ from bbfit.files import read_json
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import corners, shown_bounds
 from bbfit.layout import REQUEST_FILE
-from bbfit.records import RECORD_FILE
+from bbfit.stages.stage import RECORD_FILE
 from bbfit.viewing.levels import Level
 from bbfit.viewing.originals import MOST_BYTES, Original, find_original
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from bbfit.blender import sources, views_folder
+from bbfit.blender import views_folder
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.sources import check_tree, fingerprint
 from bbfit.blender.views_folder import render_views
 from bbfit.checks import InputError, MissingFileError
+from bbfit.tree_files.tree_file import UP_AXES, TreeFile
 
 from .conftest import FORMATS, SMALL, run_in_blender
 
@@ -70,9 +70,9 @@ RIGHT = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
         ("tree", b"no ending", "unknown format"),
         ("short.glb", glb(triangle(RIGHT), RIGHT.tobytes())[:-10], "is cut short"),
         ("stub.glb", b"glTF", "is cut short"),
-        ("text.gltf", b"no glTF at all", "is no glTF"),
-        ("list.gltf", b"[1, 2]", "is no glTF"),
-        ("latin.gltf", b'{"asset": "\xff"}', "is no glTF"),
+        ("text.gltf", b"no glTF at all", "is not a glTF"),
+        ("list.gltf", b"[1, 2]", "is not a glTF"),
+        ("latin.gltf", b'{"asset": "\xff"}', "is not a glTF"),
     ],
 )
 def test_files_refused_at_a_glance(tmp_path: Path, name: str, content: bytes, said: str) -> None:
@@ -91,7 +91,7 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 def test_garbage_is_told(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"garbage{ending}"
     path.write_bytes(b"this is no tree\n" * 20)
-    refused(path, "cannot be read as|has no faces|is no glTF")
+    refused(path, "cannot be read as|has no faces|is not a glTF")
 
 
 @pytest.mark.parametrize("ending", [".glb", ".gltf", ".ply", ".stl", ".fbx", ".usdc", ".usdz", ".blend"])
@@ -99,7 +99,7 @@ def test_a_file_cut_in_half_is_told(things: Path, tmp_path: Path, ending: str) -
     path = tmp_path / f"half{ending}"
     data = (things / f"thing{ending}").read_bytes()
     path.write_bytes(data[: len(data) // 2])
-    refused(path, "cannot be read as|has no faces|is cut short|is no glTF|crashed while reading")
+    refused(path, "cannot be read as|has no faces|is cut short|is not a glTF|crashed while reading")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -185,29 +185,44 @@ def test_gltf_references_inside_the_folder(tmp_path: Path) -> None:
     tree = tmp_path / "tree.gltf"
     tree.write_text(json.dumps(triangle(RIGHT, uri="my%20parts/tree.bin")))
     with pytest.raises(MissingFileError, match=r"refers to my%20parts/tree\.bin, which does not exist"):
-        check_tree(tree)
+        TreeFile.open(tree)
     binary.write_bytes(RIGHT.tobytes())
-    assert check_tree(tree) == [tree, binary]
-    before = fingerprint(check_tree(tree))
+    before = TreeFile.open(tree)
+    assert before.files == (tree, binary) and before.bytes == tree.stat().st_size + binary.stat().st_size
     binary.write_bytes((2 * RIGHT).tobytes())
-    assert fingerprint(check_tree(tree)) != before
+    assert TreeFile.open(tree).digest != before.digest
     tree.write_text(json.dumps(triangle(RIGHT, uri="data:application/octet-stream;base64,AAAA")))
-    assert check_tree(tree) == [tree]
+    assert TreeFile.open(tree).files == (tree,)
     bad = RIGHT.copy()
     bad[0, 0] = np.nan
     binary.write_bytes(bad.tobytes())
     tree.write_text(json.dumps(triangle(RIGHT, uri="my%20parts/tree.bin")))
     with pytest.raises(InputError, match="NaN or infinite"):
-        check_tree(tree)
+        TreeFile.open(tree)
 
 
 def test_materials_of_an_obj_are_part_of_the_tree(things: Path) -> None:
-    files = check_tree(things / "thing.obj")
-    assert [path.suffix for path in files] == [".obj", ".mtl"]
+    assert [path.suffix for path in TreeFile.open(things / "thing.obj").files] == [".obj", ".mtl"]
+
+
+def test_textures_of_an_obj_are_part_of_the_tree(things: Path, tmp_path: Path) -> None:
+    """However a material names them: with options before the name, with spaces in it, below the folder."""
+    tree = tmp_path / "thing.obj"
+    tree.write_text("mtllib my materials.mtl\n" + (things / "thing.obj").read_text())
+    (tmp_path / "my materials.mtl").write_text(
+        "newmtl bark\nmap_Kd -s 1 1 1 bark.png\nnewmtl leaf\nmap_d textures/my leaf.png\nbump none.png\n"
+    )
+    (tmp_path / "textures").mkdir()
+    for name in ("bark.png", "textures/my leaf.png"):
+        (tmp_path / name).write_bytes(b"picture")
+    before = TreeFile.open(tree)
+    assert [path.name for path in before.files] == ["thing.obj", "my materials.mtl", "bark.png", "my leaf.png"]
+    (tmp_path / "textures/my leaf.png").write_bytes(b"another")
+    assert TreeFile.open(tree).digest != before.digest
 
 
 def test_formats_are_the_tested_ones() -> None:
-    assert set(sources.UP_AXIS) == set(FORMATS)
+    assert set(UP_AXES) == set(FORMATS)
 
 
 def test_unusable_panorama_and_device(thing_glb: Path, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from bbfit.blender import processes
 from bbfit.blender.conversion import tree_as_glb
 from bbfit.blender.processes import BlenderError
 from bbfit.checks import InputError, InputTypeError, MissingFileError
-from bbfit.model_files import split_glb
+from bbfit.glb import split_glb
 
 from .conftest import box, run_in_blender, thing
 

@@ -20,8 +20,8 @@ def test_views_are_of_the_tree() -> None:
     views.train.check()
     views.test.check()
     assert (len(views.train), len(views.test)) == (18, 6)
-    assert views.request["complete"] is True
-    assert views.request["tree"]["sha256"] == hashlib.sha256((DATA / "tree.glb").read_bytes()).hexdigest()
+    assert views.request is not None and views.request.complete
+    assert views.request.tree.sha256 == hashlib.sha256((DATA / "tree.glb").read_bytes()).hexdigest()
     assert sum(path.stat().st_size for path in DATA.rglob("*") if path.is_file()) < 3_000_000
 
 

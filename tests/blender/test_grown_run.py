@@ -18,9 +18,9 @@ from bbfit.trees.tree_file import write_tree
 
 CONFIG = RunConfig(
     species="acer",
-    grow=GrowConfig(seed=3, detail=0.3, leaves=0.1),
+    grow=GrowConfig(seed=3, detail=0.1, leaves=0.02),
     views=ViewsConfig(count=8, size=48, samples=1, denoise=False),
-    fit=FitConfig(billboards=2, candidates=2, refinement_rounds=0, steps=2),
+    fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0, steps=2),
 )
 
 
@@ -30,7 +30,7 @@ def grown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_tree_is_the_one_that_was_asked_for(grown: Path, tmp_path: Path) -> None:
-    scene = grow("acer", seed=3, detail=0.3, leaves=0.1)
+    scene = grow("acer", seed=3, detail=0.1, leaves=0.02)
     write_tree(scene, tmp_path / "tree.glb")
     assert (grown / "tree.glb").read_bytes() == (tmp_path / "tree.glb").read_bytes()
     record = json.loads((grown / "run.json").read_text())

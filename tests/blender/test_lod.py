@@ -21,13 +21,13 @@ from bbfit.exporting.lod import glb_counts
 from bbfit.files import read_json
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.glb import split_glb
 from bbfit.lod import LodLevel, LodResult, build_lod
-from bbfit.model_files import split_glb
 from bbfit.pipeline import RunConfig
 from bbfit.views import ViewDataset
 
 TREE = Path(__file__).resolve().parents[2] / "data" / "tree.glb"
-SMALL = RunConfig(views=ViewsConfig(count=12, size=64, samples=4), fit=FitConfig(steps=40, candidates=2, refinement_rounds=1, restarts=1))
+SMALL = RunConfig(views=ViewsConfig(count=12, size=64, samples=4), fit=FitConfig(steps=20, candidates=1, refinement_rounds=0, restarts=1))
 LEVELS = LodConfig(planes=(4, 2), error_pixels=0.5)
 
 
@@ -60,7 +60,8 @@ def test_levels_take_over_where_their_error_is_within_the_bound(built: LodResult
     points = trimesh.load(TREE, force="mesh").vertices
     radius, height = np.linalg.norm(np.ptp(points, axis=0)) / 2, np.ptp(points[:, 1])
     # The cameras look at the axis, from as far as they are from it.
-    axis = views.request["camera"]["distance"]
+    assert views.request and views.request.camera
+    axis = views.request.camera["distance"]
     scale = float(views.train.cameras.intrinsics[0, 0, 0]) / axis
     before: LodLevel = built.levels[0]
     assert before.distance_meters == before.error_meters == 0 and before.tree_pixels is None

@@ -11,10 +11,10 @@ import torch
 import trimesh
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.sources import UP_AXIS
 from bbfit.blender.views_folder import render_views
 from bbfit.files import read_json
 from bbfit.images import read_rgba
+from bbfit.tree_files.tree_file import UP_AXES
 from bbfit.views import ViewDataset
 
 from .conftest import FORMATS, SMALL, box, run_in_blender, thing
@@ -80,7 +80,7 @@ def test_every_format_gives_the_same_pictures(things: Path, unbroken: Path, tmp_
     got, expected = pictures(out), pictures(unbroken)
     assert abs(got[..., 3] - expected[..., 3]).max() <= 2
     tree = read_json("views", out / "views.json")["tree"]
-    assert tree["up_axis"] == UP_AXIS[ending]
+    assert tree["up_axis"] == UP_AXES[ending]
     assert tree["faces"] == 36
     np.testing.assert_allclose(tree["bounds"], [[-0.2, 0.0, -0.2], [1.3, 2.0, 0.8]], atol=1e-5)
     if ending != ".stl":

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bbfit.exporting.atlas import Atlas, pack_atlas
+from bbfit.exporting.atlas import pack_atlas
+from bbfit.geometry.cards import Atlas
 
 SIZES = [(20, 13), (9, 31), (1, 1), (64, 40), (16, 16), (3, 90)]
 

@@ -13,16 +13,16 @@ from scipy import ndimage
 from torch import Tensor
 
 from bbfit.checks import InputError
-from bbfit.exporting.atlas import Atlas
-from bbfit.exporting.cards import Card, Cards, cloud_cards
-from bbfit.exporting.drawing import draw_cards, hits, sheets_of
+from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.hulls import with_hulls
 from bbfit.exporting.mip_matching import matched_chain, with_mips
 from bbfit.exporting.mips import mip_chain
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinhole_intrinsics
+from bbfit.geometry.cards import Atlas, Card, Cards
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
+from bbfit.rendering.cards import draw_cards, hits, sheets_of
 from bbfit.rendering.reference import render_reference
 
 KINDS = ("one", "two", "mixed")

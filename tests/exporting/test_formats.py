@@ -17,7 +17,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import as_shipped, export, shipped_cards
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.model_files import joined_glb, split_glb
+from bbfit.glb import joined_glb, split_glb
 
 
 def tree_of(path: Path) -> tuple[dict[str, Any], list[bytes]]:

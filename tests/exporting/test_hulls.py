@@ -14,12 +14,13 @@ from glb_viewer import view_glb
 from numpy.typing import NDArray
 
 from bbfit.checks import InputError
-from bbfit.exporting.cards import Card, Cards, cloud_cards
+from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import overdraw, with_hulls
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
+from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.cloud import BillboardCloud
 
 LEASTS = (0.0, 1 / 255, 0.5, 1.0)

@@ -12,8 +12,9 @@ from scipy import ndimage
 from torch.nn import functional
 
 from bbfit.checks import InputError
-from bbfit.exporting.atlas import Atlas, pack_atlas
+from bbfit.exporting.atlas import pack_atlas
 from bbfit.exporting.mips import coverage, linear_to_srgb, mip_chain, srgb_to_linear
+from bbfit.geometry.cards import Atlas
 
 WHOLE = np.array([[0.0, 0.0], [1.0, 1.0]])
 

@@ -35,7 +35,7 @@ def data_views() -> ViewDataset:
 
 def quick(**fields: object) -> FitConfig:
     """A configuration whose search for a placement is short."""
-    return FitConfig(**{"candidates": 2, "refinement_rounds": 2} | fields)  # type: ignore[arg-type]
+    return FitConfig(**{"candidates": 1, "refinement_rounds": 0} | fields)  # type: ignore[arg-type]
 
 
 class Killed(Exception):

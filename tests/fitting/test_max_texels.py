@@ -35,7 +35,7 @@ def views(views_folder: Path) -> ViewDataset:
 
 
 def config(**fields: object) -> FitConfig:
-    return FitConfig(**{"billboards": 2, "texel_density": 1.5, "candidates": 2, "refinement_rounds": 0, "steps": 8} | fields)  # type: ignore[arg-type]
+    return FitConfig(**{"billboards": 2, "texel_density": 1.5, "candidates": 1, "refinement_rounds": 0, "steps": 8} | fields)  # type: ignore[arg-type]
 
 
 def rectangles(seed: int) -> BillboardCloud:

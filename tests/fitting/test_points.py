@@ -171,7 +171,8 @@ def test_a_damaged_mesh_is_refused(views: ViewSet, tmp_path: Path, spoil: str) -
     path, data = tmp_path / "tree.glb", (DATA / "tree.glb").read_bytes()
     path.write_bytes({"cut short": data[: len(data) // 2], "no glTF at all": bytes(range(256)), "empty": b""}[spoil])
     with pytest.raises(
-        InputError, match=r"^tree: .*tree\.glb " + {"cut short": "is cut short", "no glTF at all": "is no glTF", "empty": "is empty"}[spoil]
+        InputError,
+        match=r"^tree: .*tree\.glb " + {"cut short": "is cut short", "no glTF at all": "is not a glTF", "empty": "is empty"}[spoil],
     ):
         mesh_points(path, views)
 

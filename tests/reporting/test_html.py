@@ -21,13 +21,13 @@ from playwright.sync_api import Frame, Page
 from bbfit.blender.config import ViewsConfig
 from bbfit.evaluation.metrics import psnr
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.drawing import draw_cards
 from bbfit.exporting.model import shipped_cards
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
 from bbfit.pipeline import RunConfig, RunResult, run
+from bbfit.rendering.cards import draw_cards
 from bbfit.reporting.charts import worst_views
 
 # What a folder and a picture may be called.

@@ -1,14 +1,33 @@
-"""Work for tests that other processes can import: it tells that it began, and ends well or not."""
+"""Work for tests that other processes can import: it reports that it began, waits at a gate, and ends well or not."""
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
-import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+_PIPE = "began"
+
+
+@contextmanager
+def watched(marks: Path) -> Iterator[Iterator[tuple[str, int]]]:
+    """Name and process of each task that begins from now on; the iterator blocks until one does."""
+    os.mkfifo(marks / _PIPE)
+    with os.fdopen(os.open(marks / _PIPE, os.O_RDWR)) as pipe:
+        yield ((name, int(process)) for name, process in map(str.split, iter(pipe.readline, "")))
+
+
+@contextmanager
+def closed(gate: Path) -> Iterator[None]:
+    """Tasks wait at the gate within this block."""
+    with gate.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def begun(marks: Path) -> list[str]:
@@ -18,13 +37,17 @@ def begun(marks: Path) -> list[str]:
 
 def mark(marks: str, name: str) -> None:
     Path(marks, f"{name} {uuid.uuid4()}").touch()
+    if (pipe := Path(marks, _PIPE)).exists():
+        with pipe.open("w") as file:
+            file.write(f"{name} {os.getpid()}\n")
 
 
 def copy(inputs: Mapping[str, Path], folder: Path, marks: str, name: str, gate: str = "") -> dict[str, Any]:
-    """Put together what the inputs hold, when the file ``gate`` is there."""
+    """Put together what the inputs hold, once the gate is open."""
     mark(marks, name)
-    while gate and not Path(gate).exists():
-        time.sleep(0.02)
+    if gate:
+        with Path(gate).open() as file:
+            fcntl.flock(file, fcntl.LOCK_SH)
     folder.mkdir(parents=True, exist_ok=True)
     texts = []
     for key in sorted(inputs):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import select
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import sweep_works
@@ -70,12 +71,11 @@ def test_a_process_that_dies_costs_its_own_task_only(tmp_path: Path) -> None:
 def test_tasks_that_want_a_machine_to_themselves_run_alone(tmp_path: Path) -> None:
     """The one behind it begins when it has ended."""
     marks, gate = str(tmp_path), tmp_path / "gate"
-    with LocalWorkers(2) as workers:
-        workers.submit(task("first", sweep_works.copy, tmp_path / "first", marks, "first", str(gate), alone=True))
-        workers.submit(task("second", sweep_works.copy, tmp_path / "second", marks, "second"))
-        time.sleep(0.5)
-        assert sweep_works.begun(tmp_path) in ([], ["first"])
-        gate.touch()
+    with LocalWorkers(2) as workers, sweep_works.watched(tmp_path) as began:
+        with sweep_works.closed(gate):
+            workers.submit(task("first", sweep_works.copy, tmp_path / "first", marks, "first", str(gate), alone=True))
+            workers.submit(task("second", sweep_works.copy, tmp_path / "second", marks, "second"))
+            assert next(began)[0] == "first" and sweep_works.begun(tmp_path) == ["first"]
         ended, _ = workers.next()
         assert ended.name == "first" and sweep_works.begun(tmp_path) == ["first"]
         assert workers.next()[0].name == "second"
@@ -91,29 +91,23 @@ from bbfit.sweep.local import LocalWorkers
 from bbfit.sweep.tasks import Task
 if __name__ == "__main__":
     with LocalWorkers(1) as workers:
-        workers.submit(Task("nap", sweep_works.copy, {{}}, Path({str(tmp_path)!r}), ({str(tmp_path)!r}, "nap", "never")))
-        print(workers._workers[0].process.pid, flush=True)
+        workers.submit(Task("nap", sweep_works.copy, {{}}, Path({str(tmp_path)!r}), ({str(tmp_path)!r}, "nap", {str(tmp_path / "gate")!r})))
         workers.next()
 """
     (tmp_path / "parent.py").write_text(script)
-    parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py")], stdout=subprocess.PIPE, text=True)
-    assert parent.stdout
-    child = int(parent.stdout.readline())
-    while not sweep_works.begun(tmp_path):
-        time.sleep(0.05)
-    parent.send_signal(signal.SIGKILL)
-    parent.wait()
-    parent.stdout.close()
-    deadline = time.monotonic() + 20
-    while Path(f"/proc/{child}/status").exists() and "zombie" not in Path(f"/proc/{child}/status").read_text():
-        assert time.monotonic() < deadline, f"{child} still runs"
-        time.sleep(0.05)
+    with sweep_works.watched(tmp_path) as began, sweep_works.closed(tmp_path / "gate"):
+        with subprocess.Popen([sys.executable, str(tmp_path / "parent.py")]) as parent:
+            _, child = next(began)
+            process = os.pidfd_open(child)
+            parent.send_signal(signal.SIGKILL)
+        select.select([process], [], [])  # until it has ended
+        os.close(process)
 
 
 def test_leaving_ends_what_still_runs(tmp_path: Path) -> None:
-    with LocalWorkers(1) as workers:
-        workers.submit(task("nap", sweep_works.copy, tmp_path / "nap", str(tmp_path), "nap", "never"))
-        (process,) = [worker.process for worker in workers._workers]
-        while not sweep_works.begun(tmp_path):
-            time.sleep(0.05)
-    assert not process.is_alive()
+    with sweep_works.watched(tmp_path) as began, sweep_works.closed(tmp_path / "gate"):
+        with LocalWorkers(1) as workers:
+            workers.submit(task("nap", sweep_works.copy, tmp_path / "nap", str(tmp_path), "nap", str(tmp_path / "gate")))
+            _, child = next(began)
+            assert Path(f"/proc/{child}").exists()
+        assert not Path(f"/proc/{child}").exists()

@@ -145,7 +145,7 @@ def test_failures_are_recorded_and_retried_when_asked(two_trees: list[Path], tmp
     stages = RunConfig(fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0, steps=8))
     result = run_sweep(tmp_path / "out", config, stages, trees=[bad], views=[broken, two_trees[0]])
     reasons = [row.reason for row in result.rows]
-    assert "bad.glb is no glTF" in str(reasons[0])
+    assert "bad.glb is not a glTF" in str(reasons[0])
     assert "0001.png" in str(reasons[1]) and reasons[2] is None
     text = (result.folder / "table.md").read_text()
     assert "1 of 3 runs done" in text and f"bad, its one run: {reasons[0]}" in text

@@ -14,13 +14,13 @@ from three_viewer import ThreeViewer
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import evaluate, held_out
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.drawing import draw_cards
 from bbfit.exporting.lod import LodLevel, lod_glb
 from bbfit.exporting.model import as_shipped, export, shipped_cards
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import fit
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
+from bbfit.rendering.cards import draw_cards
 from bbfit.rendering.dispatch import render
 from bbfit.views import ViewDataset
 

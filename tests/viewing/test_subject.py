@@ -15,6 +15,7 @@ import trimesh
 from bbfit.checks import InputError, MissingFileError
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import corners
+from bbfit.glb import joined_glb, split_glb
 from bbfit.viewing.originals import find_original
 from bbfit.viewing.subject import open_run, outlines
 
@@ -157,13 +158,9 @@ def test_other_meshes_are_converted_and_stand_upright(tmp_path: Path) -> None:
 
 def test_what_the_page_cannot_unpack_is_refused(tmp_path: Path) -> None:
     glb = (DATA / "tree.glb").read_bytes()
-    length = int.from_bytes(glb[12:16], "little")
-    tree = json.loads(glb[20 : 20 + length]) | {"extensionsUsed": ["KHR_draco_mesh_compression"]}
-    text = json.dumps(tree | {"extensionsRequired": ["KHR_draco_mesh_compression"]}).encode()
-    text += b" " * (-len(text) % 4)
-    rest = glb[20 + length :]
-    head = b"glTF" + (2).to_bytes(4, "little") + (20 + len(text) + len(rest)).to_bytes(4, "little")
-    (tmp_path / "packed.glb").write_bytes(head + len(text).to_bytes(4, "little") + b"JSON" + text + rest)
+    tree, views = split_glb(glb)
+    tree |= {"extensionsUsed": ["KHR_draco_mesh_compression"], "extensionsRequired": ["KHR_draco_mesh_compression"]}
+    (tmp_path / "packed.glb").write_bytes(joined_glb(tree, views))
     assert "KHR_draco_mesh_compression" in find_original([tmp_path / "packed.glb"]).note
 
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bbfit.checks import fail
-from bbfit.exporting.cards import Card, Cards
-from bbfit.exporting.hulls import area, sides
 from bbfit.geometry.camera import Camera
+from bbfit.geometry.cards import Card, Cards
+from bbfit.geometry.polygons import area, sides
 from bbfit.rendering.compositing import composite, opacity, thresholds
 from bbfit.rendering.reference import EDGE_ON
 

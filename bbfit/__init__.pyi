@@ -1,0 +1,35 @@
+"""The public names of bbfit and where they come from; __init__.py reads this file to import a name when it is first used."""
+
+from .blender.config import ViewsConfig as ViewsConfig
+from .blender.views_folder import render_views as render_views
+from .budget.choice import choose as choose
+from .budget.config import BudgetConfig as BudgetConfig
+from .checks import InputError as InputError
+from .comparison import compare as compare
+from .evaluation.report import Report as Report
+from .evaluation.scoring import evaluate as evaluate
+from .exporting.config import ExportConfig as ExportConfig
+from .exporting.config import LodConfig as LodConfig
+from .exporting.model import export as export
+from .fitting.config import FitConfig as FitConfig
+from .fitting.loop import FitResult as FitResult
+from .fitting.loop import fit as fit
+from .geometry.camera import Camera as Camera
+from .geometry.cloud import BillboardCloud as BillboardCloud
+from .geometry.orbit import Orbit as Orbit
+from .lod import build_lod as build_lod
+from .pipeline import RunConfig as RunConfig
+from .pipeline import run as run
+from .rendering.dispatch import render as render
+from .rivals.config import CompareConfig as CompareConfig
+from .sweep.config import SweepConfig as SweepConfig
+from .sweep.scheduling import run_sweep as run_sweep
+from .trees.config import GrowConfig as GrowConfig
+from .trees.growth import grow as grow
+from .trees.species import Species as Species
+from .trees.species import load_species as load_species
+from .trees.tree_file import write_tree as write_tree
+from .viewing.opening import view as view
+from .views import ViewDataset as ViewDataset
+
+__version__: str

@@ -1,0 +1,145 @@
+"""What was asked of Blender for a folder of pictures, and what it found of the tree: the files ``views.json`` and ``pictures.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from bbfit.blender.config import ViewsConfig
+from bbfit.checks import check_file, fail
+from bbfit.files import read_json, write_json
+from bbfit.provenance import VERSIONS, identity
+from bbfit.tree_files.tree_file import TreeFile
+
+
+@dataclass(frozen=True)
+class RenderedTree:
+    """The tree that pictures show; ``None`` where a fact is not known."""
+
+    name: str | None = None
+    """Name of its file."""
+    sha256: str | None = None
+    """Digest of the tree (:class:`~bbfit.tree_files.tree_file.TreeFile`)."""
+    bytes: int | None = None
+    """Size of all of its files."""
+    up_axis: str | None = None
+    """The axis of its file that points up, ``"y"`` or ``"z"``."""
+    vertices: int | None = None
+    """Vertices that Blender counted."""
+    faces: int | None = None
+    """Triangles that Blender counted."""
+    bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    """Lowest and highest corner of its bounding box in meters, Y up."""
+
+
+@dataclass(frozen=True)
+class ViewsRequest:
+    """A request to render pictures of a tree, and what is known of its outcome."""
+
+    config: Mapping[str, Any]
+    """The :func:`~bbfit.provenance.identity` of the :class:`~bbfit.blender.config.ViewsConfig`."""
+    tree: RenderedTree
+    """The tree."""
+    version: int = VERSIONS["views"]
+    """Version of the rendering."""
+    bbfit: str | None = None
+    """Version of bbfit."""
+    blender: str | None = None
+    """Version of Blender."""
+    camera: Mapping[str, Any] | None = None
+    """Views on rings: ``target``, the point in meters that all cameras look at, and ``distance``, theirs from it in meters."""
+    cameras: Mapping[str, Any] | None = None
+    """Pictures by cameras that were given one by one: those cameras."""
+    clips: list[list[float]] | None = None
+    """Their clip distances in meters, if there are any."""
+    seconds: float = 0.0
+    """Time spent rendering, over all attempts."""
+    complete: bool = False
+    """Whether all pictures were rendered."""
+
+    @staticmethod
+    def of(tree: TreeFile, config: ViewsConfig) -> ViewsRequest:
+        """The request for views of a tree, before anything is rendered.
+
+        Raises
+        ------
+        MissingFileError
+            If the panorama of the configuration does not exist.
+        """
+        if config.hdri is not None:
+            check_file("hdri", config.hdri)
+        known = RenderedTree(tree.path.name, tree.digest, tree.bytes, tree.up_axis)
+        return ViewsRequest(identity(config), known, bbfit=_version())
+
+    @staticmethod
+    def load(path: Path) -> ViewsRequest | None:
+        """Read a request; ``None`` if the file was not written by bbfit. Facts of another type than expected count as unknown.
+
+        Raises
+        ------
+        InputError
+            If the file is not valid JSON.
+        """
+        content = read_json("views", path)
+        if not isinstance(content, dict) or not isinstance(content.get("tree"), dict):
+            return None
+        kinds = {"name": str, "sha256": str, "bytes": int, "up_axis": str, "vertices": int, "faces": int, "bounds": list}
+        facts: dict[str, Any] = {name: value for name, kind in kinds.items() if isinstance(value := content["tree"].get(name), kind)}
+        types = {"version": int, "bbfit": str, "blender": str, "camera": dict, "cameras": dict, "clips": list, "complete": bool}
+        known: dict[str, Any] = {name: value for name, kind in types.items() if isinstance(value := content.get(name), kind)}
+        config = content.get("config")
+        seconds = content.get("seconds")
+        return ViewsRequest(
+            identity(config) if isinstance(config, dict) else {},
+            RenderedTree(**facts),
+            **known,
+            seconds=float(seconds) if isinstance(seconds, int | float) else 0.0,
+        )
+
+    def save(self, path: Path) -> None:
+        """Write the request, without what is not known."""
+        content = {name: value for name, value in asdict(self).items() if value is not None}
+        content["tree"] = {name: value for name, value in content["tree"].items() if value is not None}
+        write_json(path, content)
+
+    def check_same(self, folder: Path, file: str) -> ViewsRequest | None:
+        """The earlier request in ``folder``, which must be for the same pictures; ``None`` if there is none.
+
+        Raises
+        ------
+        InputError
+            If ``folder`` holds pictures of another request; the message names the first difference.
+        """
+        path, hint = folder / file, f"choose another output folder, or remove {folder} to render again"
+        if not path.is_file():
+            return None
+        earlier = ViewsRequest.load(path)
+        if earlier is None or not earlier.config:
+            fail("out", f"{path} was not written by bbfit", hint)
+        for name, value in self.config.items():
+            before = earlier.config.get(name)
+            if before != value:
+                fail("out", f"{folder} holds pictures with {name} {_shown(before)}, not {_shown(value)}", hint)
+        if earlier.tree.sha256 != self.tree.sha256:
+            other = "another tree," if earlier.tree.name != self.tree.name else "an earlier version of"
+            fail("out", f"{folder} holds pictures of {other} {earlier.tree.name}", hint)
+        for name in ("version", "cameras", "clips"):
+            if getattr(earlier, name) != getattr(self, name):
+                fail("out", f"{folder} holds pictures with other {name}", hint)
+        return earlier
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, dict):
+        return str(value.get("name"))
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _version() -> str:
+    try:
+        return version("bbfit")
+    except PackageNotFoundError:  # run from a source folder that is not installed
+        return "unknown"

@@ -1,0 +1,81 @@
+"""Cards: flat textured polygons with one atlas, which is what model files hold of a cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bbfit.geometry.alpha import AlphaMode
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """R textures side by side in one picture, texel for texel."""
+
+    image: NDArray[np.uint8]
+    """Straight-alpha RGBA, [H, W, 4]; both sides are multiples of 4."""
+    corners: NDArray[np.int64]
+    """Column and row of the top-left texel of each texture, [R, 2]."""
+    sizes: NDArray[np.int64]
+    """Width and height of each texture in texels, [R, 2]."""
+
+    @property
+    def used(self) -> float:
+        """Share of the picture that textures cover, in (0, 1]; the rest is padding and gaps."""
+        height, width = self.image.shape[:2]
+        return float(self.sizes.prod(-1).sum() / (height * width))
+
+
+@dataclass(frozen=True)
+class Card:
+    """A flat convex polygon that shows a part of one texture of the atlas, or all of it."""
+
+    corners: NDArray[np.float64]
+    """K >= 3 points in meters, counter-clockwise as seen from where the normal points, [K, 3]."""
+    uvs: NDArray[np.float64]
+    """Texture coordinates with (0, 0) at the atlas's top-left corner and (1, 1) at its bottom-right corner, [K, 2]."""
+    normal: NDArray[np.float64]
+    """Unit normal, [3]."""
+    culled: bool
+    """Whether only the side that the normal points to is shown; otherwise both sides show the same."""
+    rectangle: int
+    """Which texture of the atlas it shows."""
+    origin: NDArray[np.float64] | None = None
+    """Point in meters by which programs that sort what is transparent are to sort it, [3]; it then gets a node of its own."""
+
+    @property
+    def triangles(self) -> NDArray[np.int64]:
+        """A fan of triangles that wind like the polygon, [K - 2, 3]."""
+        middle = np.arange(1, len(self.corners) - 1)
+        return np.stack([np.zeros_like(middle), middle, middle + 1], -1)
+
+
+@dataclass(frozen=True)
+class Cards:
+    """A cloud's cards and their textures."""
+
+    cards: tuple[Card, ...]
+    """Q >= 1 of them."""
+    atlas: Atlas
+    """The textures: per billboard the front, then the back if there is one."""
+    alpha: AlphaMode = field(default_factory=AlphaMode)
+    """What their alpha means."""
+    chain: tuple[NDArray[np.uint8], ...] | None = None
+    """Mip levels that files of them bring, straight RGBA, level 0 first and down to 1 x 1 texel; without any, level 0 is filtered
+    bilinearly at every distance."""
+
+    @property
+    def vertex_count(self) -> int:
+        """Vertices of all cards, with the two that center the bounds of each that has an origin."""
+        return sum(len(card.corners) + 2 * (card.origin is not None) for card in self.cards)
+
+    @property
+    def visible_alpha(self) -> float:
+        """The least alpha that is visible: the cutoff of mask, and 0 for the other modes, which show any alpha above 0."""
+        return self.alpha.cutoff if self.alpha.kind == "mask" else 0.0
+
+    def with_cards(self, cards: list[Card]) -> Cards:
+        """Other cards of the same textures."""
+        return replace(self, cards=tuple(cards))

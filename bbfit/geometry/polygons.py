@@ -1,0 +1,36 @@
+"""Convex polygons in the plane, arrays of their corners."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def sides(polygon: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Unit normals n, [K, 2], and offsets d, [K], of a convex polygon's sides: inside is n . p <= d. Either winding will do."""
+    along = np.roll(polygon, -1, 0) - polygon
+    length = np.linalg.norm(along, axis=-1)
+    kept = length > 1e-12 * length.max()  # a doubled corner has no side
+    normals = np.stack([along[:, 1], -along[:, 0]], -1)[kept] / length[kept, None]
+    normals = normals if area(polygon) > 0 else -normals
+    return normals, (normals * polygon[kept]).sum(-1)
+
+
+def area(polygon: NDArray[np.float64]) -> float:
+    """Signed area, positive where x turns to y, [K, 2] ->."""
+    x, y = (polygon - polygon[0]).T
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+
+
+def kept_half(polygon: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The part of a convex polygon, [K, D], where a height, given at the corners, is not positive, [L, D].
+
+    One side of a clip after Sutherland and Hodgman (1974, "Reentrant polygon clipping").
+    """
+    made = []
+    for here, there, low, high in zip(polygon, np.roll(polygon, -1, 0), heights, np.roll(heights, -1), strict=True):
+        if low <= 0:
+            made.append(here)
+        if (low < 0 < high) or (high < 0 < low):
+            made.append(here + (there - here) * (low / (low - high)))
+    return np.array(made).reshape(-1, polygon.shape[1])

@@ -1,0 +1,115 @@
+"""The stages from views to fitted billboards: the choice within a budget, and the fit."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from dataclasses import asdict, fields
+from pathlib import Path
+
+from bbfit.budget.choice import Trial, choose, within_bytes
+from bbfit.budget.config import BudgetConfig
+from bbfit.checks import InputError
+from bbfit.exporting.config import ExportConfig
+from bbfit.files import read_json, write_bytes, write_json
+from bbfit.fitting.config import FitConfig, ResolvedFit
+from bbfit.fitting.loop import Step, fit, fit_inputs
+from bbfit.reporting.plots import Cost, loss_plot, pareto_plot
+from bbfit.stages.stage import OnProgress, Stage
+from bbfit.tree_files.tree_file import TreeFile
+from bbfit.views import ViewDataset
+
+
+def budget_stage(
+    folder: Path, views: ViewDataset, tree: TreeFile | None, fit_config: FitConfig, budget: BudgetConfig, export: ExportConfig
+) -> Stage:
+    """Choose a configuration for a budget. ``pareto.json`` keeps every finished trial, so that none is done twice."""
+    path = folder / "pareto.json"
+    inputs = (*fit_inputs(views, fit_config, tree), budget, export)
+
+    def work(on_progress: OnProgress) -> None:
+        def on_trial(trials: list[Trial], total: int) -> None:
+            write_json(path, {"inputs": stage.key, "trials": [asdict(trial) for trial in trials]})
+            last = trials[-1]
+            on_progress("budget", len(trials), max(total, len(trials)), f"{last.vertices} vertices {last.psnr:.2f} dB")
+
+        on_progress("budget", 0, 1)
+        known = _known_trials(path, stage.key)
+        choice = choose(views, fit_config, budget, tree=tree, export=export, known=known, on_trial=on_trial)
+        limits = {name: value for name, value in asdict(budget).items() if value}
+        write_json(path, {"inputs": stage.key, "budget": limits, "config": asdict(choice.config), **choice.to_json()})
+        cost: Cost = "bytes" if budget.bytes else "texels" if budget.texels else "vertices"
+        pareto_plot(choice, path.with_suffix(".png"), cost=cost)
+
+    stage = Stage("budget", inputs, (path.name, "pareto.png"), work)
+    return stage
+
+
+def read_choice(folder: Path) -> tuple[ResolvedFit, bool]:
+    """The configuration that a finished budget stage chose, and whether it met the target PSNR, if there was one."""
+    content = read_json("budget", folder / "pareto.json")
+    return ResolvedFit(**content["config"]), content["met"]
+
+
+def fit_stage(
+    folder: Path,
+    views: ViewDataset,
+    tree: TreeFile | None,
+    config: FitConfig,
+    limit: tuple[int, ExportConfig] | None = None,
+    on_step: Callable[[Step], None] | None = None,
+) -> Stage:
+    """Fit billboards and write ``cloud.safetensors``, ``loss.csv`` and ``loss.png``. An interrupted fit continues from its checkpoint.
+
+    Parameters
+    ----------
+    limit
+        The largest size of the model in bytes, and how it will be exported.
+    on_step
+        Called after every step of the fit.
+    """
+    config = config.resolve()
+    checkpoint = folder / "fit.checkpoint"
+
+    def work(on_progress: OnProgress) -> float:
+        def after(step: Step) -> None:
+            on_progress("fit", step.index, step.total, f"loss {step.loss:.5f}")
+            if on_step is not None:
+                on_step(step)
+
+        def on_place(done: int, total: int) -> None:
+            on_progress("place", done, total)
+
+        result = fit(views, config, tree=tree, checkpoint=checkpoint, on_step=after, on_place=on_place)
+        cloud = result.cloud if limit is None else within_bytes(result.cloud, *limit)
+        cloud.save(folder / "cloud.safetensors")
+        write_bytes(folder / "loss.csv", _loss_table(result.losses))
+        loss_plot(result.losses, folder / "loss.png")
+        return result.seconds
+
+    return Stage("fit", (*fit_inputs(views, config, tree), limit), ("cloud.safetensors", "loss.csv", "loss.png"), work)
+
+
+def remove_checkpoint(folder: Path) -> None:
+    """Remove the checkpoint of a fit whose result is recorded."""
+    (folder / "fit.checkpoint").unlink(missing_ok=True)
+
+
+def _known_trials(path: Path, key: str) -> list[Trial]:
+    """The trials of an interrupted choice with the same key. A damaged file costs only its trials."""
+    try:
+        content = read_json("budget", path) if path.is_file() else {}
+        names = [entry.name for entry in fields(Trial)]
+        same = isinstance(content, dict) and content.get("inputs") == key
+        return [Trial(**{name: trial[name] for name in names}) for trial in content["trials"]] if same else []
+    except (InputError, KeyError, TypeError):
+        return []
+
+
+def _loss_table(losses: list[float]) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["step", "loss"])
+    writer.writerows(enumerate(losses, 1))
+    return text.getvalue().encode()

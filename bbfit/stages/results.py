@@ -1,0 +1,88 @@
+"""The stages from fitted billboards to what people take away: the models, the score, and the report."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from bbfit.evaluation.report import Report
+from bbfit.evaluation.scoring import OriginalTree, evaluate_model
+from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.gltf import glb_bytes
+from bbfit.exporting.model import ShippedModel
+from bbfit.files import write_bytes
+from bbfit.provenance import digest_file
+from bbfit.reporting.html import RunFacts, report_page
+from bbfit.reporting.plots import comparison_picture
+from bbfit.stages.stage import OnProgress, Stage
+from bbfit.tree_files.tree_file import TreeFile
+from bbfit.views import ViewDataset
+
+
+def export_stage(folder: Path, model: ShippedModel) -> Stage:
+    """Write ``model.glb`` and ``model.obj`` with its material and texture."""
+
+    def work(on_progress: OnProgress) -> None:
+        for step, suffix in enumerate((".glb", ".obj"), 1):
+            model.save(folder / f"model{suffix}")
+            on_progress("export", step, 2)
+
+    names = ("model.glb", "model.obj", "model.mtl", "model.png", *(("model_mip*.png",) if model.config.mip_files else ()))
+    return Stage("export", (model.config, digest_file(folder / "cloud.safetensors")), names, work)
+
+
+def evaluate_stage(folder: Path, model: ShippedModel, views: ViewDataset, tree: TreeFile | None, seconds: Mapping[str, float]) -> Stage:
+    """Score what was exported on the held-out views: ``metrics.json`` and ``comparison.png``. ``seconds`` are those of earlier stages."""
+
+    def work(on_progress: OnProgress) -> None:
+        report = evaluate_model(model, views.test, original=original_tree(views, tree), on_progress=partial(on_progress, "evaluate"))
+        replace(report, seconds={**seconds, **report.seconds}).save(folder / "metrics.json")
+        comparison_picture(model, views.test, folder / "comparison.png")
+
+    results = [digest_file(folder / name) for name in ("cloud.safetensors", "model.glb")]
+    inputs = (results, model.cloud.alpha, views.fingerprint, None if tree is None else tree.digest)
+    return Stage("evaluate", inputs, ("metrics.json", "comparison.png"), work)
+
+
+def report_stage(
+    folder: Path,
+    report: Report,
+    model: ShippedModel,
+    views: ViewDataset,
+    facts: Mapping[str, Any],
+) -> Stage:
+    """Write ``report.html``. ``facts`` are the fields of :class:`~bbfit.reporting.html.RunFacts` that the record of the run holds."""
+    pareto = folder / "pareto.png" if any(facts["asked"].get("budget", {}).values()) else None
+
+    def work(on_progress: OnProgress) -> None:
+        on_progress("report", 0, 1)
+        losses = [float(row["loss"]) for row in csv.DictReader((folder / "loss.csv").read_text().splitlines())]
+        picture = pareto.read_bytes() if pareto else None
+        readable = replace(model.config, textures="webp", fallback=False, mip_files=False)  # by browsers
+        known = RunFacts(**facts, losses=losses, pareto=picture, cut_up=bool(model.config.split))
+        page = report_page(report, model, views.test, known, glb_bytes(model.cards, readable))
+        write_bytes(folder / "report.html", page.encode())
+        on_progress("report", 1, 1)
+
+    shown = [folder / name for name in ("cloud.safetensors", "metrics.json", "loss.csv")] + ([pareto] if pareto else [])
+    described = {name: value for name, value in facts.items() if name != "versions"}
+    inputs = ([digest_file(file) for file in shown], described, views.fingerprint)
+    return Stage("report", inputs, ("report.html",), work)
+
+
+def original_tree(views: ViewDataset, tree: TreeFile | None = None) -> OriginalTree:
+    """Vertices and bytes of the tree that views were rendered from: as their request records them, else those of the mesh."""
+    known = views.request.tree if views.request else None
+    if known and (known.vertices or known.bytes):
+        return OriginalTree(known.vertices, known.bytes)
+    return OriginalTree() if tree is None else OriginalTree(tree.vertices, tree.bytes)
+
+
+def export_config(views: ViewDataset, config: ExportConfig) -> ExportConfig:
+    """``config`` with the up axis of the file that the views were rendered from, where that is left open and known."""
+    z_up = config.up == "auto" and views.request is not None and views.request.tree.up_axis == "z"
+    return replace(config, up="z") if z_up else config

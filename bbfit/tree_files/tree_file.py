@@ -1,0 +1,126 @@
+"""A tree as a value: all of its files, one digest over them, and its triangles on demand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from bbfit.checks import check_file, fail
+from bbfit.provenance import digest_files
+from bbfit.tree_files.gltf import read_gltf
+from bbfit.tree_files.obj import obj_files
+from bbfit.tree_files.ply import ply_positions
+
+if TYPE_CHECKING:
+    import trimesh
+
+UpAxis = Literal["y", "z"]
+UP_AXES: dict[str, UpAxis] = {
+    **dict.fromkeys((".glb", ".gltf", ".obj", ".fbx", ".usd", ".usda", ".usdc", ".usdz"), "y"),
+    **dict.fromkeys((".ply", ".stl", ".blend"), "z"),
+}
+"""The formats of trees, and the axis that points up in each. An FBX or a USD can declare another axis, and its importer obeys."""
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
+"""The formats whose triangles can be read without Blender."""
+
+
+@dataclass(frozen=True)
+class TreeFile:
+    """A tree on disk, opened and checked once by :meth:`open`. Two trees with the same digest have the same contents."""
+
+    files: tuple[Path, ...]
+    """All files that belong to the tree: the named file first, then those that it refers to (glTF, OBJ)."""
+    digest: str
+    """SHA-256 over the contents of all files (:func:`bbfit.provenance.digest_files`)."""
+    bytes: int
+    """Size of all files."""
+
+    @staticmethod
+    def open(tree: str | Path | TreeFile) -> TreeFile:
+        """Find the files of a tree, refuse what is known to be unusable, and compute the digest. No geometry is loaded.
+
+        Parameters
+        ----------
+        tree
+            The path of a .glb, .gltf, .obj, .fbx, .usd, .usda, .usdc, .usdz, .ply, .stl or .blend file. A ``TreeFile`` is returned as it
+            is.
+
+        Raises
+        ------
+        MissingFileError, InputError
+            If the file, or one that a glTF refers to, is missing. If the file is empty, of an unknown format, or a damaged glTF. If a
+            glTF refers to a file outside its folder. If a glTF or PLY has vertices that are NaN or infinite, which Blender's importers
+            of these two silently replace by 0.
+        """
+        if isinstance(tree, TreeFile):
+            return tree
+        path = check_file("tree", tree)
+        suffix = path.suffix.lower()
+        if suffix not in UP_AXES:
+            fail("tree", f"{path} has an unknown format", f"expected one of {' '.join(UP_AXES)}")
+        others, positions = list[Path](), list[np.ndarray]()
+        if suffix in (".glb", ".gltf"):
+            others, positions = read_gltf(path)
+        elif suffix == ".obj":
+            others = obj_files(path)
+        elif suffix == ".ply" and (points := ply_positions(path.read_bytes())) is not None:
+            positions = [points]
+        if not all(np.isfinite(points).all() for points in positions):
+            fail("tree", f"{path} has vertices that are NaN or infinite", "export the tree again")
+        files = (path, *others)
+        return TreeFile(files, digest_files(files, path.parent), sum(file.stat().st_size for file in files))
+
+    @property
+    def path(self) -> Path:
+        """The named file."""
+        return self.files[0]
+
+    @property
+    def suffix(self) -> str:
+        """The ending of the named file, in lower case."""
+        return self.path.suffix.lower()
+
+    @property
+    def up_axis(self) -> UpAxis:
+        """The axis of the file that points up."""
+        return UP_AXES[self.suffix]
+
+    @property
+    def is_mesh(self) -> bool:
+        """Whether the triangles can be read without Blender."""
+        return self.suffix in MESH_SUFFIXES
+
+    @cached_property
+    def vertices(self) -> int:
+        """Vertices of the mesh, as :meth:`mesh` has them."""
+        return len(self.mesh().vertices)
+
+    def scene(self) -> trimesh.Scene:
+        """The meshes of the tree with their materials, in the axes and the order of the file, nothing merged.
+
+        Raises
+        ------
+        InputError
+            If only Blender can read the file, or it cannot be read or has no triangles.
+        """
+        import trimesh
+
+        if not self.is_mesh:
+            fail("tree", f"only Blender can read the triangles of {self.path}", f"give one of {' '.join(MESH_SUFFIXES)}, or no tree")
+        try:
+            scene = trimesh.load_scene(self.path, process=False)
+        except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:
+            fail("tree", f"{self.path} cannot be read ({error})", "expected a mesh")
+        for name in [name for name, mesh in scene.geometry.items() if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces)]:
+            scene.delete_geometry(name)  # points, lines, and empty meshes
+        if not scene.geometry or not scene.area > 0:
+            fail("tree", f"{self.path} has no triangles", "expected a mesh")
+        return scene
+
+    def mesh(self) -> trimesh.Trimesh:
+        """All triangles of the tree as one mesh, placed as in the file. Raises the errors of :meth:`scene`."""
+        return self.scene().to_mesh()

@@ -1,0 +1,33 @@
+"""What a sweep on a cluster does without one: files on their way, and an address where nobody listens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from bbfit.checks import InputError
+from bbfit.sweep.cluster import RayWorkers, place_files, read_files
+from bbfit.sweep.config import SweepConfig
+
+
+def test_an_address_without_a_cluster_is_refused() -> None:
+    with (
+        pytest.raises(InputError, match=r"ray: no cluster answers at 127.0.0.1:1 .*; start one with ray start"),
+        RayWorkers(SweepConfig(ray="127.0.0.1:1")),
+    ):
+        pass
+
+
+def test_files_are_read_and_placed_as_they_lie(tmp_path: Path) -> None:
+    """A folder, a single file, and a file with what it refers to."""
+    (tmp_path / "tree" / "more").mkdir(parents=True)
+    (tmp_path / "tree" / "tree.gltf").write_bytes(b"g")
+    (tmp_path / "tree" / "more" / "part.bin").write_bytes(b"b")
+    (tmp_path / "tree" / "other.txt").write_bytes(b"o")
+    tree, part = tmp_path / "tree" / "tree.gltf", tmp_path / "tree" / "more" / "part.bin"
+    assert read_files(tree) == {"tree.gltf": b"g"}
+    assert read_files(tree, part) == {"tree.gltf": b"g", "more/part.bin": b"b"}
+    assert read_files(tmp_path / "tree") == {"more/part.bin": b"b", "other.txt": b"o", "tree.gltf": b"g"}
+    place_files(read_files(tmp_path / "tree"), tmp_path / "copy")
+    assert (tmp_path / "copy" / "more" / "part.bin").read_bytes() == b"b"
