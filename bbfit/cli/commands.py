@@ -12,7 +12,7 @@ import tyro
 from bbfit.blender.config import ViewsConfig
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import fail
-from bbfit.cli.console import out_console, progress, show, show_missed
+from bbfit.cli.console import out_console, progress, show, show_missing_encoder
 from bbfit.cli.viewing import WatchConfig, watched
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.fitting.config import FitConfig
@@ -57,7 +57,7 @@ def run_command(
         with onlooker.progress() as on_progress:
             result = run(tree, out, config, on_progress=on_progress, on_step=onlooker.on_step)
         show(result, thesis=fit.preset == "thesis")
-        show_missed(export)
+        show_missing_encoder(export)
         onlooker.finish()
 
 
@@ -161,7 +161,7 @@ def fit_command(
         with onlooker.progress() as on_progress:
             result = run(views, out, stages, on_progress=on_progress, on_step=onlooker.on_step)
         show(result, thesis=fit.preset == "thesis")
-        show_missed(export)
+        show_missing_encoder(export)
         onlooker.finish()
 
 
@@ -226,7 +226,7 @@ def export_command(
 
     for path in model.export(BillboardCloud.load(cloud), out, export):
         out_console.print(f"{path}  {path.stat().st_size:,} bytes")
-    show_missed(export)
+    show_missing_encoder(export)
 
 
 def lod_command(
@@ -263,7 +263,7 @@ def lod_command(
     with progress() as on_progress:
         result = build_lod(tree, out, lod, RunConfig(views=views, fit=fit, export=export), work=work, on_progress=on_progress)
     out_console.print(lod_table(result.levels))
-    show_missed(export)
+    show_missing_encoder(export)
     out_console.print(
         f"levels of detail in {result.path}, {result.path.stat().st_size:,} bytes; measures in {result.folder}", soft_wrap=True
     )
