@@ -47,6 +47,11 @@ class RunConfig:
     export: ExportConfig = field(default_factory=ExportConfig)
     """Writing the model."""
 
+    def seeded(self, seed: int) -> RunConfig:
+        """The same options with one seed for growing, rendering and fitting."""
+        grow, views, fit = (replace(stage, seed=seed) for stage in (self.grow, self.views, self.fit))
+        return replace(self, grow=grow, views=views, fit=fit)
+
 
 @dataclass(frozen=True)
 class RunResult:
