@@ -29,7 +29,7 @@ from .trees.growth import grow as grow
 from .trees.species import Species as Species
 from .trees.species import load_species as load_species
 from .trees.tree_file import write_tree as write_tree
-from .viewing.opening import view as view
+from .viewing.server import view as view
 from .views import ViewDataset as ViewDataset
 
 __version__: str

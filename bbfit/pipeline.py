@@ -49,8 +49,8 @@ class RunConfig:
 
     def seeded(self, seed: int) -> RunConfig:
         """The same options with one seed for growing, rendering and fitting."""
-        grow, views, fit = (replace(stage, seed=seed) for stage in (self.grow, self.views, self.fit))
-        return replace(self, grow=grow, views=views, fit=fit)
+        views, fit = replace(self.views, seed=seed), replace(self.fit, seed=seed)
+        return replace(self, grow=replace(self.grow, seed=seed), views=views, fit=fit)
 
 
 @dataclass(frozen=True)

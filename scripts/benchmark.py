@@ -44,13 +44,13 @@ import torch
 from torch.nn.functional import interpolate
 
 import bbfit
-from bbfit.fitting.adam import rest_after
 from bbfit.fitting.initialize import random_textures, start_cloud
 from bbfit.fitting.levels import Targets, resize_textures, shrunk_sizes
 from bbfit.fitting.loop import Step
-from bbfit.fitting.steps import FusedStepper, ReferenceStepper, Stepper
+from bbfit.fitting.steps import Stepper
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import write_png
+from bbfit.operators.adam.fused import AdamFused, rest_after
 from bbfit.views import ViewSet
 
 DATA = Path(__file__).resolve().parents[1] / "data"
@@ -148,13 +148,13 @@ def copy_speed(device: torch.device) -> float:
     return 2 * 4 * source.numel() / statistics.median(seconds_of(lambda: target.copy_(source), device) for _ in range(15))
 
 
-def warm(views: ViewSet, config: bbfit.FitConfig, device: torch.device) -> FusedStepper:
+def warm(views: ViewSet, config: bbfit.FitConfig, device: torch.device) -> Stepper:
     """A fused fit some way into its last level, so that what is empty is empty, as in most steps of a fit."""
     start = start_cloud(views, config)
     cloud = random_textures(start, shrunk_sizes(start, 3), 0)
     for halvings in (3, 2, 1, 0):
         cloud = resize_textures(cloud, shrunk_sizes(start, halvings))
-        stepper = FusedStepper(cloud.to(device), Targets.at(views, halvings), config)
+        stepper = Stepper(cloud.to(device), Targets.at(views, halvings), config)
         # The thesis's rate is low and its billboards are large: emptying them takes long, but not at an eighth of the size.
         for index in range(WARM_STEPS[config.preset] >> (3 - halvings)):
             stepper.step([(5 * index) % len(views)], config.learning_rate or 0.0)
@@ -167,7 +167,7 @@ def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torc
     config, targets = config.resolve(), Targets.at(views, 0)
     fused = warm(views, config, device)
     start = start_cloud(views, config).to(device)
-    reference = ReferenceStepper(start.with_texels(fused.texels.clone()), targets, config)
+    reference = Stepper(start.with_texels(fused.texels.clone()), targets, replace(config, backend="reference"))
     reference.step([0], 0.01)
     times: dict[str, list[float]] = {"reference": [], "fused": []}
     batch = config.views_per_step or 1
@@ -195,9 +195,10 @@ def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torc
     }
 
 
-def bytes_of_a_step(stepper: FusedStepper, views: ViewSet, batch: int, rest: int) -> int:
+def bytes_of_a_step(stepper: Stepper, views: ViewSet, batch: int, rest: int) -> int:
     """Bytes that a step must move: targets once, touched texels read and their gradients added for each view, awake blocks updated."""
     state, steps = stepper.state, stepper.steps
+    assert isinstance(state, AdamFused)
     touched = int((state.last == steps).sum()) * 4
     awake = int((steps - state.last <= rest).sum()) * 4
     pixels = views.cameras.width * views.cameras.height
@@ -306,8 +307,8 @@ def keep(clouds: list[tuple[float, BillboardCloud]], begun: float, step: Step) -
 
 def reference_step(views: ViewSet, config: bbfit.FitConfig, steps: int = 50) -> float:
     """Mean seconds of a step by the reference renderer, over ``steps`` steps after two."""
-    config = config.resolve()
-    stepper: Stepper = ReferenceStepper(start_cloud(views, config), Targets.at(views, 0), config)
+    config = replace(config.resolve(), backend="reference")
+    stepper = Stepper(start_cloud(views, config), Targets.at(views, 0), config)
     for index in range(2):
         stepper.step([index % len(views)], 0.01)
     begun = time.perf_counter()

@@ -1,7 +1,7 @@
 """Make the pictures in docs/: python scripts/make_pictures.py [species] [acer] [pages] (needs Blender; pages Chromium and playwright too)
 
 species.png has one view of every species that bbfit grows; acer.png held-out views of an acer, what the thesis preset makes of them, and
-what the default preset does with as many vertices; report.png and view.png the report of a run and its page in ``bbfit view``.
+what the default preset does with as many vertices; report.png and view.png the report of a run and the same run in ``bbfit view``.
 """
 
 from __future__ import annotations
@@ -90,16 +90,16 @@ def draw_pages(run: Path) -> None:
     from playwright.sync_api import sync_playwright
 
     flags = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
-    with sync_playwright() as driver, bbfit.view(run, port=0) as page:
+    with sync_playwright() as driver, bbfit.view(run, port=0) as viewer:
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=flags)
         tab = browser.new_page(viewport={"width": 1180, "height": 1315})
         tab.goto((run / "report.html").resolve().as_uri())
         tab.screenshot(path=DOCS / "report.png")
         tab.close()
         tab = browser.new_page(viewport={"width": 1180, "height": 640})
-        tab.goto(page.url)
-        tab.locator(".mantine-Notification-closeButton").click(timeout=60_000)  # viser's remark on a browser without a graphics card
-        tab.wait_for_timeout(20_000)  # until what is measured is there
+        tab.goto(viewer.url)
+        while not tab.evaluate("Boolean(window.bbfit?.viewer?.idle) && !bbfit.viewer.state.tree.measuring"):
+            tab.wait_for_timeout(100)
         tab.screenshot(path=DOCS / "view.png")
         browser.close()
 

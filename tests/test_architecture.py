@@ -32,6 +32,7 @@ GROUPS = (
     ("tree_files",),
     ("trees", "blender"),
     ("views",),
+    ("operators",),
     ("rendering",),
     ("fitting", "rivals"),
     ("exporting",),
@@ -46,29 +47,30 @@ GROUPS = (
 )
 LEVEL = {name: level for level, group in enumerate(GROUPS) for name in group}
 
+
+def relative(path: Path) -> str:
+    return path.relative_to(PACKAGE).as_posix()
+
+
 # Heavy or optional modules, and the only files that import them.
 ONLY_IN = {
-    "bpy": {"blender/worker.py", "blender/worker_glb.py"},
+    "bpy": {f"blender/{name}.py" for name in ("worker", "worker_scene", "worker_glb")},
     "cv2": {"images.py", "fitting/bounds.py"},
     "xatlas": {"exporting/packing.py"},
     "warp": {
-        *(f"rendering/{name}.py" for name in ("launching", "sampling", "kernels", "fused", "fused_projection")),
-        *(f"fitting/{name}.py" for name in ("adam", "fused_sharpness", "fused_ssim", "ssim_kernels")),
+        "operators/launching.py",
+        "operators/drawing/projector.py",
+        *(relative(path) for name in ("fused", "*kernels") for path in PACKAGE.glob(f"operators/*/{name}.py")),
     },
     "ray": {"sweep/cluster.py"},
     "yaml": {"sweep/grid.py"},
     "jinja2": {"reporting/html.py"},
-    "viser": {"viewing/page.py", "viewing/panel.py", "viewing/planted.py", "viewing/visitor.py"},
     "mitsuba": {"rivals/mesh_rays.py"},
     "drjit": {"rivals/mesh_rays.py"},
     "fast_simplification": {"rivals/decimation.py", "rivals/learned_mesh.py"},
     "DracoPy": {"rivals/draco.py"},
 }
-NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "viser", "jinja2")
-
-
-def relative(path: Path) -> str:
-    return path.relative_to(PACKAGE).as_posix()
+NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "jinja2")
 
 
 def unit(path: Path) -> str:

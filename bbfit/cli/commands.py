@@ -53,12 +53,12 @@ def run_command(
     from bbfit.pipeline import RunConfig, run
 
     config = RunConfig(species=species, grow=grow, views=views, fit=fit, budget=budget, export=export)
-    with watched(page, out, tree, None, fit) as onlooker:
-        with onlooker.progress() as on_progress:
-            result = run(tree, out, config, on_progress=on_progress, on_step=onlooker.on_step)
+    with watched(page, out, tree, None, fit) as display:
+        with display.progress() as on_progress:
+            result = run(tree, out, config, on_progress=on_progress, on_step=display.on_step)
         show(result, thesis=fit.preset == "thesis")
         show_missing_encoder(export)
-        onlooker.finish()
+        display.finish()
 
 
 def grow_command(
@@ -157,12 +157,12 @@ def fit_command(
         fail("views", f"{views} is a file", "give a folder of views; bbfit run takes a tree")
     check_folder("views", views)
     stages = RunConfig(tree=tree, fit=fit, budget=budget, export=export)
-    with watched(page, out, views, tree, fit) as onlooker:
-        with onlooker.progress() as on_progress:
-            result = run(views, out, stages, on_progress=on_progress, on_step=onlooker.on_step)
+    with watched(page, out, views, tree, fit) as display:
+        with display.progress() as on_progress:
+            result = run(views, out, stages, on_progress=on_progress, on_step=display.on_step)
         show(result, thesis=fit.preset == "thesis")
         show_missing_encoder(export)
-        onlooker.finish()
+        display.finish()
 
 
 def evaluate_command(

@@ -12,7 +12,7 @@ from bbfit.images import to_bytes
 
 
 def cloud_cards(cloud: BillboardCloud, padding: int) -> Cards:
-    """Rectangles and atlas that any renderer with bilinear filtering shows as :func:`~bbfit.rendering.reference.render_reference` does.
+    """Rectangles and atlas that any renderer with bilinear filtering shows as :func:`~bbfit.rendering.dispatch.render` does.
 
     A billboard's picture fades to transparent over one texel beyond its outermost texel centers, so half a texel beyond its
     rectangle. Each card is half a texel larger than its rectangle on every side and reaches to the centers of the padding texels

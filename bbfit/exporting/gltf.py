@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.encoders import encode_ktx2, encode_webp
-from bbfit.exporting.splitting import centerd
+from bbfit.exporting.splitting import centered
 from bbfit.geometry.cards import Card, Cards
 from bbfit.glb import joined_glb, split_glb
 from bbfit.images import encode_png
@@ -24,7 +24,7 @@ _EXTENSIONS = {"webp": ("EXT_texture_webp", "image/webp"), "ktx2": ("KHR_texture
 def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
     """A GLB file: one mesh for the cards shown from both sides, one for those culled from behind, and one for each that has an origin.
 
-    A mesh with an origin stands there, and its bounds are centerd on it, by two vertices that no triangle uses: programs sort what is
+    A mesh with an origin stands there, and its bounds are centered on it, by two vertices that no triangle uses: programs sort what is
     blended by the one or the other. Mip levels are asked for only where the file brings its own (``ktx2``): those that programs make
     for themselves lose coverage.
     """
@@ -66,7 +66,7 @@ def _vertices(card: Card) -> tuple[NDArray[np.float64], NDArray[np.float64], NDA
     if card.origin is None:
         points, uvs = card.corners, card.uvs
     else:
-        points = centerd(card) - card.origin
+        points = centered(card) - card.origin
         uvs = np.concatenate([card.uvs, card.uvs[:1].repeat(len(points) - len(card.uvs), 0)])
     return points, uvs, np.tile(card.normal, (len(points), 1))
 

@@ -23,8 +23,8 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Atlas, Cards
 from bbfit.geometry.orbit import Orbit
+from bbfit.operators.drawing.compositing import opacity
 from bbfit.rendering.cards import filtered, hits, joined, sheets_of
-from bbfit.rendering.compositing import opacity
 
 # Pictures in which coverage is counted have so many pixels a side at most.
 _SIDE = 96

@@ -7,15 +7,14 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from bbfit.checks import Count, Range, Seed, check_fields, fail
 from bbfit.geometry.alpha import AlphaKind, Cutoff
+from bbfit.operators.config import Backend, Loss
 from bbfit.provenance import EXECUTION
-from bbfit.rendering.config import Backend
 
 Preset = Literal["default", "thesis"]
 Sides = Literal["one", "two", "pair"]
 Placement = Literal["even", "clusters"]
 Orientation = Literal["any", "upright", "free"]
 Bounds = Literal["viewport", "thesis", "silhouette"]
-Loss = Literal["l1", "l2", "backgrounds"]
 Schedule = Literal["cosine", "growth"]
 _Binarization = Annotated[float, Range(0, 10)]
 _Density = Annotated[float, Range(0, 16, open_low=True)]

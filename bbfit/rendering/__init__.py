@@ -1,1 +1,1 @@
-"""Drawing billboard clouds: one meaning, several speeds."""
+"""Renderers of billboard clouds and of the cards that are exported."""

@@ -19,8 +19,8 @@ from bbfit.checks import fail
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.polygons import area, sides
-from bbfit.rendering.compositing import composite, opacity, thresholds
-from bbfit.rendering.reference import EDGE_ON
+from bbfit.operators.drawing.compositing import composite, opacity, thresholds
+from bbfit.operators.drawing.reference import EDGE_ON
 
 # How far outside a polygon, in shares of the atlas, a pixel's center counts as in it, so that no rounding opens a seam between two.
 _SLACK = 1e-9
@@ -82,8 +82,8 @@ def draw_cards(cards: Cards, camera: Camera) -> Tensor:
     levels are mixed by it (LINEAR_MIPMAP_LINEAR), color and alpha apart, and what comes out is tested or blended. Beyond the atlas its
     outermost texels go on.
 
-    A pixel is shown by a card if its center lies in the polygon. Depth order is that of :func:`~bbfit.rendering.compositing.composite`,
-    pixel by pixel. As in the reference renderer nothing shows of a plane seen edge-on, nor where a ray meets it behind the camera.
+    A pixel shows a card if its center lies in the polygon. Layers are ordered by depth in every pixel, as in
+    :func:`~bbfit.operators.drawing.compositing.composite`. A plane shows nothing edge-on and behind the camera.
 
     Parameters
     ----------

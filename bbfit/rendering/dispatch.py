@@ -8,8 +8,8 @@ from torch import Tensor
 from bbfit.checks import check_choice
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.rendering.config import Backend
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.config import Backend
+from bbfit.operators.drawing.reference import render_reference
 
 
 def render(cloud: BillboardCloud, camera: Camera, *, backend: Backend = "auto") -> Tensor:
@@ -25,11 +25,11 @@ def render(cloud: BillboardCloud, camera: Camera, *, backend: Backend = "auto") 
     Returns
     -------
     Premultiplied RGBA over nothing in [0, 1], [H, W, 4] for one camera and [V, H, W, 4] for a batch, in the cloud's dtype and on its
-    device. See :func:`bbfit.rendering.reference.render_reference` for what it means.
+    device. See :func:`bbfit.operators.drawing.reference.render_reference` for what it means.
     """
     check_choice("backend", backend, ("auto", "reference", "fused"))
     if backend == "reference" or (backend == "auto" and cloud.texels.dtype == torch.float64):
         return render_reference(cloud, camera)
-    from bbfit.rendering.fused import render_fused  # warp takes a while to start
+    from bbfit.operators.drawing.fused import render_fused  # warp takes a while to start
 
     return render_fused(cloud, camera).to(cloud.texels.dtype)

@@ -21,11 +21,11 @@ from bbfit.exporting.encoders import encode_webp
 from bbfit.exporting.model import ShippedModel
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
-from bbfit.glb import joined_glb, split_glb
 from bbfit.images import over_color, to_bytes, unpremultiply
 from bbfit.model_files import generator
 from bbfit.reporting.charts import MEASURES, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
 from bbfit.reporting.plots import magma, spread_views
+from bbfit.reporting.threejs import drawing_script, library_page
 from bbfit.views import ViewSet
 
 # Pictures of this many held-out views are in the page at most, besides the worst ones, and none is wider than so many pixels.
@@ -102,46 +102,16 @@ def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunF
         sizes=Markup(sizes_chart(report.sizes).svg) if report.sizes else None,
         loss=Markup(loss_chart(facts.losses).svg),
         billboards=_billboards(cloud),
-        model=viewer_page(glb, shown_bounds(cloud, spared=0.005).numpy(), layered=layered),
+        library=library_page(),
+        drawing=Markup(drawing_script()),
+        glb=base64.b64encode(glb).decode(),
+        bounds=shown_bounds(cloud, spared=0.005).tolist(),
         layered=layered,
         costs=_costs(report),
         facts=facts,
         changed=_changed(facts),
         pareto=None if facts.pareto is None else _data("image/png", facts.pareto),
     )
-
-
-def viewer_page(glb: bytes, bounds: NDArray[np.float64], *, layered: bool = False) -> str:
-    """A page that shows a GLB, to be turned and zoomed: trimesh's viewer, made to keep upright and to show colors as they are.
-
-    Parameters
-    ----------
-    glb : a Y-up model without lights and cameras, whose pictures browsers read.
-    bounds : lowest and highest corner of what is to be seen at first, in meters, [2, 3].
-    layered : whether what is blended is drawn twice, as it is right but for what is less than half opaque, whatever its order: at first
-        where alpha is at least a half, which then hides what is behind it, and then all that is not hidden.
-    """
-    import trimesh
-    from trimesh.viewer.notebook import scene_to_html
-
-    page = scene_to_html(trimesh.Scene(trimesh.creation.box()))
-    head, mark, rest = page.partition('base64_data="')
-    _, end, tail = rest.partition('"')
-    assert mark and end and "</body>" in tail, "trimesh's viewer has changed"
-    script = (files("bbfit.reporting") / "page" / "model.js").read_text(encoding="utf-8")
-    model = base64.b64encode(_with_camera(glb)).decode()
-    given = f"const bounds = {json.dumps(bounds.tolist())}, layered = {json.dumps(layered)};"
-    script = f"<script>{given}\n{script}</script></body>"
-    return f"{head}{mark}{model}{end}{tail.replace('</body>', script)}"
-
-
-def _with_camera(glb: bytes) -> bytes:
-    """The model with a camera, which trimesh's viewer needs; the script places it."""
-    tree, views = split_glb(glb)
-    tree["cameras"] = [{"type": "perspective", "perspective": {"yfov": float(np.radians(35)), "znear": 1.0}}]
-    tree["nodes"].append({"name": "camera", "camera": 0, "translation": [0.0, 0.0, 1.0]})
-    tree["scenes"][tree.get("scene", 0)]["nodes"].append(len(tree["nodes"]) - 1)
-    return joined_glb(tree, views)
 
 
 def _least_seen(cloud: BillboardCloud) -> float:

@@ -10,18 +10,15 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-# Seconds between two lines of a stage in a log.
-_EVERY = 60.0
-
 
 @contextlib.contextmanager
-def progress_bars(console: Console) -> Iterator[Callable[..., None]]:
+def progress_bars(console: Console, *, every: float = 60.0) -> Iterator[Callable[..., None]]:
     """A bar for each stage, with rate and time left; yields what the work has to tell (:class:`bbfit.stages.stage.OnProgress`).
 
-    What is no terminal, as a log, gets a line when a stage is finished and every minute on the way.
+    What is no terminal, as a log, gets a line when a stage is finished and every ``every`` seconds on the way.
     """
     if not console.is_terminal:
-        yield _lines(console)
+        yield _lines(console, every)
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -46,12 +43,12 @@ def progress_bars(console: Console) -> Iterator[Callable[..., None]]:
         yield tell
 
 
-def _lines(console: Console) -> Callable[..., None]:
+def _lines(console: Console, every: float) -> Callable[..., None]:
     told: dict[str, float] = {}
 
     def tell(stage: str, done: int, total: int, note: str = "") -> None:
         now = time.monotonic()
-        if done == total or now - told.setdefault(stage, now) >= _EVERY:
+        if done == total or now - told.setdefault(stage, now) >= every:
             told[stage] = now
             console.print(f"{stage} {done}/{total} {note}".rstrip(), highlight=False, soft_wrap=True)
 

@@ -72,7 +72,13 @@ class Surface:
 
 
 def boundary_gradient(
-    surface: Surface, points: Tensor, camera: Camera, slope: Tensor, colors: Callable[[Tensor, Tensor], Tensor], random: torch.Generator
+    surface: Surface,
+    points: Tensor,
+    camera: Camera,
+    slope: Tensor,
+    colors: Callable[[Tensor, Tensor], Tensor],
+    random: torch.Generator,
+    density: float = BOUNDARY_SAMPLES,
 ) -> Tensor:
     """Gradient of a loss by what silhouettes cover and uncover as they move: an integral along them, by sampling.
 
@@ -83,6 +89,7 @@ def boundary_gradient(
     slope : derivative of the loss by the premultiplied RGBA of each pixel, [H·W, 4].
     colors : what rays of given origins and directions see, premultiplied RGBA: :meth:`bbfit.rivals.mesh_rays.RayCaster.colors`.
     random : chooses the samples.
+    density : samples per pixel of the view.
 
     Returns
     -------
@@ -94,7 +101,7 @@ def boundary_gradient(
     lengths = along.norm(dim=-1).nan_to_num(0)
     if float(lengths.sum()) == 0:
         return torch.zeros_like(points)
-    count = max(1, round(BOUNDARY_SAMPLES * camera.width * camera.height))
+    count = max(1, round(density * camera.width * camera.height))
     chosen = torch.multinomial(lengths, count, replacement=True, generator=random)
     part = torch.rand(count, 1, generator=random, dtype=torch.float64)
     places = ends[chosen, 0] * (1 - part) + ends[chosen, 1] * part

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from bbfit.budget.config import amount
 from bbfit.checks import Count, Range, check_count, check_fields, fail
-from bbfit.fitting.config import Loss
+from bbfit.operators.config import Loss
 
 
 @dataclass(frozen=True)

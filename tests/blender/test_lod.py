@@ -18,6 +18,7 @@ from bbfit.evaluation.metrics import silhouette_distance
 from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.exporting.lod import glb_counts
+from bbfit.exporting.model import shipped_model
 from bbfit.files import read_json
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
@@ -68,7 +69,10 @@ def test_levels_take_over_where_their_error_is_within_the_bound(built: LodResult
     for level in built.levels[1:]:
         cloud = BillboardCloud.load(built.folder / str(level.planes) / "cloud.safetensors")
         worst = [
-            max(silhouette_distance(*(picture.numpy() for picture in held_out(cloud, split, index))) for index in range(len(split)))
+            max(
+                silhouette_distance(*(picture.numpy() for picture in held_out(shipped_model(cloud).draw, split, index)))
+                for index in range(len(split))
+            )
             for split in (views.train, views.test)
         ]
         assert level.error_meters == pytest.approx(worst[0] / scale, rel=1e-3) and worst[0] > 0

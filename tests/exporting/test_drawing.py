@@ -22,8 +22,8 @@ from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinh
 from bbfit.geometry.cards import Atlas, Card, Cards
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
+from bbfit.operators.drawing.reference import render_reference
 from bbfit.rendering.cards import draw_cards, hits, sheets_of
-from bbfit.rendering.reference import render_reference
 
 KINDS = ("one", "two", "mixed")
 

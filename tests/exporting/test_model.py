@@ -20,7 +20,7 @@ from bbfit.exporting.model import export
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.homography import texel_to_world
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.drawing.reference import render_reference
 
 KINDS = ("one", "two", "mixed")
 

@@ -16,7 +16,7 @@ from bbfit.fitting.levels import Targets, resampled, resize_textures, shrunk_siz
 from bbfit.geometry.camera import Camera, pinhole_intrinsics
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.images import premultiply
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.drawing.reference import render_reference
 from bbfit.views import ViewDataset, ViewSet
 
 

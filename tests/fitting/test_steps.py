@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,15 +12,19 @@ from torch import Tensor
 
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.levels import Targets, resize_textures
-from bbfit.fitting.losses import binarization_loss, image_loss
 from bbfit.fitting.movement import Movement
-from bbfit.fitting.steps import FusedStepper, ReferenceStepper, Stepper, make_stepper
+from bbfit.fitting.steps import Stepper
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.rendering import fused
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.adam.fused import AdamFused
+from bbfit.operators.adam.reference import AdamReference, binarization_loss
+from bbfit.operators.drawing.fused import schedule
+from bbfit.operators.drawing.projection import project
+from bbfit.operators.drawing.reference import render_reference
+from bbfit.operators.image_loss.reference import image_loss_reference
 from bbfit.views import ViewDataset, ViewSet
 
-STEPPERS = pytest.mark.parametrize("kind", [ReferenceStepper, FusedStepper])
+pytestmark = pytest.mark.usefixtures("poison")
+STEPPERS = pytest.mark.parametrize("backend", ["reference", "fused"])
 PLACEMENT = ("centers", "rights", "ups", "half_extents")
 # The default preset's losses at the levels where billboards move.
 DEFAULT = FitConfig(sharpness_weight=0, binarization_weight=0)
@@ -42,6 +45,11 @@ def displaced(known_cloud: BillboardCloud) -> BillboardCloud:
     numbers = 0.2 * torch.rand(2, 8, generator=torch.Generator().manual_seed(3), dtype=torch.float64) - 0.1
     numbers[:, 6:] = 0
     return Movement(known_cloud, REACH).placed(numbers, known_cloud.texels).to(torch.float32)
+
+
+def stepper_of(backend: str, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None) -> Stepper:
+    """A stepper with the operators of a backend."""
+    return Stepper(cloud, targets, replace(config, backend=backend), movement)
 
 
 def chosen(index: int, count: int) -> list[int]:
@@ -84,9 +92,9 @@ def test_both_steppers_move_billboards_alike(displaced: BillboardCloud, views: V
     twentieth of one step. After some dozens of steps the paths may part: what a sample's gradient is jumps from texel to texel.
     """
     targets, moves = Targets.at(views, halvings), []
-    for kind in (ReferenceStepper, FusedStepper):
+    for backend in ("reference", "fused"):
         movement = Movement(displaced, REACH)
-        stepper = kind(displaced, targets, config.resolve(), movement)
+        stepper = stepper_of(backend, displaced, targets, config.resolve(), movement)
         first = advance(stepper, views, range(1), 60)
         begun = movement.parameters.clone()
         losses = torch.stack([loss.double() for loss in first + advance(stepper, views, range(1, 6), 60)])
@@ -104,11 +112,11 @@ def test_both_steppers_move_billboards_alike(displaced: BillboardCloud, views: V
 @STEPPERS
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())
 def test_planted_billboards_are_found_again(
-    known_cloud: BillboardCloud, displaced: BillboardCloud, views: ViewSet, kind: type[Stepper], config: FitConfig
+    known_cloud: BillboardCloud, displaced: BillboardCloud, views: ViewSet, backend: str, config: FitConfig
 ) -> None:
     """From 20 cm at the furthest corner to 1 cm (measured: 0.7 to 1.0); a texel is 7 cm. The textures are right, and may hardly change."""
     before = off(displaced, known_cloud)
-    stepper = kind(displaced, Targets.at(views, 0), config.resolve(), Movement(displaced, REACH))
+    stepper = stepper_of(backend, displaced, Targets.at(views, 0), config.resolve(), Movement(displaced, REACH))
     losses = advance(stepper, views, range(60), 60)
     assert before > 0.15 and off(stepper.cloud, known_cloud) < 0.1 * before
     assert float(losses[-1]) < 0.2 * float(losses[0])
@@ -116,12 +124,10 @@ def test_planted_billboards_are_found_again(
 
 
 @STEPPERS
-def test_billboards_that_stay_do_not_find_it(
-    known_cloud: BillboardCloud, displaced: BillboardCloud, views: ViewSet, kind: type[Stepper]
-) -> None:
+def test_billboards_that_stay_do_not_find_it(known_cloud: BillboardCloud, displaced: BillboardCloud, views: ViewSet, backend: str) -> None:
     """The same steps with a rate of 0: the placement is the start's to the bit, and so is what is kept of it; texels move nevertheless."""
     movement = Movement(displaced, REACH)
-    stepper = kind(displaced, Targets.at(views, 0), FitConfig(preset="thesis").resolve(), movement)
+    stepper = stepper_of(backend, displaced, Targets.at(views, 0), FitConfig(preset="thesis").resolve(), movement)
     advance(stepper, views, range(10), 10, placement_learning_rate=0.0)
     assert not movement.parameters.any() and not stepper.tensors()["movement"].any()
     for name in PLACEMENT:
@@ -132,11 +138,11 @@ def test_billboards_that_stay_do_not_find_it(
 
 @STEPPERS
 @pytest.mark.parametrize("still", [False, True])
-def test_without_a_rate_a_movement_makes_no_difference(displaced: BillboardCloud, views: ViewSet, kind: type[Stepper], still: bool) -> None:
+def test_without_a_rate_a_movement_makes_no_difference(displaced: BillboardCloud, views: ViewSet, backend: str, still: bool) -> None:
     """Neither does a rate without a movement: the texels are the same."""
     config, targets = FitConfig(preset="thesis").resolve(), Targets.at(views, 0)
-    with_movement = kind(displaced, targets, config, Movement(displaced, REACH))
-    without = kind(displaced, targets, config)
+    with_movement = stepper_of(backend, displaced, targets, config, Movement(displaced, REACH))
+    without = stepper_of(backend, displaced, targets, config)
     advance(with_movement, views, range(5), 5, placement_learning_rate=0.0)
     advance(without, views, range(5), 5, placement_learning_rate=0.0 if still else 0.1)
     assert "movement" not in without.tensors()
@@ -146,39 +152,40 @@ def test_without_a_rate_a_movement_makes_no_difference(displaced: BillboardCloud
 
 
 @pytest.mark.parametrize(
-    ("kind", "placement_learning_rate"),
-    [(ReferenceStepper, 0.02), (ReferenceStepper, 0.0), (FusedStepper, 0.02), (FusedStepper, 0.0)],
+    ("backend", "placement_learning_rate"),
+    [("reference", 0.02), ("reference", 0.0), ("fused", 0.02), ("fused", 0.0)],
 )
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS.keys())
-def test_a_step_tells_the_loss_of_the_cloud_where_it_is(
-    displaced: BillboardCloud, views: ViewSet, kind: type[Stepper], placement_learning_rate: float, config: FitConfig
+def test_a_step_returns_the_loss_of_the_cloud_before_the_update(
+    displaced: BillboardCloud, views: ViewSet, backend: str, placement_learning_rate: float, config: FitConfig
 ) -> None:
     """Before the step's update, of billboards that have moved, also in a step that does not move them."""
     config, targets = config.resolve(), Targets.at(views, 0)
-    stepper = kind(displaced, targets, config, Movement(displaced, REACH))
+    stepper = stepper_of(backend, displaced, targets, config, Movement(displaced, REACH))
     advance(stepper, views, range(6), 60)
     cloud, picked = stepper.cloud, chosen(6, len(views))
     weights = [getattr(config, name) or 0.0 for name in ("ssim_weight", "sharpness_weight") if hasattr(config, name)]
     assert config.loss is not None
 
     def loss(cloud: BillboardCloud) -> float:
-        return float(image_loss(render_reference(cloud, targets.cameras[picked]), targets.pictures(picked), config.loss, *weights))
+        image = render_reference(cloud, targets.cameras[picked])
+        return float(image_loss_reference(image, targets.pictures(picked), config.loss, *weights))
 
-    told = float(stepper.step(picked, 1e-3, placement_learning_rate))
-    assert told == pytest.approx(loss(cloud), rel=1e-3)
-    assert abs(loss(displaced) - told) > 0.05 * told  # where it began is another loss
+    reported = float(stepper.step(picked, 1e-3, placement_learning_rate))
+    assert reported == pytest.approx(loss(cloud), rel=1e-3)
+    assert abs(loss(displaced) - reported) > 0.05 * reported  # where it began is another loss
     if not placement_learning_rate:
         assert all(torch.equal(getattr(stepper.cloud, name), getattr(cloud, name)) for name in PLACEMENT)
 
 
 @STEPPERS
 @pytest.mark.parametrize("halvings", [0, 1])
-def test_going_on_from_what_was_kept_is_going_on(displaced: BillboardCloud, views: ViewSet, kind: type[Stepper], halvings: int) -> None:
+def test_going_on_from_what_was_kept_is_going_on(displaced: BillboardCloud, views: ViewSet, backend: str, halvings: int) -> None:
     """To the bit, texels and placement alike."""
     config, targets = FitConfig(preset="thesis", loss="backgrounds", ssim_weight=0.02).resolve(), Targets.at(views, halvings)
 
     def fresh() -> Stepper:
-        return kind(displaced, targets, config, Movement(displaced, REACH))
+        return stepper_of(backend, displaced, targets, config, Movement(displaced, REACH))
 
     whole, first, resumed = fresh(), fresh(), fresh()
     losses = advance(whole, views, range(12), 12, rate=0.05)
@@ -198,9 +205,9 @@ def test_going_on_from_what_was_kept_is_going_on(displaced: BillboardCloud, view
 
 
 @STEPPERS
-def test_a_steppers_cloud_is_a_copy(displaced: BillboardCloud, views: ViewSet, kind: type[Stepper]) -> None:
+def test_a_steppers_cloud_is_a_copy(displaced: BillboardCloud, views: ViewSet, backend: str) -> None:
     start = displaced.texels.clone()
-    stepper = kind(displaced, Targets.at(views, 0), FitConfig(preset="thesis").resolve(), Movement(displaced, REACH))
+    stepper = stepper_of(backend, displaced, Targets.at(views, 0), FitConfig(preset="thesis").resolve(), Movement(displaced, REACH))
     advance(stepper, views, range(2), 60)
     cloud = stepper.cloud
     texels, centers = cloud.texels.clone(), cloud.centers.clone()
@@ -211,11 +218,11 @@ def test_a_steppers_cloud_is_a_copy(displaced: BillboardCloud, views: ViewSet, k
     assert all(getattr(cloud, name).dtype == torch.float32 and not getattr(cloud, name).requires_grad for name in (*PLACEMENT, "texels"))
 
 
-@pytest.mark.parametrize(("backend", "kind"), [("auto", FusedStepper), ("fused", FusedStepper), ("reference", ReferenceStepper)])
-def test_the_backend_chooses_the_stepper(displaced: BillboardCloud, views: ViewSet, backend: str, kind: type[Stepper]) -> None:
+@pytest.mark.parametrize(("backend", "adam"), [("auto", AdamFused), ("fused", AdamFused), ("reference", AdamReference)])
+def test_the_backend_selects_the_operators(displaced: BillboardCloud, views: ViewSet, backend: str, adam: type) -> None:
     config, movement = FitConfig(preset="thesis", backend=backend).resolve(), Movement(displaced, REACH)
-    stepper = make_stepper(displaced, Targets.at(views, 0), config, movement)
-    assert type(stepper) is kind
+    stepper = Stepper(displaced, Targets.at(views, 0), config, movement)
+    assert type(stepper.state) is adam
     stepper.step([0], 1e-3, 0.02)
     assert movement.parameters.any()
 
@@ -264,7 +271,7 @@ def test_clouds_side_by_side_step_as_each_alone(
         several = [several[0], several[2], several[1]]
 
     def fitted(cloud: BillboardCloud, groups: int) -> tuple[BillboardCloud, list[float]]:
-        stepper = make_stepper(cloud, targets, config, Movement(cloud, REACH) if moving else None, groups=groups)
+        stepper = Stepper(cloud, targets, config, Movement(cloud, REACH) if moving else None, groups=groups)
         losses = advance(stepper, views, range(5), 60, rate=0.05)
         return stepper.cloud, [float(loss) for loss in losses]
 
@@ -286,7 +293,7 @@ def test_crispness_is_the_same_side_by_side(several: list[BillboardCloud], views
     for weight in (1.0, 0.0):
         config = FitConfig(preset="thesis", binarization_weight=weight, backend=backend).resolve()
         for joined, groups in (([several[2], several[0], several[1]], 3), ([several[2]], 1)):
-            stepper = make_stepper(BillboardCloud.joined(joined), Targets.at(views, 0), config, groups=groups)
+            stepper = Stepper(BillboardCloud.joined(joined), Targets.at(views, 0), config, groups=groups)
             advance(stepper, views, range(10), 60, rate=0.02)
             clouds.append(of_group(stepper.cloud, 0))
     blends = [float(binarization_loss(cloud.texels)) for cloud in clouds]
@@ -297,7 +304,7 @@ def test_crispness_is_the_same_side_by_side(several: list[BillboardCloud], views
 def test_groups_go_on_from_what_was_kept(several: list[BillboardCloud], views: ViewSet, backend: str) -> None:
     config = FitConfig(preset="thesis", ssim_weight=0.02, backend=backend).resolve()
     joined, targets = BillboardCloud.joined(several), Targets.at(views, 1)
-    whole, first, resumed = (make_stepper(joined, targets, config, Movement(joined, REACH), groups=3) for _ in range(3))
+    whole, first, resumed = (Stepper(joined, targets, config, Movement(joined, REACH), groups=3) for _ in range(3))
     advance(whole, views, range(6), 60, rate=0.05)
     advance(first, views, range(3), 60, rate=0.05)
     resumed.restore({name: tensor.clone() for name, tensor in first.tensors().items()}, 3)
@@ -312,7 +319,7 @@ def test_groups_have_the_same_bytes_with_any_number_of_threads(several: list[Bil
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            stepper = make_stepper(joined, targets, config.resolve(), Movement(joined, REACH), groups=3)
+            stepper = Stepper(joined, targets, config.resolve(), Movement(joined, REACH), groups=3)
             losses = advance(stepper, views, range(4), 60, rate=0.05)
             results.append([*losses, *stepper.tensors().values()])
     finally:
@@ -321,16 +328,7 @@ def test_groups_have_the_same_bytes_with_any_number_of_threads(several: list[Bil
         assert all(torch.equal(ours, first) for ours, first in zip(other, results[0], strict=True))
 
 
-def test_groups_are_differentiated_at_once(several: list[BillboardCloud], views: ViewSet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_groups_are_differentiated_at_once(several: list[BillboardCloud], views: ViewSet) -> None:
     """Every group's four views are a piece for a thread."""
-    launched, original = [], fused.in_parallel
-
-    def watched(launch: Callable[..., None], pieces: Iterable[tuple[int, ...]]) -> None:
-        launched.append(list(pieces))
-        original(launch, launched[-1])
-
-    monkeypatch.setattr(fused, "in_parallel", watched)
-    joined = BillboardCloud.joined(several)
-    stepper = make_stepper(joined, Targets.at(views, 0), FitConfig(preset="thesis").resolve(), Movement(joined, REACH), groups=3)
-    advance(stepper, views, range(1), 60)
-    assert launched == [[(0, 4, 0, 40), (4, 4, 0, 40), (8, 4, 0, 40)]]
+    projection = project(BillboardCloud.joined(several), views.cameras[chosen(0, len(views))]).grouped(3)
+    assert schedule(projection, torch.device("cpu")) == [[(0, 4, 0, 40), (4, 4, 0, 40), (8, 4, 0, 40)]]

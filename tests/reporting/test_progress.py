@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import io
 
-import pytest
 from rich.console import Console
 
-from bbfit.reporting import progress
+from bbfit.reporting.progress import progress_bars
 
 
-def told(console: Console) -> None:
-    with progress.progress_bars(console) as tell:
+def told(console: Console, **options: float) -> None:
+    with progress_bars(console, **options) as tell:
         for stage, count in (("views", 3), ("fit", 2)):
             for done in range(count + 1):
                 tell(stage, done, count, f"note {done}")
 
 
-def test_a_log_gets_a_line_for_each_finished_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_gets_a_line_for_each_finished_stage() -> None:
     text = io.StringIO()
     told(Console(file=text))
     assert text.getvalue() == "views 3/3 note 3\nfit 2/2 note 2\n"
-    monkeypatch.setattr(progress, "_EVERY", 0.0)
-    told(Console(file=text))
+    told(Console(file=text), every=0.0)
     assert len(text.getvalue().splitlines()) == 2 + 4 + 3
 
 

@@ -14,7 +14,7 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera, orthographic_intrinsics
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, read_rgba
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.drawing.reference import render_reference
 from bbfit.rivals.baking import BakeConfig, Slabs, bake, tree_triangles
 
 WHOLE = (-5.0, 5.0)

@@ -223,7 +223,7 @@ def test_trees_have_names_of_their_own(tmp_path: Path) -> None:
     trees = [tmp_path / name / "tree.glb" for name in ("oak", "elm")]
     assert [source.name for source in sources(["acer"], trees, [])] == ["acer", "oak_tree", "elm_tree"]
     assert [source.name for source in sources([], trees[:1], [tmp_path / "elm" / "views"])] == ["tree", "elm"]
-    with pytest.raises(InputError, match=r"two trees are called \w+_oak; rename one, or leave one out"):
+    with pytest.raises(InputError, match=r"two trees are called \w+_oak; rename one, or omit one"):
         sources([], [], [tmp_path / "oak" / "views"] * 2)
     with pytest.raises(InputError, match="two trees are called acer"):
         sources(["acer", "acer"], [], [])
@@ -236,6 +236,6 @@ def test_trees_have_names_of_their_own(tmp_path: Path) -> None:
 def test_budgets_are_refused(tmp_path: Path, two_trees: list[Path]) -> None:
     from bbfit.budget.config import BudgetConfig
 
-    with pytest.raises(InputError, match="budget: a sweep tries what its grid says"):
+    with pytest.raises(InputError, match="budget: a sweep runs the configurations of its grid"):
         run_sweep(tmp_path / "out", QUICK, RunConfig(budget=BudgetConfig(vertices=8)), views=two_trees)
     assert not (tmp_path / "out").exists()

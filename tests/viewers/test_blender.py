@@ -19,7 +19,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import export
 from bbfit.geometry.camera import Camera, orthographic_intrinsics
 from bbfit.images import over_color
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.drawing.reference import render_reference
 
 
 @pytest.mark.parametrize(("alpha", "count"), [("mask", 3), ("blend", 1)])

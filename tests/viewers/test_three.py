@@ -27,7 +27,7 @@ from bbfit.exporting.model import export
 from bbfit.geometry.camera import Camera, orthographic_intrinsics
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png, over_color
-from bbfit.rendering.reference import render_reference
+from bbfit.operators.drawing.reference import render_reference
 
 BILINEAR = 9729
 ALPHA_TEST = 0.5

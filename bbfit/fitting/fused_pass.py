@@ -1,0 +1,88 @@
+"""Loss and gradients of a step by the fused operators: one pass over the pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from bbfit.fitting.config import ResolvedFit
+from bbfit.fitting.levels import Targets
+from bbfit.fitting.movement import Movement
+from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.operators.adam.fused import AdamFused
+from bbfit.operators.drawing.fused import differentiate, draw
+from bbfit.operators.drawing.projection import Projection, project
+from bbfit.operators.drawing.projector import Projector
+from bbfit.operators.image_loss.fused import PixelLoss, add_structure, unpacked
+
+
+class FusedPass:
+    """Differentiates the loss of views in texels and placement; parameters as of :class:`~bbfit.fitting.steps.Stepper`."""
+
+    adam = AdamFused
+
+    def __init__(self, cloud: BillboardCloud, targets: Targets, config: ResolvedFit, movement: Movement | None, groups: int) -> None:
+        self._targets, self._config, self._movement, self._groups = targets, config, movement, groups
+        self._scratch: list[Tensor] | None = None
+        self._fixed = None if movement else project(cloud, targets.cameras.to(cloud.texels.device))
+        self._projector = Projector(cloud, targets.cameras) if movement else None
+
+    def differentiate(self, state: AdamFused, chosen: Sequence[int], alpha: AlphaMode, moves: bool) -> tuple[Tensor, Tensor | None]:
+        """Add the gradient in the texels to ``state.gradient``.
+
+        Parameters
+        ----------
+        state : AdamFused
+            Current texels.
+        chosen : Sequence[int]
+            Indices of the views to compare with.
+        alpha : AlphaMode
+            Alpha mode in which they are drawn.
+        moves : bool
+            Whether to differentiate in the movement's parameters.
+
+        Returns
+        -------
+        tuple[Tensor, Tensor or None]
+            The loss, a scalar, and the gradient in the movement's parameters, [N, 8], if ``moves``.
+        """
+        config, device, movement, projector, groups = self._config, state.texels.device, self._movement, self._projector, self._groups
+        if movement is not None and projector is not None:
+            placement = movement.placement()
+            projection = projector.project(placement, chosen)
+        else:
+            assert self._fixed is not None
+            projection = self._fixed.take(torch.tensor(chosen, device=device))
+        projection = replace(projection, alpha=alpha).grouped(groups)
+        pixels = len(chosen) * projection.width * projection.height
+        target = self._targets.packed(chosen).to(device)
+        if groups > 1:
+            target = target.repeat(groups, 1, 1, 1)
+        loss = PixelLoss(target, self._targets.shrunk is None, config.loss, 1 / pixels)
+        structure, of_image = self._structure(state, projection, loss)
+        sums, of_matrices = differentiate(
+            state.texels, projection, state.gradient, image_gradient=of_image, loss=loss, occupied=state.occupied, placement=moves
+        )
+        assert sums is not None
+        of_parameters = None
+        if of_matrices is not None and movement is not None and projector is not None:
+            of_matrices = of_matrices.unflatten(0, (groups, -1)).transpose(0, 1).flatten(1, 2)
+            of_parameters = movement.pull_back(placement, projector.pull_back(of_matrices).cpu())
+        return sums.sum() / pixels + structure, of_parameters
+
+    def _structure(self, state: AdamFused, projection: Projection, loss: PixelLoss) -> tuple[Tensor | float, Tensor | None]:
+        """The loss in structure and sharpness and its gradient in the picture, [B, H, W, 4], which exists only for a weight above 0."""
+        # Both terms are means over views, but losses of groups are added.
+        weights = [self._groups * weight for weight in (self._config.ssim_weight, self._config.sharpness_weight)]
+        if not any(weights):
+            return 0.0, None
+        # The memory is kept: new pages for a few large pictures in every step would cost as much as drawing.
+        if self._scratch is None or self._scratch[0].shape != loss.target.shape:
+            self._scratch = [torch.empty(loss.target.shape, dtype=torch.float32, device=loss.target.device) for _ in range(3)]
+        image = draw(state.texels, projection, state.occupied, out=self._scratch[0])
+        target = unpacked(loss.target, loss.straight, out=self._scratch[1])
+        return add_structure(image, target, weights[0], weights[1], self._scratch[2]), self._scratch[2]

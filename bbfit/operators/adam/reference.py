@@ -1,0 +1,77 @@
+"""Adam for texels in torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.optim.adam import adam
+
+EPSILON = 1e-8
+
+
+def binarization_loss(texels: Tensor) -> Tensor:
+    """Sum of alpha (1 - alpha) over texels [P, 4]; the derivative is zero where alpha is 0. A scalar."""
+    alpha = texels[:, 3]
+    return torch.where(alpha > 0, alpha * (1 - alpha), 0).sum()
+
+
+@dataclass(frozen=True)
+class AdamReference:
+    """Texels and Adam's moments, all of which :meth:`update` changes in place."""
+
+    texels: Tensor
+    """[P, 4]."""
+    gradient: Tensor
+    """To add to before every update, which clears it, [P, 4]."""
+    first_moment: Tensor
+    """[P, 4]."""
+    second_moment: Tensor
+    """[P, 4]."""
+
+    @staticmethod
+    def padded(texels: Tensor) -> Tensor:
+        """A copy of texels [P, 4] for :meth:`start`."""
+        return texels.detach().clone()
+
+    @staticmethod
+    def start(texels: Tensor) -> AdamReference:
+        """The state before the first step, which takes over the memory of ``texels``, as :meth:`padded` returns them."""
+        return AdamReference(texels, *(torch.zeros_like(texels) for _ in range(3)))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What :meth:`restored` needs to continue; the gradient is zero between steps."""
+        return {"texels": self.texels, "first_moment": self.first_moment, "second_moment": self.second_moment}
+
+    def restored(self, tensors: dict[str, Tensor]) -> AdamReference:
+        """The state that :meth:`tensors` returned."""
+        return replace(self.start(self.texels), **{name: tensor.to(self.texels.device) for name, tensor in tensors.items()})
+
+    def update(self, step: int, rate: float, betas: tuple[float, float], binarization: float = 0.0, alpha_rate: float = 1.0) -> None:
+        """Take a step of Adam (Kingma and Ba 2015, algorithm 1) and clamp texels to [0, 1].
+
+        Parameters
+        ----------
+        step : int
+            Number of the step, from 1.
+        rate : float
+            Learning rate.
+        betas : tuple[float, float]
+            Decay of the two moments in a step.
+        binarization : float
+            Factor of :func:`binarization_loss`, whose gradient is added.
+        alpha_rate : float
+            Factor of the change of alpha.
+        """
+        leaf = self.texels.detach().requires_grad_()
+        if binarization:
+            self.gradient.add_(torch.autograd.grad(binarization * binarization_loss(leaf), leaf)[0])
+        texels, alpha, steps = self.texels.detach(), self.texels[:, 3].clone(), torch.tensor(step - 1.0, device=self.texels.device)
+        adam(
+            [texels], [self.gradient], [self.first_moment], [self.second_moment], [], [steps],
+            fused=True, amsgrad=False, beta1=betas[0], beta2=betas[1], lr=rate, weight_decay=0.0, eps=EPSILON, maximize=False,
+        )  # fmt: skip
+        texels[:, 3].sub_(alpha).mul_(alpha_rate).add_(alpha)
+        texels.clamp_(0, 1)
+        self.gradient.zero_()

@@ -1,0 +1,1 @@
+"""Drawing billboard clouds."""

@@ -1,0 +1,87 @@
+"""Depth order per pixel and the over operator."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from bbfit.geometry.alpha import AlphaMode
+
+STEEPEST = 6.0
+"""Largest slope of a mask's gradient, which is nonzero within 1 / (2 slope) of the cutoff; a step has no gradient of its own."""
+HASH = (0x8DA6B343, 0xD8163841, 0xCB1AB31F, 0x7FEB352D, 0x846CA68B)
+"""Factors of :func:`thresholds`: for a pixel's column and row, for a texture, and for the two rounds of mixing."""
+TIE = 1e-5
+"""Relative difference of depths below which layers count as equally deep. It is far above rounding and far below what is visible: where two
+planes cross exactly at a pixel's center, their order must not depend on rounding."""
+
+
+def composite(colors: list[Tensor], alphas: list[Tensor], depths: list[Tensor]) -> Tensor:
+    """Blend layers by Porter and Duff's over operator (1984, section 4.3), each pixel in its own depth order.
+
+    A layer contributes its alpha times the transmittance of all layers in front of it, ``prod(1 - alpha_j)``. The product is formed pair by
+    pair, without sorting: crossing planes have no order for a whole picture, and sorting and gathering per pixel costs several times as
+    much on a CPU. Among layers of equal depth (within :data:`TIE`) the lower index is in front.
+
+    Parameters
+    ----------
+    colors : list[Tensor]
+        N >= 1 straight colors, [V, 3, H, W] in [0, 1].
+    alphas : list[Tensor]
+        N opacities, [V, 1, H, W] in [0, 1].
+    depths : list[Tensor]
+        N depths, [V, 1, H, W]; smaller is nearer. Not differentiated.
+
+    Returns
+    -------
+    Tensor
+        Premultiplied RGBA, [V, 4, H, W].
+    """
+    weights = list(alphas)
+    for j in range(1, len(alphas)):
+        for i in range(j):
+            i_in_front = depths[i] <= depths[j] * (1 + TIE)
+            weights[j] = weights[j] * (1 - alphas[i] * i_in_front)
+            weights[i] = weights[i] * (1 - alphas[j] * ~i_in_front)
+    color = colors[0] * weights[0]
+    for n in range(1, len(colors)):
+        color = torch.addcmul(color, colors[n], weights[n])
+    return torch.cat([color, sum(weights[1:], weights[0])], 1)
+
+
+def opacity(alpha: Tensor, mode: AlphaMode) -> Tensor:
+    """Opacity of samples for their filtered alpha, in the modes ``blend`` and ``mask``; the same shape.
+
+    A mask is a ramp around its cutoff, or a step. Where the ramp is steeper than :data:`STEEPEST`, the derivative is that of a ramp of this
+    slope (a straight-through estimator; Bengio et al. 2013, section 4).
+    """
+    if mode.kind == "blend":
+        return alpha
+    steepness = min(mode.hardness, STEEPEST)
+    ramp = (0.5 + (alpha - mode.cutoff) * steepness).clamp(0, 1)
+    if mode.hardness == steepness:
+        return ramp
+    hard = (alpha >= mode.cutoff).to(alpha) if math.isinf(mode.hardness) else (0.5 + (alpha - mode.cutoff) * mode.hardness).clamp(0, 1)
+    return ramp + (hard - ramp).detach()
+
+
+def thresholds(x: Tensor, y: Tensor, texture: int) -> Tensor:
+    """Pseudo-random thresholds of alpha in (0, 1) for the mode ``hash``, one for each pixel and texture.
+
+    An integer hash of 32 bits (lowbias32, C. Wellons, "Prospecting for Hash Functions", 2018).
+
+    Parameters
+    ----------
+    x, y : Tensor
+        Columns and rows of pixels, int64, broadcast.
+    texture : int
+        Index of the texture's first texel.
+    """
+    bits, (of_x, of_y, of_texture, first_round, second_round) = 0xFFFFFFFF, HASH
+    mixed = (x * of_x & bits) ^ (y * of_y & bits) ^ (texture * of_texture & bits)
+    mixed = ((mixed ^ mixed >> 16) * first_round) & bits
+    mixed = ((mixed ^ mixed >> 15) * second_round) & bits
+    mixed = mixed ^ mixed >> 16
+    return ((mixed >> 9).to(torch.float32) + 0.5) / (1 << 23)

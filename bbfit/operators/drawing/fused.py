@@ -1,0 +1,240 @@
+"""Drawing by Warp kernels: all views and billboards at once, with a hand-written backward pass."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.operators.drawing.compositing import STEEPEST
+from bbfit.operators.drawing.kernels import Plane, kernels
+from bbfit.operators.drawing.projection import Projection, project
+from bbfit.operators.drawing.sampling_kernels import BLOCK
+from bbfit.operators.image_loss.fused import PixelLoss
+from bbfit.operators.image_loss.kernels import LOSSES
+from bbfit.operators.launching import LEAST_PIXELS, in_parallel, pieces_of, warp_array
+
+# Most bands of rows that a picture is cut into. Independent of the number of threads, which must not change the order of sums.
+MOST_BANDS = 32
+# Pixels that a CPU thread processes at a time, in vector registers.
+LANES = 16
+
+
+def render_fused(cloud: BillboardCloud, camera: Camera) -> Tensor:
+    """:func:`~bbfit.operators.drawing.reference.render_reference` in float32.
+
+    Differentiable in texels and placement, except in the alpha mode ``hash``. On a CPU equal inputs give equal bytes, whatever the number
+    of threads; on CUDA gradients are summed in no fixed order.
+
+    Returns
+    -------
+    Tensor
+        Premultiplied RGBA, float32 [V, H, W, 4] ([H, W, 4] for a single camera).
+    """
+    projection, texels = project(cloud, camera), cloud.texels.to(torch.float32)
+    if cloud.alpha.kind == "hash":
+        image = draw(texels.detach().contiguous(), projection)
+    else:
+        image = _Drawing.apply(texels, projection.to_texel, projection)
+    return image if camera.batched else image[0]
+
+
+class _Drawing(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, texels: Tensor, to_texel: Tensor, projection: Projection) -> Tensor:
+        texels = texels.contiguous()
+        ctx.save_for_backward(texels, to_texel)
+        ctx.projection = projection
+        return draw(texels, projection)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        texels, to_texel = ctx.saved_tensors
+        of_texels = torch.zeros_like(texels)
+        of_matrices = differentiate(
+            texels, ctx.projection, of_texels, image_gradient=gradients[0].contiguous(), placement=ctx.needs_input_grad[1]
+        )[1]
+        return (of_texels if ctx.needs_input_grad[0] else None), (of_matrices.to(to_texel) if of_matrices is not None else None), None
+
+
+def occupancy(texels: Tensor) -> Tensor:
+    """Whether each block of :data:`BLOCK` texels [P, 4] has one with alpha above 0, uint8 [ceil(P / BLOCK)]."""
+    alpha = torch.nn.functional.pad(texels[:, 3], (0, -len(texels) % BLOCK))
+    return (alpha.view(-1, BLOCK) != 0).any(-1).to(torch.uint8)
+
+
+def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+    """Draw projected billboards.
+
+    Parameters
+    ----------
+    texels : Tensor
+        Straight RGBA, float32 [P, 4], contiguous.
+    projection : Projection
+        N billboards in V views.
+    occupied : Tensor, optional
+        :func:`occupancy` of the texels; computed if omitted.
+    out : Tensor, optional
+        Memory for the picture, contiguous; it is overwritten completely.
+
+    Returns
+    -------
+    Tensor
+        Premultiplied RGBA, float32 [V, H, W, 4].
+    """
+    views, height, width = len(projection), projection.height, projection.width
+    image = torch.empty(views, height, width, 4, dtype=torch.float32, device=texels.device) if out is None else out
+    if not len(texels) or not views:
+        return image.zero_()
+    occupied = occupancy(texels.detach()) if occupied is None else occupied
+    run, device = _run(projection, texels.device), wp.device_from_torch(texels.device)
+    kernel, packed = kernels(_capacity(projection.count), _lanes(texels.device)).draw, _packed_planes(projection)
+    kernel.module.load(device)  # or every thread would compile it
+    arguments = [run, width, int(projection.orthographic), projection.count, _test(projection.alpha), _planes(packed)]
+    arguments += [warp_array(texels, wp.vec4), warp_array(occupied, wp.uint8)]
+    outputs = [warp_array(image, wp.vec4)]
+
+    def launch(begin: int, end: int) -> None:
+        wp.launch(kernel, (views, end - begin, -(-width // run)), [begin, *arguments], outputs, device=device)
+
+    in_parallel(launch, [(0, height)] if texels.is_cuda else pieces_of(height, -(-LEAST_PIXELS // (width * views)), MOST_BANDS))
+    return image
+
+
+def differentiate(
+    texels: Tensor,
+    projection: Projection,
+    texel_gradient: Tensor,
+    *,
+    image_gradient: Tensor | None = None,
+    loss: PixelLoss | None = None,
+    occupied: Tensor | None = None,
+    placement: bool = False,
+) -> tuple[Tensor | None, Tensor | None]:
+    """Backward pass of :func:`draw`, which adds the gradient in texels to ``texel_gradient``.
+
+    Parameters
+    ----------
+    texels : Tensor
+        Straight RGBA, float32 [P, 4], contiguous.
+    projection : Projection
+        N billboards in V views.
+    texel_gradient : Tensor
+        Float32 [P, 4], contiguous.
+    image_gradient : Tensor, optional
+        Gradient of a loss in the picture, float32 [V, H, W, 4], contiguous.
+    loss : PixelLoss, optional
+        A loss of the picture that is computed on the way and whose gradient is added to ``image_gradient``.
+    occupied : Tensor, optional
+        :func:`occupancy` of the texels; computed if omitted.
+    placement : bool
+        Whether to compute the gradient in ``projection.to_texel``.
+
+    Returns
+    -------
+    tuple[Tensor or None, Tensor or None]
+        The sum of ``loss`` over each view's pixels, float64 [V], if there is a loss; the gradient in the homographies, float64
+        [V, N, 3, 3], if ``placement``.
+    """
+    views, height, width, count = len(projection), projection.height, projection.width, projection.count
+    device = texels.device
+    sums = torch.zeros(views if loss else 0, height, dtype=torch.float32, device=device)
+    matrices = torch.zeros(views if placement else 0, height, count, 3, 3, dtype=torch.float64, device=device)
+    if views and (len(texels) or loss):
+        nothing = torch.zeros(0, 0, 0, 4, dtype=torch.float32, device=device)
+        target = loss.target if loss else nothing.to(torch.uint8)
+        occupied = occupancy(texels.detach()) if occupied is None else occupied
+        run, packed = _run(projection, device), _packed_planes(projection)
+        arguments = [
+            run,
+            width,
+            int(projection.orthographic),
+            count,
+            _test(projection.alpha),
+            _planes(packed),
+            warp_array(texels, wp.vec4),
+            warp_array(occupied, wp.uint8),
+            warp_array(nothing if image_gradient is None else image_gradient, wp.vec4),
+            warp_array(target.view(torch.int32).squeeze(-1), wp.int32),
+            int(loss.straight) if loss else 0,
+            LOSSES[loss.kind] if loss else 0,
+            loss.weight if loss else 0.0,
+        ]
+        outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices, wp.vec3d)]
+        kernel, pieces = kernels(_capacity(count), _lanes(device)).differentiate, -(-width // run)
+
+        on = wp.device_from_torch(device)
+        kernel.module.load(on)  # or every thread would compile it
+
+        def launch(view: int, number: int, begin: int, end: int) -> None:
+            wp.launch(kernel, (number, end - begin, pieces), [view, begin, *arguments], outputs, device=on)
+
+        for phase in schedule(projection, device):
+            in_parallel(launch, phase)
+    return (sums.sum(-1, dtype=torch.float64) if loss else None), (matrices.sum(1) if placement else None)
+
+
+def schedule(projection: Projection, device: torch.device) -> list[list[tuple[int, int, int, int]]]:
+    """Phases of pieces that run at the same time; a piece is a first view, a number of views, and a band of rows.
+
+    On a CPU bands of equal parity touch different texels: no two threads add to the same texel, and every sum has one order. CUDA adds
+    atomically. Small pictures are not cut.
+    """
+    views, height, width = len(projection), projection.height, projection.width
+    if device.type == "cuda":
+        return [[(0, views, 0, height)]]
+    if projection.groups > 1:
+        share = views // projection.groups
+        return [[(group * share, share, 0, height) for group in range(projection.groups)]]
+    phases = list[list[tuple[int, int, int, int]]]()
+    for view, apart in enumerate(projection.rows_apart.tolist()):
+        bands = pieces_of(height, max(apart, -(-LEAST_PIXELS // width)), MOST_BANDS)
+        if len(bands) > 3:
+            phases += [[(view, 1, *band) for band in bands[parity::2]] for parity in (0, 1)]
+        elif phases and len(phases[-1]) == 1:  # views that are not cut form one piece
+            phases[-1] = [(phases[-1][0][0], phases[-1][0][1] + 1, 0, height)]
+        else:
+            phases.append([(view, 1, 0, height)])
+    return phases
+
+
+def _test(mode: AlphaMode) -> Any:
+    """An alpha mode for a kernel: the cutoff (0: blend, -1: hash), the hardness (0: a step) and the slope of the gradient."""
+    if mode.kind != "mask":
+        return wp.vec3(0.0 if mode.kind == "blend" else -1.0, 0.0, 0.0)
+    return wp.vec3(mode.cutoff, 0.0 if math.isinf(mode.hardness) else mode.hardness, min(mode.hardness, STEEPEST))
+
+
+def _capacity(count: int) -> int:
+    """Most billboards that a kernel is compiled for: the next power of two, at least 4."""
+    return max(4, 1 << (count - 1).bit_length())
+
+
+def _lanes(device: torch.device) -> int:
+    """Pixels that a thread processes at a time."""
+    return 1 if device.type == "cuda" else LANES
+
+
+def _run(projection: Projection, device: torch.device) -> int:
+    """Pixels of a row that a thread processes in all."""
+    return 1 if device.type == "cuda" else projection.width
+
+
+def _packed_planes(projection: Projection) -> Tensor:
+    """Memory of an array of :class:`~bbfit.operators.drawing.kernels.Plane`, int32 [V, N, 19]."""
+    views, count = projection.boxes.shape[:2]
+    numbers = [projection.to_texel.detach().reshape(views, count, 9), projection.nearness]
+    return torch.cat([*(part.contiguous().view(torch.int32) for part in numbers), projection.textures, projection.boxes], -1)
+
+
+def _planes(packed: Tensor) -> Any:
+    """A Warp view of :func:`_packed_planes`, which must outlive it."""
+    return wp.array(ptr=packed.data_ptr(), shape=packed.shape[0] * packed.shape[1], dtype=Plane, device=wp.device_from_torch(packed.device))

@@ -1,0 +1,98 @@
+"""Losses of a render against a view by Warp kernels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from bbfit.operators.config import Loss
+from bbfit.operators.image_loss.kernels import LOSSES, compare, unpack
+from bbfit.operators.launching import LEAST_PIXELS, in_parallel, pieces_of, warp_array
+from bbfit.operators.precomputed import differentiable
+from bbfit.operators.sharpness.fused import add_sharpness_gradient
+from bbfit.operators.ssim.fused import ssim_and_gradient
+
+
+@dataclass(frozen=True)
+class PixelLoss:
+    """A loss of every pixel that the backward pass of drawing computes, so that the picture itself is never stored."""
+
+    target: Tensor
+    """8-bit RGBA, uint8 [V, H, W, 4], contiguous."""
+    straight: bool
+    """Whether the target's alpha is straight; premultiplied otherwise."""
+    kind: Loss
+    """Loss of a pixel (:func:`~bbfit.operators.image_loss.reference.pixel_loss_reference`)."""
+    weight: float
+    """Factor of the loss, summed over pixels, in the gradient."""
+
+
+def image_loss_fused(render: Tensor, target: Tensor, kind: Loss, ssim_weight: float, sharpness_weight: float = 0.0) -> Tensor:
+    """:func:`~bbfit.operators.image_loss.reference.image_loss_reference` in float32, differentiable in ``render`` alone."""
+    gradient = torch.empty_like(render)
+    structure = add_structure(render, target, ssim_weight, sharpness_weight, gradient)
+    pixels, losses = render.numel() // 4, torch.empty(render.shape[:-1], device=render.device)
+    arrays = [warp_array(picture.detach().view(-1, 4), wp.vec4) for picture in (render, target, gradient)]
+    outputs = [warp_array(losses.view(-1), wp.float32), arrays[2]]
+    wp.launch(compare, pixels, [LOSSES[kind], 1 / pixels, *arrays[:2]], outputs, device=wp.device_from_torch(render.device))
+    return differentiable(losses.mean(dtype=torch.float64) + structure, render, gradient)
+
+
+def add_structure(render: Tensor, target: Tensor, ssim_weight: float, sharpness_weight: float, out: Tensor) -> Tensor | float:
+    """The weighted terms for structure and sharpness of an image loss, and their gradient.
+
+    Parameters
+    ----------
+    render, target : Tensor
+        Premultiplied RGBA in [0, 1], float32 [V, H, W, 4], contiguous.
+    ssim_weight, sharpness_weight : float
+        As in :func:`~bbfit.operators.image_loss.reference.image_loss_reference`.
+    out : Tensor
+        Memory for the gradient in ``render``, float32 [V, H, W, 4], contiguous; it is overwritten completely.
+
+    Returns
+    -------
+    Tensor or float
+        A float64 scalar.
+    """
+    lost: Tensor | float = 0.0
+    if ssim_weight:
+        lost = ssim_weight * (1 - ssim_and_gradient(render, target, -ssim_weight, out)[0])
+    else:
+        out.zero_()
+    if sharpness_weight:
+        lost = lost + sharpness_weight * add_sharpness_gradient(render, target, sharpness_weight, out)
+    return lost
+
+
+def unpacked(packed: Tensor, straight: bool, out: Tensor | None = None) -> Tensor:
+    """8-bit RGBA as premultiplied floats.
+
+    Parameters
+    ----------
+    packed : Tensor
+        uint8 [V, H, W, 4], contiguous.
+    straight : bool
+        Whether its alpha is straight; premultiplied otherwise.
+    out : Tensor, optional
+        Memory for the result, contiguous; it is overwritten completely.
+
+    Returns
+    -------
+    Tensor
+        Premultiplied RGBA in [0, 1], float32 [V, H, W, 4].
+    """
+    image = torch.empty(packed.shape, dtype=torch.float32, device=packed.device) if out is None else out
+    run, device = 1 if packed.is_cuda else 1 << 10, wp.device_from_torch(packed.device)
+    arguments = [run, warp_array(packed.view(torch.int32).flatten(), wp.int32), int(straight)]
+    outputs, runs = [warp_array(image.view(-1, 4), wp.vec4)], -(-packed.numel() // 4 // run)
+    unpack.module.load(device)  # or every thread would compile it
+
+    def launch(begin: int, end: int) -> None:
+        wp.launch(unpack, end - begin, [begin, *arguments], outputs, device=device)
+
+    in_parallel(launch, [(0, runs)] if packed.is_cuda else pieces_of(runs, LEAST_PIXELS // run))
+    return image

@@ -1,0 +1,67 @@
+"""Losses of a render against a view, in torch."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from bbfit.operators.config import Loss
+from bbfit.operators.sharpness.reference import sharpness_reference
+from bbfit.operators.ssim.reference import ssim_reference
+
+
+def image_loss_reference(render: Tensor, target: Tensor, kind: Loss, ssim_weight: float, sharpness_weight: float = 0.0) -> Tensor:
+    """The mean of :func:`pixel_loss_reference` plus weighted terms for structure and sharpness.
+
+    Parameters
+    ----------
+    render, target : Tensor
+        Premultiplied RGBA in [0, 1], [V, H, W, 4].
+    kind : {"l1", "l2", "backgrounds"}
+        Loss of a pixel.
+    ssim_weight : float
+        Factor of 1 - SSIM (:func:`~bbfit.operators.ssim.reference.ssim_reference`).
+    sharpness_weight : float
+        Factor of :func:`~bbfit.operators.sharpness.reference.sharpness_reference`.
+
+    Returns
+    -------
+    Tensor
+        A scalar, differentiable in both pictures.
+    """
+    loss = pixel_loss_reference(render, target, kind).mean()
+    if ssim_weight:
+        loss = loss + ssim_weight * (1 - ssim_reference(render, target))
+    if sharpness_weight:
+        loss = loss + sharpness_weight * sharpness_reference(render, target)
+    return loss
+
+
+def pixel_loss_reference(render: Tensor, target: Tensor, kind: Loss) -> Tensor:
+    """Loss of every pixel.
+
+    ``l1`` and ``l2`` are absolute and squared differences, summed over the four channels (thesis, section 4.4).
+
+    ``backgrounds`` is the expected squared difference of colors over an opaque background whose channels b are independent and uniform in
+    [0, 1]. With the differences c of premultiplied color and a of alpha, E[b] = 1/2 and E[b^2] = 1/3 give
+
+        sum over channels of E[(c - a b)^2] = sum of (c^2 - a c) + a^2,
+
+    which is ``l2`` minus one term: where alpha is missing too, missing color costs less, because the background shows instead.
+
+    Parameters
+    ----------
+    render, target : Tensor
+        Premultiplied RGBA in [0, 1], [V, H, W, 4].
+    kind : {"l1", "l2", "backgrounds"}
+        Which loss.
+
+    Returns
+    -------
+    Tensor
+        [V, H, W], differentiable in both pictures.
+    """
+    difference = render - target
+    loss = (difference.abs() if kind == "l1" else difference.square()).sum(-1)
+    if kind == "backgrounds":
+        loss = loss - difference[..., 3] * difference[..., :3].sum(-1)
+    return loss

@@ -1,0 +1,89 @@
+"""Launching Warp kernels: at once on a GPU, in pieces on all cores of a CPU, because Warp runs a CPU launch in the calling thread."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+FLAGS = "-march=native -ffp-contract=fast"
+"""Clang's flags for CPU kernels; they enable the host's vector instructions and fused multiply-add."""
+LEAST_PIXELS = 1 << 14
+"""Least pixels in a piece for a CPU thread."""
+
+
+def _initialize() -> None:
+    """Initialize Warp silently. Its C code warns on standard error when there is no GPU."""
+    wp.config.log_level = wp.LOG_ERROR
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is no standard error
+        wp.init()
+        return
+    if sys.stderr is not None:
+        sys.stderr.flush()
+    try:
+        with Path(os.devnull).open("wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        wp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+_initialize()
+
+
+def worker_count() -> int:
+    """Number of threads for CPU launches: as many as torch uses (``torch.set_num_threads``, ``OMP_NUM_THREADS``)."""
+    return torch.get_num_threads()
+
+
+def in_parallel(launch: Callable[..., None], pieces: Iterable[tuple[int, ...]]) -> None:
+    """Call ``launch(*piece)`` for every piece on :func:`worker_count` threads and wait until all are done.
+
+    The calling thread takes pieces too and never waits for a thread that has not started. On a busy machine it then does most of the work
+    itself, instead of waiting to be scheduled a thousand times a second. An exception in a piece is raised here.
+    """
+    pieces = list(pieces)
+    left = iter(pieces)
+
+    def work() -> None:
+        for piece in left:  # the interpreter's lock makes sure that each piece goes to one thread
+            launch(*piece)
+
+    helpers = min(worker_count(), len(pieces)) - 1
+    others = [_pool(worker_count()).submit(work) for _ in range(helpers)]
+    try:
+        work()
+    finally:
+        begun = [other for other in others if not other.cancel()]
+        wait(begun)
+    for other in begun:
+        other.result()
+
+
+def pieces_of(count: int, least: int, most: int | None = None) -> list[tuple[int, int]]:
+    """Cut ``range(count)`` into nearly equal pieces of at least ``least``: at most ``most`` of them, or four for each worker."""
+    number = max(1, min(count // max(least, 1), 4 * worker_count() if most is None else most))
+    edges = [count * i // number for i in range(number + 1)]
+    return [(begin, end) for begin, end in pairwise(edges) if end > begin]
+
+
+def warp_array(tensor: Tensor, dtype: Any) -> Any:
+    """A Warp view of the memory of a contiguous tensor, which must outlive it."""
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+@cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers, thread_name_prefix="bbfit-launch")

@@ -1,0 +1,1 @@
+"""Difference in sharpness between pictures."""

@@ -1,5 +1,0 @@
-"""Which renderers there are."""
-
-from typing import Literal
-
-Backend = Literal["auto", "reference", "fused"]

@@ -1,0 +1,199 @@
+"""The tree that the viewer shows, read from the folder of a run or of levels of detail."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bbfit.blender.config import ViewsConfig
+from bbfit.checks import InputError, check_folder, fail
+from bbfit.exporting.config import ExportConfig
+from bbfit.files import read_json
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.extent import shown_bounds
+from bbfit.layout import REQUEST_FILE
+from bbfit.stages.stage import RECORD_FILE
+from bbfit.viewing.levels import ViewerLevel
+from bbfit.viewing.originals import MAX_BYTES, Original, find_original
+
+LOD_FILE, CLOUD_FILE = "lod.json", "cloud.safetensors"
+"""Files of a folder of levels of detail and of a run's folder."""
+
+
+@dataclass(frozen=True)
+class ViewedTree:
+    """A tree and its billboards."""
+
+    name: str
+    """The folder's name."""
+    levels: tuple[ViewerLevel, ...]
+    """The original, if it is a level, and the billboards, finest first; at least one level has billboards."""
+    original: Original
+    """The original tree."""
+    export: ExportConfig
+    """How the run's models are exported; the textures are PNG, which browsers read."""
+    bounds: NDArray[np.float64]
+    """Lowest and highest corner of what the billboards show in meters, [2, 3]."""
+    light: ViewsConfig
+    """How the tree was lit in the views, as far as it is known."""
+    views: Path | None = None
+    """The folder of views that the billboards were fitted to."""
+    notes: tuple[str, ...] = ()
+    """Remarks that the page shows."""
+    live: bool = False
+    """Whether the fit is still running."""
+
+    @property
+    def clouds(self) -> tuple[BillboardCloud, ...]:
+        """The clouds of the levels that have billboards."""
+        return tuple(level.cloud for level in self.levels if level.cloud is not None)
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the scale of every level is known."""
+        return all(level.scale is not None for level in self.levels)
+
+    def with_scale(self, scale: float) -> ViewedTree:
+        """The same tree with the scale of its one cloud, in pixels per meter."""
+        return replace(self, levels=tuple(level if level.scale is not None else replace(level, scale=scale) for level in self.levels))
+
+    def without_views(self, reason: str) -> ViewedTree:
+        """The same tree without views, and a note on why they cannot be used."""
+        return replace(self, views=None, notes=(*self.notes, reason))
+
+
+def open_results(folder: str | Path, *, original_bytes: int = MAX_BYTES) -> ViewedTree:
+    """Read the folder of ``bbfit run``, ``bbfit fit`` or ``bbfit lod``.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The folder.
+    original_bytes : int
+        The largest size of the original's file that is sent to browsers.
+
+    Returns
+    -------
+    The tree. An original that is gone or cannot be read becomes a note.
+
+    Raises
+    ------
+    MissingFileError, InputError
+        If it is no such folder, or is damaged.
+    """
+    folder = check_folder("run", folder)
+    if (folder / LOD_FILE).is_file():
+        return _open_lod(folder, original_bytes)
+    if not (folder / CLOUD_FILE).is_file():
+        done = " yet" if (folder / RECORD_FILE).is_file() or (folder / "fit.checkpoint").is_file() else ""
+        fail("run", f"{folder} holds no {CLOUD_FILE}{done}", "give the folder that bbfit run, bbfit fit or bbfit lod wrote")
+    record = _record(folder)
+    views, cloud = _views(folder, record), BillboardCloud.load(folder / CLOUD_FILE)
+    original = find_original(sources(folder, record), original_bytes)
+    tree = live_tree(cloud, folder.resolve().name, original, light_of(views))
+    notes = () if record else (f"there is no {RECORD_FILE}, so the tree that it was made from is not known",)
+    return replace(tree, export=_export(record), views=views, notes=notes, live=False)
+
+
+def live_tree(cloud: BillboardCloud, name: str, original: Original, light: ViewsConfig) -> ViewedTree:
+    """A tree whose billboards are being fitted."""
+    levels = (ViewerLevel(None, math.inf), ViewerLevel(cloud, None)) if original.glb is not None else (ViewerLevel(cloud, math.inf),)
+    return ViewedTree(name, levels, original, ExportConfig(), shown_bounds(cloud).numpy(), light, live=True)
+
+
+def sources(folder: Path, record: dict[str, Any]) -> list[Path | None]:
+    """Files that may hold the original tree of a run: the grown tree, the source, or the mesh that was given beside views."""
+    if not record:
+        return [folder / "tree.glb"] if (folder / "tree.glb").is_file() else []
+    if record["config"].get("grow") is not None:
+        return [folder / "tree.glb"]
+    source = Path(record["source"])
+    if not source.is_dir() and source.suffix:
+        return [source]
+    given = record["config"].get("tree")
+    return [Path(given)] if isinstance(given, str) else []
+
+
+def light_of(views: Path | None) -> ViewsConfig:
+    """The light of a folder of views by its ``views.json``; the default light if that file has none."""
+    path = views / REQUEST_FILE if views is not None else None
+    try:
+        request = read_json("views", path) if path is not None and path.is_file() else {}
+    except InputError:
+        request = {}
+    config = request.get("config") if isinstance(request, dict) else None
+    names = ("sun_strength", "sun_azimuth", "sun_elevation", "ambient_strength")
+    known = {name: config[name] for name in names if isinstance(config.get(name), int | float)} if isinstance(config, dict) else {}
+    try:
+        return ViewsConfig(**known)
+    except InputError:
+        return ViewsConfig()
+
+
+def _record(folder: Path) -> dict[str, Any]:
+    """``run.json``, empty if there is none."""
+    path = folder / RECORD_FILE
+    if not path.is_file():
+        return {}
+    record = read_json("run", path)
+    if not isinstance(record, dict) or not isinstance(record.get("source"), str) or not isinstance(record.get("config"), dict):
+        fail("run", f"{path} was not written by bbfit or is damaged", "remove it, or start the run again")
+    return record
+
+
+def _export(record: dict[str, Any]) -> ExportConfig:
+    """The run's export, with textures that browsers read."""
+    stored = record.get("config", {}).get("export")
+    known = {f.name: stored[f.name] for f in fields(ExportConfig) if f.name in stored} if isinstance(stored, dict) else {}
+    try:
+        config = ExportConfig(**known)
+    except (InputError, TypeError):  # of another version
+        config = ExportConfig()
+    return replace(config, textures="png", mip_files=False)
+
+
+def _views(folder: Path, record: dict[str, Any]) -> Path | None:
+    near = [folder / "views", folder.parent / "views", *([Path(record["source"])] if record else [])]
+    return next((path for path in near if path.is_dir()), None)
+
+
+def _open_lod(folder: Path, original_bytes: int) -> ViewedTree:
+    stored = read_json("run", folder / LOD_FILE)
+    coarser, records, with_tree = list[ViewerLevel](), list[dict[str, Any]](), False
+    try:
+        config = stored["config"]
+        focal = config["screen_height"] / 2 / math.tan(math.radians(config["screen_fov_degrees"]) / 2)
+        for index, level in enumerate(stored["levels"]):
+            scale = focal / level["distance_meters"] if index and level["distance_meters"] else math.inf
+            if level["planes"] is None:
+                with_tree = True
+                continue
+            run = folder / str(level["planes"])
+            cloud = BillboardCloud.load(run / CLOUD_FILE)
+            halvings = 0 if math.isinf(scale) else max(0, math.floor(math.log2(cloud.texel_density / scale)))
+            coarser.append(ViewerLevel(cloud, scale, halvings))
+            records.append(_record(run))
+    except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        fail("run", f"{folder / LOD_FILE} is damaged or of another version ({error!r})", "start bbfit lod again")
+    if not coarser:
+        fail("run", f"{folder / LOD_FILE} names no billboards", "start bbfit lod again")
+    converted = folder / "original.glb"
+    original = find_original([converted] if converted.is_file() else sources(folder, records[0]), original_bytes)
+    levels = (ViewerLevel(None, math.inf), *coarser) if with_tree and original.glb is not None else tuple(coarser)
+    boxes = np.stack([shown_bounds(level.cloud).numpy() for level in coarser if level.cloud is not None])
+    return ViewedTree(
+        name=folder.resolve().name,
+        levels=levels,
+        original=original,
+        export=_export(records[0]),
+        bounds=np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)]),
+        light=light_of(folder / "views"),
+        views=folder / "views",
+    )
