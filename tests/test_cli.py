@@ -68,7 +68,7 @@ def test_fit_writes_what_run_writes_for_the_same_views(views_folder: Path, fitte
 EXPORTS = {
     "default": ([], bbfit.ExportConfig()),
     "blended": (
-        ["--export.alpha", "blend", "--export.split", "True", "--export.hull", "6", "--export.mip-files"],
+        ["--alpha", "blend", "--split", "--hull", "6", "--mip-files"],
         bbfit.ExportConfig(alpha="blend", split=True, hull=6, mip_files=True),
     ),
 }
