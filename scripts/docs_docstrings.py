@@ -1,7 +1,7 @@
-"""Griffe extension for the API pages: bbfit's docstrings as Markdown.
+"""Griffe extension for the API pages: convert bbfit's docstrings to Markdown.
 
-Sections are headings underlined with dashes, parameters are ``name : text``, and names are marked up as in reStructuredText. They are
-turned into bold titles, lists, and links to the public names that the pages have.
+The docstrings follow numpydoc, with roles of reStructuredText. Section headings become bold titles, entries of sections become lists, and
+roles become links to the public names that the pages describe.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ import bbfit
 
 _ROLE = re.compile(r":\w+:`~?([\w.]+)`")
 _TITLE = re.compile(r"^(\w[\w ]*)\n-{3,}\n", re.MULTILINE)
-# Parameters, and what is raised, start at the margin; what is said of them goes on indented.
-_ENTRY = re.compile(r"^(\w[\w, ]*?)(?: : (.*)|)$")
+# An entry of a section starts at the margin. Its description is indented.
+_ENTRY = re.compile(r"^(\*{0,2}\w[\w, ]*?)(?: : (.*)|)$")
 
 
 def markdown(text: str) -> str:
-    """A docstring as Markdown."""
+    """Convert a docstring to Markdown."""
     parts = _TITLE.split(cleandoc(text))
     pieces = [parts[0].strip()]
     for title, body in zip(parts[1::2], parts[2::2], strict=True):
-        listed = title in ("Parameters", "Raises")
-        pieces.append(f"**{title}**\n\n{_entries(body) if listed else body.strip()}")
+        is_list = title in ("Parameters", "Raises") or re.match(r"\S.*\n +\S", body) is not None
+        pieces.append(f"**{title}**\n\n{_entries(body) if is_list else body.strip()}")
     return _marked_up("\n\n".join(pieces))
 
 
 def _entries(body: str) -> str:
-    """``name : text`` and indented continuations as a Markdown list."""
+    """Convert entries, which are ``name`` or ``name : text`` with indented descriptions, to a Markdown list."""
     lines: list[str] = []
     for line in body.strip().splitlines():
         entry = _ENTRY.match(line)
@@ -49,7 +49,7 @@ def _marked_up(text: str) -> str:
 
 
 def _link(path: str) -> str:
-    """A public name as a link to its entry, another one as code."""
+    """A public name as a link to its entry, and any other name as code."""
     name = path.rpartition(".")[2]
     if name in bbfit.__all__:
         home = getattr(bbfit, name).__module__
@@ -58,10 +58,10 @@ def _link(path: str) -> str:
 
 
 class Docstrings(griffe.Extension):
-    """Rewrites every docstring of a package once it is loaded."""
+    """Convert every docstring of a package after griffe has loaded it."""
 
     def on_package(self, *, pkg: griffe.Module, **kwargs: Any) -> None:
-        """Called by griffe with the whole package."""
+        """Convert the docstrings of ``pkg``. Griffe calls this method."""
         self._rewrite(pkg)
 
     def _rewrite(self, item: griffe.Object | griffe.Alias) -> None:

@@ -1,7 +1,7 @@
 """Run Blender in a process of its own: load one tree, measure it, and render pictures of it or convert it.
 
 The parent starts this file by path. It imports only the files beside it, not bbfit, so that it starts fast. Parent and worker exchange
-lines of JSON. On standard input, the first line holds the settings. Each further line requests a picture. On standard output, the worker
+lines of JSON. On standard input, the first line contains the settings. Each further line requests a picture. On standard output, the worker
 answers ``ready`` (followed by the vertices as raw float32 if the settings request them), then ``done`` for each picture. It answers
 ``refused`` with a reason if an input cannot be used. If the settings contain ``convert``, ``worker_glb.py`` writes the tree as a GLB file,
 and the worker answers ``converted`` or ``refused``. The output of Blender itself goes to standard error. Standard input ends when the

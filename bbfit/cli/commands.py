@@ -88,7 +88,7 @@ def grow_command(
         out_console.print(species_table([load_species(name, grow.species_file) for name in known_species(grow.species_file)]))
         out_console.print(f"figures in {grow.species_file or figures_file()}", soft_wrap=True, highlight=False)
         return
-    from bbfit.trees.tree_file import write_tree
+    from bbfit.trees.tree_writer import write_tree
 
     figures = load_species(species, grow.species_file)
     if out is None:

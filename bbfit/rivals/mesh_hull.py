@@ -24,7 +24,7 @@ SMALLEST_PART = 0.01
 
 
 def hull_surface(views: ViewSet) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Carve the hull out of two grids, the second around what the first left over.
+    """Carve the hull from two grids, the second around the cells that the first one keeps.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def hull_surface(views: ViewSet) -> tuple[NDArray[np.float64], NDArray[np.int64]
 
 
 def _reach(cameras: Camera) -> tuple[NDArray[np.float64], float]:
-    """The middle of what the cameras see, and half a side of a cube that holds all that every one of them sees."""
+    """Center of the cameras' common view, and half the side of a cube that contains what all of them see."""
     center = convergence_point(cameras)
     distance = (cameras.position - center).norm(dim=-1)
     scale = 1 if cameras.orthographic else distance

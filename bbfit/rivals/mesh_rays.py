@@ -1,8 +1,8 @@
 """Casting rays at a textured triangle mesh on the CPU, with gradients, by Mitsuba's ray tracer (Embree) and Dr.Jit (LLVM).
 
-Mitsuba is used for what is general in it: the scene with its search tree, and arrays that are compiled and differentiated. Its integrators
-are not: its emitters know no opacity. Colors are blended along each ray instead, surface by surface, which is the depth peeling of
-Hasselgren et al. 2021 without its sorting by rasterizer passes.
+Mitsuba provides the scene with its acceleration structure, and arrays that are compiled and differentiated. Its integrators are not used,
+because its emitters have no opacity. Colors are blended along each ray instead, surface by surface, which is the depth peeling of
+Hasselgren et al. 2021 without rasterizer passes.
 """
 
 from __future__ import annotations
@@ -21,17 +21,15 @@ from bbfit.geometry.camera import Camera
 
 VARIANT = "llvm_ad_rgb"
 LAYERS = 8
-"""Surfaces blended along a ray; those behind them are not seen."""
+"""Largest number of surfaces blended along a ray; surfaces behind them are ignored."""
 FAINT = 1 / 512
-"""A ray that lets less through than this goes no further."""
+"""Transmittance below which a ray ends."""
 STEP_ON = 1e-5
 """How far behind a surface a ray goes on, as a part of the mesh's longest side."""
 
 
 def pixel_rays(camera: Camera, places: Tensor, grid: int) -> tuple[Tensor, Tensor]:
-    """Rays through every pixel's cells, in the world that the mesh lives in: the one place where a camera meets the ray caster.
-
-    The ray caster knows no camera, only rays, so there is no other convention to convert to.
+    """Rays through the cells of every pixel, in world space.
 
     Parameters
     ----------
@@ -124,7 +122,7 @@ class RayCaster:
 
         Returns
         -------
-        The derivative by the pixels, [S / ``samples``, 4], by the vertices, [P, 3], as if the silhouettes stood still, and by the texture,
+        The derivative by the pixels, [S / ``samples``, 4], by the vertices, [P, 3], with fixed silhouettes, and by the texture,
         [h, w, 4].
         """
         mi, dr = _libraries()

@@ -1,4 +1,4 @@
-"""Where a mesh ends as a camera sees it, and how a loss changes as those edges move."""
+"""Silhouette edges of a mesh, and the gradient of a loss as they move."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Surface:
         owner = torch.arange(len(self.faces)).repeat(3)
         self.edges, edge, shared = pairs.sort(-1).values.unique(dim=0, return_inverse=True, return_counts=True)
         """Pairs of points, [E, 2]."""
-        # A border has one side. Where more than two triangles meet, any two of them stand for all.
+        # A border has one side. Where more than two triangles meet, two of them represent all.
         first = torch.full((len(self.edges),), -1).scatter_reduce(0, edge, owner, "amax")
         last = torch.full((len(self.edges),), len(owner)).scatter_reduce(0, edge, owner, "amin")
         self.sides, self.border = torch.stack([first, last], -1), shared != 2
@@ -80,7 +80,7 @@ def boundary_gradient(
     random: torch.Generator,
     density: float = BOUNDARY_SAMPLES,
 ) -> Tensor:
-    """Gradient of a loss by what silhouettes cover and uncover as they move: an integral along them, by sampling.
+    """Gradient of a loss through the motion of silhouettes: an integral along them, estimated by sampling.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.growth import grow
 from bbfit.trees.species import Species
-from bbfit.trees.tree_file import write_tree
+from bbfit.trees.tree_writer import write_tree
 
 
 def grow_stage(folder: Path, species: Species, config: GrowConfig) -> Stage:

@@ -43,7 +43,7 @@ class RayWorkers:
         try:
             import ray
         except ImportError:
-            fail("ray", "it is not installed", 'install bbfit with its extra, pip install "bbfit[cluster]", or leave out --ray')
+            fail("ray", "it is not installed", 'install bbfit with its extra, pip install "bbfit[cluster]", or omit --ray')
         self._ray, self._config = ray, config
         self._references: dict[tuple[Path, ...], Any] = {}
         self._running: dict[Any, Task] = {}

@@ -15,7 +15,7 @@ VERTEX_LIMIT = 20_000_000
 
 @dataclass(frozen=True)
 class GrowConfig:
-    """How a tree is grown."""
+    """Options of growing a tree."""
 
     seed: Seed = 0
     """Seed of the tree: each seed grows a different tree of the species."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bbfit.checks import InputError
-from bbfit.exporting.lod import stands_alone
+from bbfit.exporting.lod import is_self_contained
 from bbfit.glb import gltf_parts
 from bbfit.tree_files.tree_file import MESH_SUFFIXES, TreeFile
 
@@ -52,7 +52,7 @@ def find_original(candidates: Sequence[Path | None], max_bytes: int = MAX_BYTES)
         size = tree.bytes
         if size > max_bytes:
             return Original.missing(_too_large(path.name, size, max_bytes))
-        if ending == ".glb" and stands_alone(path):
+        if ending == ".glb" and is_self_contained(path):
             return _unchanged(path.read_bytes(), path.name)
         glb = _converted(tree)
     except (InputError, OSError) as error:

@@ -220,6 +220,14 @@ def test_textures_of_an_obj_are_part_of_the_tree(things: Path, tmp_path: Path) -
     assert TreeFile.open(tree).digest != before.digest
 
 
+def test_every_material_library_of_a_line_is_part_of_the_tree(tmp_path: Path) -> None:
+    """The format allows several names after ``mtllib``, and some programs read them all."""
+    (tmp_path / "tree.obj").write_text("mtllib bark.mtl leaf.mtl\n")
+    for name in ("bark.mtl", "leaf.mtl"):
+        (tmp_path / name).write_text("newmtl m\n")
+    assert {path.name for path in TreeFile.open(tmp_path / "tree.obj").files} == {"tree.obj", "bark.mtl", "leaf.mtl"}
+
+
 def test_formats_are_the_tested_ones() -> None:
     assert set(UP_AXES) == set(FORMATS)
 

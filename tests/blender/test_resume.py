@@ -31,19 +31,25 @@ _RENDER = """
 import sys
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.views_folder import render_views
-tree, out, samples, size, limit = sys.argv[1:]
+tree, out, samples, size, limit, workers, hold = sys.argv[1:]
 if int(limit):
     import resource
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), resource.RLIM_INFINITY))
-config = ViewsConfig(count=4, size=int(size), samples=int(samples), denoise=False)
-render_views(tree, out, config, on_progress=lambda done, total: print(done, flush=True))
+def on_progress(done, total):
+    print(done, flush=True)
+    if done == int(hold):
+        sys.stdin.readline()
+config = ViewsConfig(count=4, size=int(size), samples=int(samples), denoise=False, workers=int(workers))
+render_views(tree, out, config, on_progress=on_progress)
 """
 
 
-def start(tree: Path, out: Path, *, samples: int = 4, size: int = 32, limit: int = 0) -> subprocess.Popen[str]:
-    """Render views in a process that may be killed."""
-    arguments = [sys.executable, "-c", _RENDER, str(tree), str(out), str(samples), str(size), str(limit)]
-    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def start(
+    tree: Path, out: Path, *, samples: int = 4, size: int = 32, limit: int = 0, workers: int = 1, hold: int = -1
+) -> subprocess.Popen[str]:
+    """Render views in a process that may be killed; after ``hold`` views it hands over no more, and goes on with a line of input."""
+    arguments = [sys.executable, "-c", _RENDER, str(tree), str(out), *map(str, (samples, size, limit, workers, hold))]
+    return subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def blenders(parent: int) -> list[int]:
@@ -75,13 +81,13 @@ def assert_same_pictures(out: Path, expected: Path) -> None:
 
 def test_killed_in_the_middle_and_started_again(thing_glb: Path, tmp_path: Path) -> None:
     """Blender dies with its parent; only what is missing or cut short is rendered again; pixels are those of an unbroken run."""
-    out, config = tmp_path / "views", ViewsConfig(**SMALL | {"samples": 600})
-    parent = start(thing_glb, out, samples=600)
+    out, config = tmp_path / "views", ViewsConfig(**SMALL | {"samples": 200})
+    parent = start(thing_glb, out, samples=200, workers=2, hold=2)
     assert parent.stdout
     for _ in range(3):  # 0, 1, 2 views
         parent.stdout.readline()
     workers = [os.pidfd_open(pid) for pid in blenders(parent.pid)]
-    assert workers
+    assert len(workers) == 2
     parent.kill()
     parent.communicate()
     for worker in workers:

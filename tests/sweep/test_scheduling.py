@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -121,14 +120,21 @@ def test_what_is_damaged_or_depends_on_something_else_is_made_anew(done: SweepRe
 def test_a_killed_sweep_goes_on_where_it_was(done: SweepResult, two_trees: list[Path], tmp_path: Path) -> None:
     """Killed with all its processes after the third result."""
     folder = tmp_path / "killed"
-    options = ["--steps", "12", "--workers", "2", "--loss", "l1", "l2", "--billboards", "2", "3", "--variants", "base", "double"]
-    command = [sys.executable, "-m", "bbfit.cli", "sweep", "--out", str(folder), "--views", *map(str, two_trees), *options]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while len(list((folder / "results").glob("*.json"))) < 3:
-        assert process.poll() is None
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    script = tmp_path / "sweep.py"
+    script.write_text(f"""
+import os, signal, sys
+from pathlib import Path
+from bbfit.sweep.config import SweepConfig
+from bbfit.sweep.scheduling import run_sweep
+
+def kill(stage, done, total, note=""):
+    if stage == "runs" and done == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+if __name__ == "__main__":
+    run_sweep(Path({str(folder)!r}), {QUICK!r}, views=[Path(name) for name in sys.argv[1:]], on_progress=kill)
+""")
+    assert subprocess.run([sys.executable, str(script), *map(str, two_trees)]).returncode == -signal.SIGKILL
     before = times(folder)
     result = run_sweep(folder, QUICK, SHORT, views=two_trees)
     assert 3 <= result.kept == len(before) < 16 and {name: times(folder)[name] for name in before} == before

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from bbfit.checks import InputError, MissingFileError
 from bbfit.trees.parts import Material, Part
-from bbfit.trees.tree_file import scene_of, write_tree
+from bbfit.trees.tree_writer import scene_of, write_tree
 
 BARK = Material("bark", (0.0221, 1 / 3, 0.1), 0.85, double_sided=False)
 LEAVES = (Material("leaf_0", (0.0225, 0.3, 0.05), 0.6, double_sided=True), Material("leaf_1", (0.5, 0.25, 0.0), 0.6, double_sided=True))
@@ -178,7 +178,7 @@ os.write(out, json.dumps(report).encode())
 os._exit(0)
 """
     command = [sys.executable, "-c", script, str(tmp_path / "tree.glb"), str(tmp_path / "tree.obj")]
-    report = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, timeout=60).stdout)
+    report = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
     glb, obj = report[: len(parts)], report[len(parts) :]
     for made, *both in zip(parts, glb, obj, strict=True):
         assert both[0][0] == both[1][0] and both[0][0][0] == made.material.name
@@ -213,7 +213,7 @@ def test_the_same_scene_gives_the_same_bytes_in_every_process(tmp_path: Path) ->
     script = "import json, pathlib, sys, test_tree_file as t; print(json.dumps(t.written(pathlib.Path(sys.argv[1]))))"
     command = [sys.executable, "-c", script, str(tmp_path)]
     environment = {**os.environ, "PYTHONHASHSEED": "1234", "PYTHONPATH": str(Path(__file__).parents[1])}
-    result = subprocess.run(command, check=True, stdout=subprocess.PIPE, cwd=Path(__file__).parent, env=environment, timeout=60)
+    result = subprocess.run(command, check=True, stdout=subprocess.PIPE, cwd=Path(__file__).parent, env=environment)
     assert json.loads(result.stdout) == first
 
 

@@ -1,4 +1,4 @@
-"""Packing by xatlas in a process of its own; that nothing overlaps is shown on the atlases in test_atlas.py."""
+"""xatlas in a process of its own; test_atlas.py and test_learned_mesh.py show that nothing overlaps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bbfit.exporting.packing import packed
+from bbfit.xatlas_process import packed
 
 CELLS = np.array([[3, 3], [4, 5], [2, 9], [40, 2]])
 
