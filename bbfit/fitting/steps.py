@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.movement import Movement
 from bbfit.geometry.alpha import AlphaMode
@@ -41,8 +41,8 @@ class Stepper:
         Its texels, on their device, are the start.
     targets : Targets
         Views to compare with.
-    config : FitConfig
-        A resolved configuration.
+    config : ResolvedFit
+        The configuration.
     movement : Movement, optional
         Placement to optimize; every step changes it.
     groups : int
@@ -50,11 +50,10 @@ class Stepper:
     """
 
     def __init__(
-        self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None, *, groups: int = 1
+        self, cloud: BillboardCloud, targets: Targets, config: ResolvedFit, movement: Movement | None = None, *, groups: int = 1
     ) -> None:
-        assert config.beta1 is not None and config.beta2 is not None
         self._cloud, self._movement, self._betas = cloud.without_textures(), movement, (config.beta1, config.beta2)
-        self._binarization = (config.binarization_weight or 0.0) / (targets.cameras.width * targets.cameras.height)
+        self._binarization = config.binarization_weight / (targets.cameras.width * targets.cameras.height)
         self._pass: Any = _pass_of(config)(self._cloud, targets, config, movement, groups)
         self._begin, self.steps = self._pass.adam.padded(cloud.texels), 0
 
@@ -100,7 +99,7 @@ class Stepper:
             self._movement.restore(tensors)
 
 
-def _pass_of(config: FitConfig) -> type[ReferencePass] | type[FusedPass]:
+def _pass_of(config: ResolvedFit) -> type[ReferencePass] | type[FusedPass]:
     if config.backend == "reference":
         from bbfit.fitting.reference_pass import ReferencePass
 
