@@ -125,8 +125,9 @@ def run(
         missed = None if met else config.budget.target_psnr
         record.head["config"]["fit"] = _plain(asdict(fit_config))  # the fit uses the chosen configuration
     max_bytes = config.budget.most_bytes
-    record.run(fit_stage(folder, views, tree, fit_config, None if max_bytes is None else (max_bytes, export), on_step), on_progress)
-    remove_checkpoint(folder)
+    limit = None if max_bytes is None else (max_bytes, export)
+    if record.run(fit_stage(folder, views, tree, fit_config, limit, on_step), on_progress):
+        remove_checkpoint(folder)
     cloud = BillboardCloud.load(folder / "cloud.safetensors")
     model = shipped_model(cloud, export)
     record.run(export_stage(folder, model), on_progress)
