@@ -163,7 +163,7 @@ def test_a_missing_mesh_is_said_to_be_missing(views: ViewSet, tmp_path: Path) ->
 def test_what_only_blender_reads_is_refused(views: ViewSet, tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"tree.{ending}"
     path.write_bytes(b"Kaydara FBX Binary")
-    with pytest.raises(InputError, match=rf"^tree: .*tree\.{ending} .*only Blender.*\.glb \.gltf \.obj \.ply \.stl"):
+    with pytest.raises(InputError, match=rf"^tree: only Blender .*tree\.{ending}; .*\.glb \.gltf \.obj \.ply \.stl"):
         mesh_points(TreeFile.open(path), views)
 
 
