@@ -21,8 +21,9 @@ from bbfit.cli import main
 from bbfit.cli.console import out_console
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import write_png
-from bbfit.pipeline import original_tree
 from bbfit.reporting.tables import report_table
+from bbfit.stages.results import original_tree
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.species import figures_file, known_species
 
 DATA = Path(__file__).resolve().parents[1] / "data"
@@ -86,7 +87,7 @@ def test_there_is_one_evaluation(kind: str, views_folder: Path, tmp_path: Path, 
     assert main(["evaluate", str(run / "cloud.safetensors"), str(views_folder), "--out", str(again), *tree, *options]) == 0
     printed = capsys.readouterr().out
     views = bbfit.ViewDataset.load(views_folder)
-    cloud, original = BillboardCloud.load(run / "cloud.safetensors"), original_tree(views, DATA / "tree.glb")
+    cloud, original = BillboardCloud.load(run / "cloud.safetensors"), original_tree(views, TreeFile.open(DATA / "tree.glb"))
     report = dataclasses.replace(bbfit.evaluate(cloud, views.test, export=export, original=original), seconds={})
     assert report.bytes.model == (run / "model.glb").stat().st_size and report.overdraw and report.sizes and report.vertices.ratio
     for path in (run / "metrics.json", again):
