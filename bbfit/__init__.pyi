@@ -24,12 +24,13 @@ from .rendering.dispatch import render as render
 from .rivals.config import CompareConfig as CompareConfig
 from .sweep.config import SweepConfig as SweepConfig
 from .sweep.scheduling import run_sweep as run_sweep
+from .tree_files.tree_file import TreeFile as TreeFile
 from .trees.config import GrowConfig as GrowConfig
 from .trees.growth import grow as grow
 from .trees.species import Species as Species
 from .trees.species import load_species as load_species
-from .trees.tree_file import write_tree as write_tree
-from .viewing.opening import view as view
+from .trees.tree_writer import write_tree as write_tree
+from .viewing.server import view as view
 from .views import ViewDataset as ViewDataset
 
 __version__: str

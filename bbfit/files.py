@@ -1,4 +1,4 @@
-"""Writing files completely or not at all: everything goes to a temporary name in the same folder and is renamed into place."""
+"""Write files atomically: under a temporary name in the same folder, then renamed. A file is complete or does not change."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from typing import TYPE_CHECKING, Any
 
 from bbfit.checks import fail
 
-if TYPE_CHECKING:  # growing a tree need not wait for torch
+if TYPE_CHECKING:  # importing torch would delay commands that do not need it
     from torch import Tensor
 
 PART = ".part"
-"""Ending of the temporary names, which start with a dot."""
+"""The suffix of temporary files, whose names start with a dot."""
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write ``data`` to ``path`` atomically; on any failure the old file stays as it was.
+    """Write ``data`` to ``path`` atomically. If this fails, an existing file stays as it was.
 
     Raises
     ------
     InputError
-        if the disk is full or the folder is missing or not writable; the partial file is removed.
+        If the disk is full, or the folder is missing or not writable. The temporary file is removed.
     """
     write_pieces(path, (data,))
 
 
 def write_pieces(path: str | Path, pieces: Iterable[bytes]) -> None:
-    """Write a file as :func:`write_bytes` does, one piece after the other, so that it need not fit into memory."""
+    """Write a file piece by piece, so that it need not fit in memory. Otherwise as :func:`write_bytes`, with the same errors."""
     path = Path(path)
     try:
         _replace(path, pieces)
@@ -53,27 +53,64 @@ def _replace(path: Path, pieces: Iterable[bytes]) -> None:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Write ``value`` as indented JSON atomically; NaN and infinity are refused."""
+    """Write ``value`` as indented JSON atomically, with the errors of :func:`write_bytes`.
+
+    Raises
+    ------
+    ValueError
+        If a number is NaN or infinite.
+    """
     write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
 def read_json(name: str, path: Path) -> Any:
-    """Read a JSON file, with an :class:`~bbfit.checks.InputError` that names it when it is damaged."""
+    """Read a JSON file.
+
+    Parameters
+    ----------
+    name
+        The name of the input in the error message.
+    path
+        The file.
+
+    Raises
+    ------
+    InputError
+        If the file is not valid JSON.
+    """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # also numbers too long and lists too deep to be read
+    except (ValueError, RecursionError) as error:  # very long numbers and very deep lists raise them too
         fail(name, f"{path} is not valid JSON ({error})", "remove the file or restore it")
 
 
 def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write a ``.safetensors`` file atomically."""
+    """Write a ``.safetensors`` file atomically, with the errors of :func:`write_bytes`."""
     from safetensors.torch import save
 
     write_bytes(path, save(dict(tensors), dict(metadata)))
 
 
 def output_folder(name: str, path: str | Path) -> Path:
-    """Create an output folder if need be and require that it can be written to; return it as a ``Path``."""
+    """Create an output folder if it does not exist, and remove temporary files of killed processes from it.
+
+    Parameters
+    ----------
+    name
+        The name of the option in the error message.
+    path
+        The folder.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    InputError
+        If ``path`` or a part of it is a file, or if the folder cannot be written to.
+    """
     path = Path(path)
     if path.exists() and not path.is_dir():
         fail(name, f"{path} is a file, not a folder", "choose another output folder")
@@ -81,8 +118,8 @@ def output_folder(name: str, path: str | Path) -> Path:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass
-        for leftover in path.glob(f".*{PART}"):  # of a process that was killed while it wrote
-            leftover.unlink(missing_ok=True)
+        for temporary in path.glob(f".*{PART}"):
+            temporary.unlink(missing_ok=True)
     except (FileExistsError, NotADirectoryError):
         fail(name, f"a part of {path} is a file, not a folder", "choose another output folder")
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Levels of detail: the tree, and ever smaller billboard clouds of it, in one file, each shown from where its error does not show."""
+"""Levels of detail: the tree and smaller and smaller billboard clouds of it in one file, each for distances that hide its error."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from bbfit.checks import fail
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import ExportConfig, LodConfig
-from bbfit.exporting.lod import LodLevel, glb_counts, lod_glb, stands_alone
+from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_a_meter
@@ -26,14 +26,14 @@ from bbfit.views import ViewDataset
 
 @dataclass(frozen=True)
 class LodResult:
-    """What :func:`build_lod` made."""
+    """The result of :func:`build_lod`."""
 
     path: Path
     """The GLB file."""
     folder: Path
-    """Where views and runs lie, and what was measured as ``lod.json`` and ``lod.png``."""
+    """The folder of the views, the runs, and the measurements ``lod.json`` and ``lod.png``."""
     levels: tuple[LodLevel, ...]
-    """The finest first."""
+    """The levels, finest first."""
 
 
 def build_lod(
@@ -45,41 +45,43 @@ def build_lod(
     work: str | Path | None = None,
     on_progress: OnProgress | None = None,
 ) -> LodResult:
-    """Render a tree, fit billboard clouds of several sizes, and write them and the tree as levels of detail in one GLB.
+    """Render a tree, fit billboard clouds of several sizes, and write the tree and the clouds as levels of detail to one GLB.
 
-    Each level reswitches the finer one at the distance from which its error stays below ``config.error_pixels``. The error is that of its
-    silhouette, in meters at the tree's axis, in the worst training view, with a margin for views between those. It shrinks in proportion
-    to the distance. No level is shown larger than the views that it was fitted to. Its textures are as fine as the screen can show at that
-    distance. Where the format of textures is left open it is ``auto``: KTX2 with mip levels if its encoder is installed, and PNG.
+    Each level replaces the next finer one at the distance from which its error stays below ``config.error_pixels``. The error is that of
+    its silhouette in the worst training view, in meters at the tree's axis, with a margin for the views in between. In pixels, it is
+    inversely proportional to the distance. No level is shown larger than the views of its fit. The textures of a level have the resolution
+    of the screen at its distance. The default format of textures is ``auto``: KTX2 with mip levels if its encoder is installed, and PNG.
 
-    A killed build continues where it stopped. Results with unchanged inputs are not made again.
+    A killed build continues where it stopped. Stages with current results are skipped.
 
     Parameters
     ----------
     tree
-        The tree, of any format that :func:`~bbfit.blender.views_folder.render_views` takes.
+        A tree in any format of :func:`~bbfit.blender.views_folder.render_views`.
     out
-        The GLB to write.
+        The .glb file to write.
+    config
+        The levels, and the error and the screen that determine their distances.
     stages
-        How views are rendered, and billboards fitted and exported. ``config.planes`` sets the numbers of billboards.
+        The options for rendering views and for fitting and exporting billboards. ``config.planes`` sets the numbers of billboards.
     work
-        Folder for views, one run for each level (named by its number of planes), ``lod.json`` and ``lod.png``. Default: ``out`` without
-        its ending.
+        The folder for views, one run for each level (named by its number of planes), ``lod.json`` and ``lod.png``. The default is ``out``
+        without its suffix.
     on_progress
         Called with the progress of each stage. The names of a level's stages start with its number of planes.
 
     Raises
     ------
     InputError, OSError
-        If an input cannot be used or something cannot be written. Earlier results stay as they were.
+        If an input cannot be used or a file cannot be written. Earlier results stay as they were.
     """
     config, stages, on_progress = config or LodConfig(), stages or RunConfig(), on_progress or silent
     out = Path(out)
     if out.suffix.lower() != ".glb":
-        fail("out", f"{out} ends in {out.suffix or 'nothing'}", "levels of detail are one .glb file")
+        fail("out", f"{out} ends in {out.suffix or 'nothing'}", "give a name that ends in .glb")
     output_folder("out's folder", out.parent)
     if stages.fit.billboards is not None or stages.budget.given:
-        fail("billboards", "planes sets the number of billboards of each level", "leave out billboards and budgets")
+        fail("billboards", "planes sets the number of billboards of each level", "omit billboards and budgets")
     tree = TreeFile.open(tree)
     folder = output_folder("work", work or out.with_suffix(""))
     record = Record(folder)
@@ -90,7 +92,7 @@ def build_lod(
     runs = [_fitted(folder, stages, planes, on_progress) for planes in config.planes]
     export = export_config(views, stages.export)
     if export.textures is None:
-        export = replace(export, textures="auto")  # mip levels matter most at a distance
+        export = replace(export, textures="auto")  # distant levels need mip levels
     record.run(_join_stage(folder, out, original, runs, views, config, export), on_progress)
     levels = read_json("levels of detail", folder / "lod.json")["levels"]
     return LodResult(out, folder, tuple(LodLevel(**level) for level in levels))
@@ -99,7 +101,7 @@ def build_lod(
 def _join_stage(
     folder: Path, out: Path, original: Path | None, runs: list[RunResult], views: ViewDataset, config: LodConfig, export: ExportConfig
 ) -> Stage:
-    """Join the original and the models of all runs to one file."""
+    """Join the original (if it is a level) and the models of all runs to one file."""
 
     def work(on_progress: OnProgress) -> None:
         switches = _switches(views, runs, config)
@@ -125,16 +127,16 @@ def _join_stage(
 
 @dataclass(frozen=True)
 class _Switch:
-    """Where a level reswitches the finer one."""
+    """The scale at which a level replaces the next finer one."""
 
     scale: float
-    """Pixels a meter on the screen below which it is shown; infinity for the finest level."""
+    """The level is shown below this scale, in pixels per meter on the screen. Infinity for the finest level."""
     error: float
-    """Meters by which its silhouette is off in the worst training view."""
-    unseen: float
-    """The same in the worst held-out view."""
+    """The error of its silhouette in the worst training view, in meters."""
+    held_out_error: float
+    """The error of its silhouette in the worst held-out view, in meters."""
     halvings: int
-    """How often the sides of its textures can be halved and still have a texel for each pixel."""
+    """How many times its textures can be halved and still have a texel for each pixel at that scale."""
 
 
 def _fitted(folder: Path, stages: RunConfig, planes: int, on_progress: OnProgress) -> RunResult:
@@ -147,20 +149,20 @@ def _fitted(folder: Path, stages: RunConfig, planes: int, on_progress: OnProgres
 
 def _original(record: Record, tree: TreeFile, config: LodConfig, on_progress: OnProgress) -> Path:
     """The tree as a GLB that others can be joined to."""
-    if config.triangles is None and stands_alone(tree.path):
+    if config.triangles is None and is_self_contained(tree.path):
         return tree.path
     record.run(convert_stage(record.folder, tree, "original.glb", triangles=config.triangles), on_progress)
     return record.folder / "original.glb"
 
 
 def _switches(views: ViewDataset, runs: list[RunResult], config: LodConfig) -> list[_Switch]:
-    """Where billboard clouds take over; the first from the start if it is the finest level."""
+    """The switch of each run. The first one has an infinite scale if it is the finest level."""
     view_scale = float(pixels_a_meter(views.train.cameras))
     switches = list[_Switch]()
     for fitted in runs:
-        error, unseen = (worst_silhouette(fitted.cloud, split) / view_scale for split in (views.train, views.test))
+        error, held_out_error = (worst_silhouette(fitted.cloud, split) / view_scale for split in (views.train, views.test))
         scale = min([view_scale, scale_within(error, config.error_pixels), *(switch.scale for switch in switches)])
-        switches.append(_Switch(scale, error, unseen, max(0, math.floor(math.log2(fitted.cloud.texel_density / scale)))))
+        switches.append(_Switch(scale, error, held_out_error, max(0, math.floor(math.log2(fitted.cloud.texel_density / scale)))))
     if not config.original:
         switches[0] = replace(switches[0], scale=math.inf, halvings=0)
     return switches
@@ -169,17 +171,17 @@ def _switches(views: ViewDataset, runs: list[RunResult], config: LodConfig) -> l
 def _levels(
     views: ViewDataset, models: list[bytes], fits: list[RunResult | None], switches: list[_Switch], config: LodConfig, name: str
 ) -> tuple[LodLevel, ...]:
-    """What is known of the levels."""
+    """The measurements of the levels."""
     view_scale = float(pixels_a_meter(views.train.cameras))
     assert views.request and views.request.tree.bounds
     low, high = views.request.tree.bounds
     height, radius = high[1] - low[1], math.dist(low, high) / 2
     focal = config.screen_height / 2 / math.tan(math.radians(config.screen_fov_degrees) / 2)
-    until = [*(switch.scale for switch in switches[1:]), 0.0]
+    next_scales = [*(switch.scale for switch in switches[1:]), 0.0]
     levels = list[LodLevel]()
-    for model, fitted, switch, least in zip(models, fits, switches, until, strict=True):
+    for model, fitted, switch, next_scale in zip(models, fits, switches, next_scales, strict=True):
         vertices, triangles = glb_counts(model)
-        shown = min(switch.scale, view_scale)
+        largest_scale = min(switch.scale, view_scale)
         levels.append(
             LodLevel(
                 name=f"{name}_LOD{len(levels)}",
@@ -188,12 +190,12 @@ def _levels(
                 triangles=triangles,
                 bytes=len(model),
                 error_meters=switch.error,
-                error_pixels=switch.error * shown,
-                held_out_error_pixels=switch.unseen * shown,
+                error_pixels=switch.error * largest_scale,
+                held_out_error_pixels=switch.held_out_error * largest_scale,
                 psnr=None if fitted is None else fitted.report.mean.over_white.psnr,
                 tree_pixels=None if math.isinf(switch.scale) else height * switch.scale,
                 distance_meters=focal / switch.scale,
-                screen_coverage=min(1.0, math.pi * (radius * least) ** 2 / (config.screen_width * config.screen_height)),
+                screen_coverage=min(1.0, math.pi * (radius * next_scale) ** 2 / (config.screen_width * config.screen_height)),
             )
         )
     return tuple(levels)

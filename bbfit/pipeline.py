@@ -1,4 +1,4 @@
-"""The main job: grow, views, budget, fit, export, evaluate, report. Each stage is done again only when its inputs change."""
+"""A run: grow, views, budget, fit, export, evaluate, report. A stage with current results is skipped."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from bbfit.files import output_folder
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.provenance import identity
 from bbfit.stages.billboards import budget_stage, fit_stage, read_choice, remove_checkpoint
 from bbfit.stages.results import evaluate_stage, export_config, export_stage, report_stage
 from bbfit.stages.stage import OnProgress, Record, Stage, record_head, silent
@@ -33,19 +32,19 @@ class RunConfig:
     """Options of every stage."""
 
     species: str | None = None
-    """What to grow when no tree is given: a quaking aspen if left open, or the one species in ``grow.species_file``."""
+    """The species to grow if no tree is given. Default: the only species in ``grow.species_file``, or a quaking aspen without that file."""
     tree: Path | None = None
-    """The mesh that a given folder of views shows, to place billboards by. Without it, the views alone decide the placement."""
+    """The mesh of the tree in a given folder of views, for placing billboards. Without it, the views alone decide the placement."""
     grow: GrowConfig = field(default_factory=lambda: GrowConfig(detail=0.5))
-    """Growing a tree, at moderate detail."""
+    """Options for growing a tree. The default is moderate detail."""
     views: ViewsConfig = field(default_factory=ViewsConfig)
-    """Rendering the tree."""
+    """Options for rendering the tree."""
     fit: FitConfig = field(default_factory=FitConfig)
-    """Fitting the billboards."""
+    """Options for fitting the billboards."""
     budget: BudgetConfig = field(default_factory=BudgetConfig)
-    """The limits of the result. They replace what ``fit`` leaves open."""
+    """Limits of the result. They determine the options of the fit that ``fit`` does not set."""
     export: ExportConfig = field(default_factory=ExportConfig)
-    """Writing the model."""
+    """Options for writing the model."""
 
 
 @dataclass(frozen=True)
@@ -59,19 +58,19 @@ class RunResult:
     report: Report
     """Their score on the held-out views."""
     skipped: tuple[str, ...]
-    """Stages whose results were current."""
+    """The names of the stages whose results were current."""
     missed: float | None = None
-    """The target PSNR in dB, if the trials of the budget did not reach it on validation views."""
+    """The target PSNR in dB, if the trials of the budget did not reach it on the validation views."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A run's folder after the tree and its views are there."""
+    """A run's folder with the tree and its views."""
 
     record: Record
     """The record of the folder."""
     tree: TreeFile | None
-    """The mesh to place billboards by, if there is one that can be read without Blender."""
+    """The mesh that places billboards. ``None`` if there is none, or if only Blender can read it."""
     views: ViewDataset
     """The views."""
 
@@ -84,19 +83,20 @@ def run(
     on_progress: OnProgress | None = None,
     on_step: Callable[[Step], None] | None = None,
 ) -> RunResult:
-    """Turn a tree, or views of one, into a measured billboard cloud with its model files.
+    """Convert a tree, or views of one, to a billboard cloud with model files, scores and a report.
 
-    Writes ``tree.glb`` (when none is given), ``views/`` (from a tree), ``cloud.safetensors``, ``model.glb``, ``model.obj/.mtl/.png``,
+    Writes ``tree.glb`` (if it grows the tree), ``views/`` (from a tree), ``cloud.safetensors``, ``model.glb``, ``model.obj/.mtl/.png``,
     ``metrics.json``, ``comparison.png``, ``report.html``, ``loss.png``, ``loss.csv`` and ``run.json`` (resolved configuration, versions,
-    seeds, seconds). A stage is skipped when its inputs are the same and nobody has changed its results. A killed run continues where it
-    stopped.
+    seeds, seconds). A stage is skipped if its inputs and its outputs have not changed. A killed run continues where it stopped.
 
     Parameters
     ----------
     source
-        A tree's file, a folder of views, or ``None`` to grow a tree.
+        The file of a tree, a folder of views, or ``None`` to grow a tree.
     out
-        The run's folder, created if need be.
+        The run's folder. It is created if it does not exist.
+    config
+        The options of all stages.
     on_progress
         Called with the progress of each stage.
     on_step
@@ -118,9 +118,9 @@ def run(
         record.run(budget_stage(folder, views, tree, fit_config, config.budget, export), on_progress)
         fit_config, met = read_choice(folder)
         missed = None if met else config.budget.target_psnr
-        record.head["config"]["fit"] = identity(asdict(fit_config))  # the choice is what is fitted
-    most = config.budget.most_bytes
-    record.run(fit_stage(folder, views, tree, fit_config, None if most is None else (most, export), on_step), on_progress)
+        record.head["config"]["fit"] = _plain(asdict(fit_config))  # the fit uses the chosen configuration
+    max_bytes = config.budget.most_bytes
+    record.run(fit_stage(folder, views, tree, fit_config, None if max_bytes is None else (max_bytes, export), on_step), on_progress)
     remove_checkpoint(folder)
     cloud = BillboardCloud.load(folder / "cloud.safetensors")
     model = shipped_model(cloud, export)
@@ -135,21 +135,22 @@ def run(
 def prepare(
     source: str | Path | TreeFile | None, out: str | Path, config: RunConfig | None = None, *, on_progress: OnProgress | None = None
 ) -> Prepared:
-    """The first stages of :func:`run`, with the same arguments and errors: grow a tree if none is given, and render its views."""
+    """Run the first stages of :func:`run`, with the same arguments and errors: grow a tree if none is given, and render its views."""
     config, on_progress = config or RunConfig(), on_progress or silent
-    given = Path(source) if isinstance(source, str | Path) and Path(source).is_dir() else None
-    if config.tree is not None and given is None:
-        fail("tree", f"{config.tree} is given beside {source or 'a tree to grow'}", "a mesh goes with a folder of views")
+    path = source.path if isinstance(source, TreeFile) else source
+    views_folder = Path(path) if path is not None and Path(path).is_dir() else None
+    if config.tree is not None and views_folder is None:
+        fail("tree", f"{config.tree} is given together with {path or 'a tree to grow'}", "give a mesh only with a folder of views")
     if source is None:
         species = load_species(config.species or (None if config.grow.species_file else "quaking_aspen"), config.grow.species_file)
         record = Record(output_folder("out", out), _head(species.name, config, grown=species, rendered=True))
         tree = _grown(record, grow_stage(record.folder, species, config.grow), on_progress)
     elif config.species is not None or config.grow != RunConfig().grow:
-        fail("run", f"{source} is given, so that no tree is grown", "leave out the species and the options of growing one")
-    elif given is not None:
-        views = ViewDataset.load(given, seed=config.fit.seed)  # before a folder is made for it
+        fail("run", f"{path} is given, so no tree is grown", "omit the species and the options for growing")
+    elif views_folder is not None:
+        views = ViewDataset.load(views_folder, seed=config.fit.seed)  # check the inputs before creating the output folder
         mesh = None if config.tree is None else TreeFile.open(config.tree)
-        return Prepared(Record(output_folder("out", out), _head(str(given.resolve()), config, rendered=False)), mesh, views)
+        return Prepared(Record(output_folder("out", out), _head(str(views_folder.resolve()), config, rendered=False)), mesh, views)
     else:
         tree = TreeFile.open(source)
         record = Record(output_folder("out", out), _head(str(tree.path.resolve()), config, rendered=True))
@@ -158,17 +159,17 @@ def prepare(
 
 
 def _grown(record: Record, stage: Stage, on_progress: OnProgress) -> TreeFile:
-    """The tree that a run grows into its folder, which must not hold the views of another tree."""
+    """Grow the tree of a run in its folder, which must not contain views of another tree."""
     path, earlier = record.folder / "tree.glb", record.stages.get(stage.name)
-    other = earlier["inputs"] != stage.key if earlier else not path.exists()
-    if other and (record.folder / "views").exists():
-        fail("out", f"{record.folder} holds the views of another tree", "choose another folder for this one")
+    is_other = earlier["inputs"] != stage.key if earlier else not path.exists()
+    if is_other and (record.folder / "views").exists():
+        fail("out", f"{record.folder} contains the views of another tree", "choose another folder for this one")
     record.run(stage, on_progress)
     return TreeFile.open(path)
 
 
 def _head(source: str, config: RunConfig, *, grown: Species | None = None, rendered: bool) -> dict[str, Any]:
-    """What is recorded of a run besides its stages."""
+    """The fields of a run's record besides its stages."""
     resolved = {
         "species": None if grown is None else asdict(grown),
         "grow": None if grown is None else asdict(config.grow),
@@ -183,14 +184,14 @@ def _head(source: str, config: RunConfig, *, grown: Species | None = None, rende
 
 
 def _facts(record: Record) -> dict[str, Any]:
-    """What the report shows of the record: options beside their usual values, seeds and versions."""
+    """The parts of the record that the report shows: options and their defaults, seeds and versions."""
     head = record.head
-    usual = RunConfig(fit=FitConfig(preset=head["config"]["fit"]["preset"]).resolve())
+    defaults = RunConfig(fit=FitConfig(preset=head["config"]["fit"]["preset"]).resolve())
     stages = ("grow", "views", "fit", "budget", "export")
     return {
         "source": Path(head["source"]).name,
-        "asked": {stage: options for stage in stages if (options := head["config"][stage]) is not None},
-        "usual": _plain(asdict(usual)),
+        "options": {stage: options for stage in stages if (options := head["config"][stage]) is not None},
+        "defaults": _plain(asdict(defaults)),
         "seeds": head["seeds"],
         "versions": head["versions"],
     }

@@ -1,7 +1,7 @@
-"""What makes a result current: the version of the algorithm that made it, the options that affect it, and the contents of its inputs.
+"""Cache keys: the version of an algorithm, the options that affect its result, and the contents of its inputs.
 
-Everything in bbfit that keeps results (runs, checkpoints, trials of a budget, sweeps, comparisons, levels of detail, views) compares keys
-from :func:`cache_key` and digests from this module. No other module has rules of its own.
+A stored result is current if its cache key is that of the requested result. All code in bbfit that stores results (runs, checkpoints,
+trials of a budget, sweeps, comparisons, levels of detail, views) compares keys from :func:`cache_key` and digests from this module.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from bbfit.checks import check_file
+
 VERSIONS: Mapping[str, int] = {
     "grow": 1,
     "convert": 1,
@@ -21,38 +23,48 @@ VERSIONS: Mapping[str, int] = {
     "budget": 3,
     "fit": 8,
     "export": 3,
-    "evaluate": 6,
+    "evaluate": 7,
     "report": 1,
     "lod": 1,
     "compare": 1,
 }
-"""Versions of the algorithms by name. Raise a number when the results for the same inputs change, so that old results are made again."""
+"""Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""
 EXECUTION = {"affects_result": False}
-"""Metadata of a dataclass field that affects how a result is computed, and not what it is: :func:`identity` leaves the field out."""
+"""Metadata of a dataclass field that affects the computation but not its result. :func:`identity` omits such fields."""
 
 
 def identity(value: Any) -> Any:
-    """Reduce a value to the plain JSON that decides whether two results are the same.
+    """Convert a value to JSON that is the same for two values exactly if both lead to the same result.
 
-    Dataclasses become mappings of their fields, without those that have the metadata :data:`EXECUTION`. Paths become the
-    name and the digest of their file. Whole floating point numbers become integers, so that 0 and 0.0 are the same.
+    Dataclasses become mappings of their fields, except the fields with the metadata :data:`EXECUTION`. A path becomes the name and the
+    digest of its file. Floating-point numbers without a fraction become integers, so that 0 and 0.0 are the same.
+
+    Parameters
+    ----------
+    value
+        A dataclass, mapping, list, tuple, path, number, string, boolean or ``None``, nested to any depth.
+
+    Returns
+    -------
+    Any
+        Mappings with string keys, lists, numbers, strings, booleans and ``None``.
 
     Raises
     ------
-    FileNotFoundError
-        If a path has no file.
+    MissingFileError, InputError
+        If the file of a path is missing or empty.
     TypeError
-        If a value has no JSON form.
+        If a value has another type.
     """
     if is_dataclass(value) and not isinstance(value, type):
-        kept = [entry for entry in fields(value) if entry.metadata.get("affects_result", True)]
-        return {entry.name: identity(getattr(value, entry.name)) for entry in kept}
+        included = [entry for entry in fields(value) if entry.metadata.get("affects_result", True)]
+        return {entry.name: identity(getattr(value, entry.name)) for entry in included}
     if isinstance(value, Mapping):
         return {str(key): identity(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [identity(entry) for entry in value]
     if isinstance(value, Path):
-        return {"name": value.name, "sha256": digest_file(value)}
+        return {"name": value.name, "sha256": digest_file(check_file("file", value))}
     if isinstance(value, float) and value.is_integer():
         return int(value)
     if value is None or isinstance(value, bool | int | float | str):
@@ -61,17 +73,30 @@ def identity(value: Any) -> Any:
 
 
 def cache_key(algorithm: str, *inputs: Any) -> str:
-    """SHA-256 over the name and version of an algorithm, as in :data:`VERSIONS`, and the identities of all of its inputs."""
+    """The key of an algorithm's result for some inputs.
+
+    Parameters
+    ----------
+    algorithm
+        A name in :data:`VERSIONS`.
+    *inputs
+        All values that the result depends on. They must have an :func:`identity`, whose errors are raised.
+
+    Returns
+    -------
+    str
+        SHA-256 over the name and the version of the algorithm and the identities of the inputs, as 64 hexadecimal digits.
+    """
     return sha256(json.dumps([algorithm, VERSIONS[algorithm], identity(inputs)], sort_keys=True).encode()).hexdigest()
 
 
 def digest_file(path: Path) -> str:
-    """SHA-256 of the contents of a file, as hexadecimal digits.
+    """SHA-256 of the contents of a file, as 64 hexadecimal digits.
 
     Raises
     ------
     FileNotFoundError
-        If there is no such file.
+        If the file does not exist.
     """
     digest = sha256()
     with path.open("rb") as file:
@@ -81,6 +106,6 @@ def digest_file(path: Path) -> str:
 
 
 def digest_files(files: Iterable[Path], folder: Path) -> str:
-    """SHA-256 over the contents of files and their paths relative to ``folder``; the digest of a single file is that file's own."""
+    """SHA-256 over the contents of files and their paths relative to ``folder``. A single file has the digest of its contents alone."""
     digests = [(Path(os.path.relpath(file, folder)).as_posix(), digest_file(file)) for file in files]
     return digests[0][1] if len(digests) == 1 else sha256(json.dumps(digests).encode()).hexdigest()

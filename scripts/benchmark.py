@@ -1,26 +1,25 @@
 """Measure speed, memory and quality: python scripts/benchmark.py [--quick] [--json FILE] [--views FOLDER ...] [--only NAME ...]
 
-Every row is measured in one run, and what is compared is measured in turns, so that ratios hold on a machine that is shared. With a GPU
-the rows about steps come once for each device. Rows by name:
+One run measures all rows. Alternatives are measured in turns, so that their ratios are valid on a shared machine. With a GPU, the rows
+about steps occur once for each device. The rows by name:
 
-grow      a tree grown and written as GLB, in a process of its own; seconds count importing bbfit
-copy      bytes a second of a plain copy in memory (read plus written)
-step      one training step (render, loss, gradient, update) at the default fit's last level, of evenly placed billboards with a texel a
-          pixel, by the reference renderer and by the fused kernels, of one view and, at 1024 x 1024, of the two that the preset takes;
-          bound_s is how long the bytes that it must move take at the speed of a copy
-thesis    the same of the thesis preset, whose billboards fill the viewport
-views     steps of more views
-quality   for each folder of views: the thesis preset's 10,000 steps by the fused kernels, what they would take by the reference
-          renderer (a step's time over 50 steps, times 10,000), and the default preset with as many billboards, without a
-          mesh; reached_s is when that fit, looked at every 25 steps, was first as good as the thesis preset's result in PSNR on the
-          held-out views, the search for a placement counted
-placement for each folder of views: the thesis preset with four two-sided billboards, by L2 and by L1, and the default preset, which has
-          as many vertices; only when asked for
-memory    the peak resident memory of a default fit of 360 views at 1024 x 1024, in a process of its own
+grow      growing a tree and writing it as GLB in a separate process; seconds include the import of bbfit
+copy      bytes per second of a plain copy in memory (read plus written)
+step      one training step (render, loss, gradient, update) at the default fit's last level, for evenly placed billboards with a texel
+          per pixel, by the reference renderer and by the fused kernels; one view, and at 1024 x 1024 also the two views of the preset;
+          bound_s is the time in which a plain copy moves the bytes that the step must move
+thesis    the same for the thesis preset, whose billboards fill the viewport
+views     steps of several views
+quality   for each folder of views: the 10,000 steps of the thesis preset by the fused kernels, an estimate of their time by the reference
+          renderer (the mean of 50 steps, times 10,000), and the default preset with as many billboards and without a mesh; reached_s is
+          the time, including the search for a placement, until that fit reaches the thesis preset's PSNR on the held-out views (checked
+          every 25 steps)
+placement for each folder of views: the thesis preset with four two-sided billboards, with L2 and with L1, and the default preset, which
+          has as many vertices; only with ``--only placement``
+memory    the peak resident memory of a default fit of 360 views at 1024 x 1024, in a separate process
 
-``--quick`` takes under a minute and leaves out the willow, the thesis, steps of two views, most numbers of
-billboards, quality and memory. ``--views`` are the
-folders for quality; without any it takes data/views. bound_s leaves out what SSIM and sharpness move.
+``--quick`` takes less than a minute. It omits the willow, the thesis, steps of two views, most numbers of billboards, quality and memory.
+``--views`` are the folders for quality, by default data/views. bound_s does not include the bytes that SSIM and sharpness move.
 """
 
 from __future__ import annotations
@@ -55,31 +54,31 @@ from bbfit.views import ViewSet
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 TREES = {"quaking_aspen": 0, "weeping_willow": 0}
-"""Species that are grown whole, and their seeds."""
+"""Species to grow with all their leaves, and their seeds."""
 WARM_STEPS = {"default": 160, "thesis": 1200}
-"""Steps at an eighth of the size; half as many at each finer level."""
+"""Number of steps at an eighth of the size. Each finer level has half as many."""
 Row = dict[str, Any]
 
 
 def own_process(script: str, *arguments: str) -> Row:
-    """Seconds that a Python script takes, with what it prints as its last line, JSON."""
-    begun = time.perf_counter()
+    """Run a Python script. Return the JSON object in its last line of output, with the seconds that it took."""
+    started = time.perf_counter()
     reading, writing = os.pipe()
     process = os.posix_spawn(
         sys.executable, [sys.executable, "-c", script, *arguments], os.environ, file_actions=[(os.POSIX_SPAWN_DUP2, writing, 1)]
     )
     os.close(writing)
     with os.fdopen(reading) as pipe:
-        printed = pipe.read()
+        output = pipe.read()
     _, status = os.waitpid(process, 0)
-    seconds = time.perf_counter() - begun
+    seconds = time.perf_counter() - started
     if status:
         raise SystemExit(f"a measurement failed with status {status}")
-    return json.loads(printed.splitlines()[-1]) | {"seconds": round(seconds, 2)}
+    return json.loads(output.splitlines()[-1]) | {"seconds": round(seconds, 2)}
 
 
 PEAK = """
-def peak():  # of this program's memory alone; what getrusage tells may be the parent's
+def peak():  # peak memory of this program alone, because getrusage can report that of the parent
     return int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0]) * 1024
 """
 
@@ -107,7 +106,7 @@ print(json.dumps({"views": len(views.train) + len(views.test), "fit_s": round(re
 
 
 def grow(quick: bool) -> list[Row]:
-    """Rows ``grow``."""
+    """Measure the rows ``grow``."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for name in list(TREES)[: 1 if quick else None]:
@@ -118,7 +117,7 @@ def grow(quick: bool) -> list[Row]:
 
 
 def enlarged(views: ViewSet, size: int) -> ViewSet:
-    """The same views in square pictures of another size."""
+    """Resize views to square pictures of another size."""
     pictures = {}
     for index, path in enumerate(views.paths):
         picture = views.image(index).permute(2, 0, 1)[None].float()
@@ -128,7 +127,7 @@ def enlarged(views: ViewSet, size: int) -> ViewSet:
 
 
 def seconds_of(work: Callable[[], object], device: torch.device) -> float:
-    """Seconds that ``work`` takes; on a GPU, of the device."""
+    """Seconds that ``work`` takes. On a GPU, this is the time of the device."""
     if device.type == "cuda":
         events = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
         events[0].record()
@@ -136,26 +135,26 @@ def seconds_of(work: Callable[[], object], device: torch.device) -> float:
         events[1].record()
         torch.cuda.synchronize()
         return events[0].elapsed_time(events[1]) / 1000
-    begun = time.perf_counter()
+    started = time.perf_counter()
     work()
-    return time.perf_counter() - begun
+    return time.perf_counter() - started
 
 
 def copy_speed(device: torch.device) -> float:
-    """Bytes a second, read plus written, of copying 64 MiB."""
+    """Bytes per second, read plus written, of copying 64 MiB."""
     source = torch.rand(1 << 24, device=device)
     target = torch.empty_like(source)
     return 2 * 4 * source.numel() / statistics.median(seconds_of(lambda: target.copy_(source), device) for _ in range(15))
 
 
 def warm(views: ViewSet, config: bbfit.FitConfig, device: torch.device) -> Stepper:
-    """A fused fit some way into its last level, so that what is empty is empty, as in most steps of a fit."""
+    """Advance a fused fit into its last level, where empty texels are empty, as in most steps of a fit."""
     start = start_cloud(views, config)
     cloud = random_textures(start, shrunk_sizes(start, 3), 0)
     for halvings in (3, 2, 1, 0):
         cloud = resize_textures(cloud, shrunk_sizes(start, halvings))
         stepper = Stepper(cloud.to(device), Targets.at(views, halvings), config)
-        # The thesis's rate is low and its billboards are large: emptying them takes long, but not at an eighth of the size.
+        # The thesis has a low learning rate and large billboards. Emptying them takes many steps, which are fast at an eighth of the size.
         for index in range(WARM_STEPS[config.preset] >> (3 - halvings)):
             stepper.step([(5 * index) % len(views)], config.learning_rate or 0.0)
         cloud = cloud.with_texels(stepper.texels.cpu())
@@ -163,7 +162,7 @@ def warm(views: ViewSet, config: bbfit.FitConfig, device: torch.device) -> Stepp
 
 
 def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torch.device, turns: int, copy: float) -> Row:
-    """A row ``step`` or ``thesis``."""
+    """Measure a row ``step`` or ``thesis``."""
     config, targets = config.resolve(), Targets.at(views, 0)
     fused = warm(views, config, device)
     start = start_cloud(views, config).to(device)
@@ -172,12 +171,12 @@ def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torc
     times: dict[str, list[float]] = {"reference": [], "fused": []}
     batch = config.views_per_step or 1
     for turn in range(turns):
-        chosen = [(turn * batch + index) % len(views) for index in range(batch)]
-        times["reference"].append(seconds_of(lambda chosen=chosen: reference.step(chosen, 0.01), device))  # type: ignore[misc]
+        sample = [(turn * batch + index) % len(views) for index in range(batch)]
+        times["reference"].append(seconds_of(lambda sample=sample: reference.step(sample, 0.01), device))  # type: ignore[misc]
         for index in range(4):
-            chosen = [((4 * turn + index) * batch + view) % len(views) for view in range(batch)]
-            times["fused"].append(seconds_of(lambda chosen=chosen: fused.step(chosen, 0.01), device))  # type: ignore[misc]
-    slow, fast = (statistics.median(times[which]) for which in ("reference", "fused"))
+            sample = [((4 * turn + index) * batch + view) % len(views) for view in range(batch)]
+            times["fused"].append(seconds_of(lambda sample=sample: fused.step(sample, 0.01), device))  # type: ignore[misc]
+    slow, fast = (statistics.median(times[name]) for name in ("reference", "fused"))
     moved = bytes_of_a_step(fused, views, batch, rest_after(config.beta1 or 0.0))
     return {
         "name": name,
@@ -196,19 +195,19 @@ def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torc
 
 
 def bytes_of_a_step(stepper: Stepper, views: ViewSet, batch: int, rest: int) -> int:
-    """Bytes that a step must move: targets once, touched texels read and their gradients added for each view, awake blocks updated."""
+    """Bytes that a step must move: for each view, the targets and the touched texels with their gradients; then the awake blocks."""
     state, steps = stepper.state, stepper.steps
     assert isinstance(state, AdamFused)
     touched = int((state.last == steps).sum()) * 4
     awake = int((steps - state.last <= rest).sum()) * 4
     pixels = views.cameras.width * views.cameras.height
-    # RGBA in float32 is 16 bytes. Touched texels are read, their gradient is read, written, and cleared; of awake ones three arrays are
-    # read and written; every gradient is looked at.
+    # RGBA in float32 is 16 bytes. A touched texel is read, and its gradient is read, written and cleared. For an awake texel, three arrays
+    # are read and written. Every gradient is read.
     return batch * (4 * pixels + 64 * touched) + 96 * awake + 16 * len(state.texels)
 
 
 def steps(quick: bool) -> list[Row]:
-    """Rows ``copy``, ``step``, ``thesis`` and ``views``."""
+    """Measure the rows ``copy``, ``step``, ``thesis`` and ``views``."""
     rows: list[Row] = []
     views = bbfit.ViewDataset.load(DATA / "views").train
     for device in [torch.device("cpu"), *([torch.device("cuda")] if torch.cuda.is_available() else [])]:
@@ -236,19 +235,19 @@ def steps(quick: bool) -> list[Row]:
 
 
 def views_rows(views: ViewSet, device: torch.device) -> list[Row]:
-    """Rows ``views``: fused steps of more than one view."""
+    """Measure the rows ``views``: fused steps of several views."""
     rows = []
     stepper = warm(views, bbfit.FitConfig(billboards=4, levels=1, placement="even", texel_density=1).resolve(), device)
     for count in (1, 2, 4, 8):
-        chosen = list(range(count))
-        seconds = statistics.median(seconds_of(lambda chosen=chosen: stepper.step(chosen, 0.01), device) for _ in range(20))  # type: ignore[misc]
+        sample = list(range(count))
+        seconds = statistics.median(seconds_of(lambda sample=sample: stepper.step(sample, 0.01), device) for _ in range(20))  # type: ignore[misc]
         rows.append({"name": "views", "device": device.type, "size": 512, "billboards": 4, "views": count, "fused_s": round(seconds, 5)})
         show(rows[-1])
     return rows
 
 
 def quality(folders: list[Path]) -> list[Row]:
-    """Rows ``quality``."""
+    """Measure the rows ``quality``."""
     rows = []
     for folder in folders:
         views = bbfit.ViewDataset.load(folder)
@@ -265,12 +264,12 @@ def quality(folders: list[Path]) -> list[Row]:
         }
         for name, config in {"thesis": thesis, "default": default}.items():
             clouds: list[tuple[float, BillboardCloud]] = []
-            begun = time.perf_counter()
-            cloud = bbfit.fit(views, config, on_step=partial(keep, clouds, begun) if name == "default" else None).cloud
-            seconds = time.perf_counter() - begun
+            started = time.perf_counter()
+            cloud = bbfit.fit(views, config, on_step=partial(keep, clouds, started) if name == "default" else None).cloud
+            seconds = time.perf_counter() - started
             scores = bbfit.evaluate(cloud, views.test).to_json()["over_white"]
             row |= {f"{name}_s": round(seconds, 2), **{f"{name}_{key}": round(value, 4) for key, value in scores.items()}}
-            # Scored afterwards; the fit knows nothing of it.
+            # Scored after the fit, which must not depend on the held-out views.
             for at, early in clouds:
                 if bbfit.evaluate(early, views.test).to_json()["over_white"]["psnr"] >= row["thesis_psnr"]:
                     row |= {"reached_s": round(at, 2), "ratio": round(slow * 10_000 / at, 1)}
@@ -281,7 +280,7 @@ def quality(folders: list[Path]) -> list[Row]:
 
 
 def placement(folders: list[Path]) -> list[Row]:
-    """Rows ``placement``."""
+    """Measure the rows ``placement``."""
     rows = []
     thesis = bbfit.FitConfig(preset="thesis", sides="two")
     fits = {"thesis l2": thesis, "thesis l1": replace(thesis, loss="l1")}
@@ -299,26 +298,26 @@ def placement(folders: list[Path]) -> list[Row]:
     return rows
 
 
-def keep(clouds: list[tuple[float, BillboardCloud]], begun: float, step: Step) -> None:
-    """Keep what a fit has after every 25 steps, with the seconds since it began; copying counts."""
+def keep(clouds: list[tuple[float, BillboardCloud]], started: float, step: Step) -> None:
+    """Store the cloud of a fit after every 25 steps, with the seconds since the start. They include the time for the copies."""
     if step.index % 25 == 0:
-        clouds.append((time.perf_counter() - begun, step.snapshot()))
+        clouds.append((time.perf_counter() - started, step.snapshot()))
 
 
 def reference_step(views: ViewSet, config: bbfit.FitConfig, steps: int = 50) -> float:
-    """Mean seconds of a step by the reference renderer, over ``steps`` steps after two."""
+    """Mean seconds of a step by the reference renderer, over ``steps`` steps after two warm-up steps."""
     config = replace(config.resolve(), backend="reference")
     stepper = Stepper(start_cloud(views, config), Targets.at(views, 0), config)
     for index in range(2):
         stepper.step([index % len(views)], 0.01)
-    begun = time.perf_counter()
+    started = time.perf_counter()
     for index in range(steps):
         stepper.step([index % len(views)], 0.01)
-    return (time.perf_counter() - begun) / steps
+    return (time.perf_counter() - started) / steps
 
 
 def memory() -> list[Row]:
-    """Rows ``memory``."""
+    """Measure the row ``memory``."""
     views = enlarged(bbfit.ViewDataset.load(DATA / "views").train, 1024)
     with tempfile.TemporaryDirectory() as folder:
         frames = []
@@ -347,25 +346,25 @@ def show(row: Row) -> None:
 
 
 def main() -> None:
-    """Measure, print, and write the rows where asked."""
+    """Measure the rows, print them, and write them to the file of ``--json``."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="under a minute")
-    parser.add_argument("--json", type=Path, help="file for the rows, a JSON list")
-    parser.add_argument("--views", type=Path, nargs="*", help="folders of views for the rows about quality")
-    parser.add_argument("--only", nargs="*", choices=["grow", "steps", "quality", "placement", "memory"], help="measure these only")
+    parser.add_argument("--quick", action="store_true", help="take less than a minute")
+    parser.add_argument("--json", type=Path, help="write the rows to this file as a JSON list")
+    parser.add_argument("--views", type=Path, nargs="*", help="folders of views for the rows quality and placement")
+    parser.add_argument("--only", nargs="*", choices=["grow", "steps", "quality", "placement", "memory"], help="measure only these rows")
     arguments = parser.parse_args()
-    wanted = arguments.only or (["grow", "steps"] if arguments.quick else ["grow", "steps", "quality", "memory"])
+    selected = arguments.only or (["grow", "steps"] if arguments.quick else ["grow", "steps", "quality", "memory"])
     rows: list[Row] = [
         {"name": "machine", "platform": platform.platform(), "processors": os.cpu_count(), "threads": torch.get_num_threads()}
     ]
-    if "steps" in wanted:
+    if "steps" in selected:
         rows += steps(arguments.quick)
-    if "quality" in wanted:
+    if "quality" in selected:
         rows += quality(arguments.views or [DATA / "views"])
-    if "placement" in wanted:
+    if "placement" in selected:
         rows += placement(arguments.views or [DATA / "views"])
     for name, measured in {"grow": lambda: grow(arguments.quick), "memory": memory}.items():
-        if name in wanted:
+        if name in selected:
             for row in measured():
                 rows.append(row)
                 show(row)

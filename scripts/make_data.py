@@ -1,6 +1,6 @@
-"""Make the small tree in data/ and its views: python scripts/make_data.py
+"""Write the small tree in data/ and its views: python scripts/make_data.py
 
-A young apple tree, grown by bbfit from figures that make it small; everything follows from SEED. The views need Blender.
+The tree is a young apple tree that bbfit grows with reduced parameters. SEED determines all random numbers. The views need Blender.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ VIEWS = bbfit.ViewsConfig(count=24, size=128, samples=64)
 
 
 def make_tree(seed: int) -> trimesh.Scene:
-    """A tree with a tenth of an apple tree's twigs and leaves, and larger leaves."""
+    """Grow a tree with a tenth of the twigs and leaves of an apple tree, and with larger leaves."""
     figures = replace(
         bbfit.load_species("apple"),
         name="young_apple",

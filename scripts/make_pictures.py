@@ -1,7 +1,10 @@
-"""Make the pictures in docs/: python scripts/make_pictures.py [species] [acer] [pages] (needs Blender; pages Chromium and playwright too)
+"""Write the pictures in docs/: python scripts/make_pictures.py [species] [acer] [pages]
 
-species.png has one view of every species that bbfit grows; acer.png held-out views of an acer, what the thesis preset makes of them, and
-what the default preset does with as many vertices; report.png and view.png the report of a run and its page in ``bbfit view``.
+All pictures need Blender. ``pages`` also needs Chromium and playwright.
+
+species    species.png: one view of every species that bbfit grows
+acer       acer.png: held-out views of an acer, and the results of the thesis preset and of the default preset with equal vertices
+pages      report.png and view.png: the report of a run, and its page in ``bbfit view``
 """
 
 from __future__ import annotations
@@ -21,12 +24,12 @@ from bbfit.trees.species import known_species
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SEED = 1
 SIZE = 480
-# Millions of leaves are more than a thumbnail needs.
+# A thumbnail does not need millions of leaves.
 LEAVES = {"weeping_willow": 0.3, "douglas_fir": 0.5, "silver_birch": 0.7}
 
 
 def picture(name: str, folder: Path) -> np.ndarray:
-    """A tree of the species over white, [H, W, 3], cut to what is not empty."""
+    """Render a tree of the species over white, [H, W, 3]."""
     tree = folder / f"{name}.glb"
     bbfit.write_tree(bbfit.grow(name, seed=SEED, leaves=LEAVES.get(name, 1.0)), tree)
     bbfit.render_views(tree, folder / name, bbfit.ViewsConfig(count=2, size=SIZE, samples=64))
@@ -35,7 +38,7 @@ def picture(name: str, folder: Path) -> np.ndarray:
 
 
 def acer() -> None:
-    """Draw acer.png: columns of views, of the thesis preset's four two-sided billboards and of the default preset's eight, blended."""
+    """Draw acer.png: the views, four two-sided billboards of the thesis preset, and eight blended billboards of the default preset."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "acer.glb"
         bbfit.write_tree(bbfit.grow("acer", seed=2), tree)
@@ -47,7 +50,7 @@ def acer() -> None:
 
 
 def draw_acer(views: bbfit.ViewDataset, thesis: bbfit.BillboardCloud, default: bbfit.BillboardCloud) -> None:
-    """Draw acer.png from what has been fitted."""
+    """Draw acer.png from two fitted clouds."""
     columns = {"held-out view": None, "thesis preset": thesis, "default preset": default}
     figure, axes = plt.subplots(2, 3, figsize=(12, 8.4))
     for column, (title, cloud) in zip(axes.T, columns.items(), strict=True):
@@ -64,7 +67,7 @@ def draw_acer(views: bbfit.ViewDataset, thesis: bbfit.BillboardCloud, default: b
 
 
 def species() -> None:
-    """Draw species.png: all of them in two rows."""
+    """Draw species.png with all species in two rows."""
     names = known_species()
     figure, axes = plt.subplots(2, len(names) // 2, figsize=(12, 6.9))
     with tempfile.TemporaryDirectory() as folder:
@@ -78,7 +81,7 @@ def species() -> None:
 
 
 def pages() -> None:
-    """Draw report.png and view.png: an acer's report and page as a browser shows them."""
+    """Draw report.png and view.png: screenshots of the report and the page of an acer."""
     with tempfile.TemporaryDirectory() as folder:
         views = bbfit.ViewsConfig(count=60, size=512)
         config = bbfit.RunConfig(species="acer", grow=bbfit.GrowConfig(seed=2, detail=0.5), views=views, fit=bbfit.FitConfig(billboards=16))
@@ -90,16 +93,16 @@ def draw_pages(run: Path) -> None:
     from playwright.sync_api import sync_playwright
 
     flags = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
-    with sync_playwright() as driver, bbfit.view(run, port=0) as page:
+    with sync_playwright() as driver, bbfit.view(run, port=0) as viewer:
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=flags)
         tab = browser.new_page(viewport={"width": 1180, "height": 1315})
         tab.goto((run / "report.html").resolve().as_uri())
         tab.screenshot(path=DOCS / "report.png")
         tab.close()
         tab = browser.new_page(viewport={"width": 1180, "height": 640})
-        tab.goto(page.url)
-        tab.locator(".mantine-Notification-closeButton").click(timeout=60_000)  # viser's remark on a browser without a graphics card
-        tab.wait_for_timeout(20_000)  # until what is measured is there
+        tab.goto(viewer.url)
+        while not tab.evaluate("Boolean(window.bbfit?.viewer?.idle) && !bbfit.viewer.state.tree.measuring"):
+            tab.wait_for_timeout(100)
         tab.screenshot(path=DOCS / "view.png")
         browser.close()
 

@@ -21,22 +21,68 @@ torch.set_num_threads(1)  # the suite runs in as many processes as there are cor
 
 TESTS = Path(__file__).resolve().parent
 SHARED = TESTS.parent / "../shared"
-# What the tests of a folder or a module need, by their places below this folder; scripts/test --fast leaves all of them out. Modules of
-# which only some tests need something mark these themselves.
-NEEDS = {
-    "blender": ("blender", "rivals/test_baking.py", "test_comparison.py"),
-    "browser": ("viewers", "viewing"),
+# The markers of the tests in a folder or a module, by places below this folder; scripts/test --fast leaves all of them out.
+MARKED = {
+    "blender": (
+        "blender",
+        "rivals/test_baking.py",
+        "rivals/test_crossed_and_sliced.py",
+        "sweep/test_scheduling.py",
+        "test_comparison.py",
+        "test_notebooks.py",
+        "test_pipeline.py",
+    ),
+    "browser": ("reporting/test_html.py", "viewers", "viewing"),
+    "node": ("exporting/test_formats.py", "exporting/test_lod.py", "exporting/test_model.py"),
     "ray": ("sweep/test_cluster.py",),
+    "slow": (
+        "exporting/test_splitting.py",
+        "fitting/test_loop.py",
+        "fitting/test_max_texels.py",
+        "fitting/test_search.py",
+        "fitting/test_steps.py",
+        "operators/test_kernels.py",
+        "rivals/test_learned_mesh.py",
+        "sweep/test_local.py",
+        "test_budget_runs.py",
+        "test_cli.py",
+        "test_docs.py",
+    ),
 }
+# The same for tests that use a fixture, directly or not.
+MARKED_FIXTURES = {"stand_ins": "blender"}
+
+# Modules that take long. They come first, so that no process is left with one of them when the others have nothing to do.
+FIRST = (
+    "test_readme.py",
+    "test_comparison.py",
+    "test_notebooks.py",
+    "sweep/test_cluster.py",
+    "sweep/test_scheduling.py",
+    "fitting/test_search.py",
+    "test_cli.py",
+    "viewers/test_fits.py",
+    "exporting/test_splitting.py",
+    "operators/test_kernels.py",
+    "operators/test_fused.py",
+    "fitting/test_loop.py",
+)
+
+assert all((TESTS / place).exists() for place in (*FIRST, *sum(MARKED.values(), ()))), "a module has moved"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests with what they need."""
+    """Mark tests by what they need, and put those that take long first."""
+    places = [TESTS / place for place in FIRST]
+    items.sort(key=lambda item: places.index(item.path) if item.path in places else len(places))
     for item in items:
-        place = item.path.relative_to(TESTS)
-        for need, places in NEEDS.items():
-            if any(place.is_relative_to(folder) for folder in places):
-                item.add_marker(need)
+        place = item.path.relative_to(TESTS) if item.path.is_relative_to(TESTS) else item.path
+        for marker, folders in MARKED.items():
+            if any(place.is_relative_to(folder) for folder in folders):
+                item.add_marker(marker)
+        for fixture, marker in MARKED_FIXTURES.items():
+            if fixture in getattr(item, "fixturenames", ()):
+                item.add_marker(marker)
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in MODULES}
 GROUPS = (
     ("checks",),
     ("provenance",),
-    ("files", "glb", "model_files"),
+    ("files", "glb", "model_files", "xatlas_process"),
     ("geometry",),
     ("layout",),
     ("images",),
@@ -54,9 +54,9 @@ def relative(path: Path) -> str:
 
 # Heavy or optional modules, and the only files that import them.
 ONLY_IN = {
-    "bpy": {"blender/worker.py", "blender/worker_glb.py"},
+    "bpy": {f"blender/{name}.py" for name in ("worker", "worker_scene", "worker_glb")},
     "cv2": {"images.py", "fitting/bounds.py"},
-    "xatlas": {"exporting/packing.py"},
+    "xatlas": {"xatlas_process.py"},
     "warp": {
         "operators/launching.py",
         "operators/drawing/projector.py",
@@ -65,13 +65,12 @@ ONLY_IN = {
     "ray": {"sweep/cluster.py"},
     "yaml": {"sweep/grid.py"},
     "jinja2": {"reporting/html.py"},
-    "viser": {"viewing/page.py", "viewing/panel.py", "viewing/planted.py", "viewing/visitor.py"},
     "mitsuba": {"rivals/mesh_rays.py"},
     "drjit": {"rivals/mesh_rays.py"},
     "fast_simplification": {"rivals/decimation.py", "rivals/learned_mesh.py"},
     "DracoPy": {"rivals/draco.py"},
 }
-NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "viser", "jinja2")
+NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "jinja2")
 
 
 def unit(path: Path) -> str:
@@ -138,6 +137,18 @@ def test_imports_go_downwards_only() -> None:
 )
 def test_the_import_rule_itself(file: str, source: str, allowed: bool) -> None:
     assert (not upward(PACKAGE / file, ast.parse(source))) == allowed
+
+
+def test_the_page_on_the_architecture_and_its_picture_show_the_same_layers() -> None:
+    layers = [set(group) for group in GROUPS if group != ("__main__",)]
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| \d+ \| (.*?) \|", page, re.MULTILINE)
+    assert [set(re.findall(r"`(\w+)`", row)) for row in rows] == layers
+    picture = (ROOT / "docs" / "figures" / "rooms.svg").read_text(encoding="utf-8")
+    heights: dict[int, set[str]] = {}
+    for height, name in re.findall(r'<text x="\d+" y="(\d+)" text-anchor="middle"><tspan font-weight="600">(\w+)</tspan>', picture):
+        heights.setdefault(int(height), set()).add(name)
+    assert [heights[height] for height in sorted(heights, reverse=True)] == layers
 
 
 def test_packages_do_not_import_their_modules_in_circles() -> None:

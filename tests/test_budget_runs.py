@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import pytest
 import torch
 
-from bbfit.budget import choice
-from bbfit.budget.choice import Trial
+from bbfit.budget.choice import Trial, model_bytes
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
+from bbfit.files import write_json
 from bbfit.fitting.config import FitConfig
+from bbfit.geometry.cloud import BillboardCloud
 from bbfit.pipeline import RunConfig, RunResult, run
-from bbfit.stages import billboards
+from bbfit.stages.billboards import fit_stage
+from bbfit.views import ViewDataset
 
 VIEWS = Path(__file__).resolve().parents[1] / "data" / "views"
 FIT = FitConfig(placement="even", steps=6, views_per_step=1)
@@ -36,26 +37,29 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     return run(VIEWS, tmp_path_factory.mktemp("budget") / "run", CONFIG)
 
 
-@pytest.fixture
-def trials_done(monkeypatch: pytest.MonkeyPatch) -> list[int | None]:
-    """Numbers of billboards of the short fits that are really done."""
-    fitted: list[int | None] = []
-    original = choice.fit
-
-    def watched(views: object, config: FitConfig, **options: object) -> object:
-        fitted.append(config.billboards)
-        return original(views, config, **options)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(choice, "fit", watched)
-    return fitted
-
-
 def written(folder: Path) -> dict:
     return json.loads((folder / "pareto.json").read_text())
 
 
 def trials_of(folder: Path) -> list[Trial]:
     return [Trial(**{name: value for name, value in trial.items() if name != "pareto"}) for trial in written(folder)["trials"]]
+
+
+KEPT = 12345.0
+"""Seconds that no trial takes: trials with them were not done again."""
+
+
+def tag(folder: Path) -> None:
+    """Give all trials on record the time of :data:`KEPT`."""
+    content = written(folder)
+    for trial in content["trials"]:
+        trial["seconds"] = KEPT
+    write_json(folder / "pareto.json", content)
+
+
+def kept(folder: Path) -> list[bool]:
+    """Which trials were not done again after :func:`tag`."""
+    return [trial.seconds == KEPT for trial in trials_of(folder)]
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
@@ -98,10 +102,10 @@ def test_the_record_holds_the_fit_that_was_chosen(done: RunResult) -> None:
     assert metrics["vertices"]["model"] == chosen.vertices
 
 
-def test_no_stage_is_done_twice(done: RunResult, trials_done: list[int | None]) -> None:
+def test_no_stage_is_done_twice(done: RunResult) -> None:
     before, told = snapshot(done.folder), []
     again = run(VIEWS, done.folder, CONFIG, on_progress=lambda *event: told.append(event))
-    assert again.skipped == STAGES and told == [] and trials_done == []
+    assert again.skipped == STAGES and told == []
     assert again.report == done.report and snapshot(done.folder) == before and torch.equal(again.cloud.texels, done.cloud.texels)
 
 
@@ -114,12 +118,13 @@ def killed_after_a_trial(folder: Path) -> None:
         run(VIEWS, folder, CONFIG, on_progress=kill)
 
 
-def test_a_killed_run_goes_on_with_the_trials_done(done: RunResult, tmp_path: Path, trials_done: list[int | None]) -> None:
+def test_a_killed_run_goes_on_with_the_trials_done(done: RunResult, tmp_path: Path) -> None:
     killed_after_a_trial(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["pareto.json"] and trials_done == [1]
+    assert [path.name for path in tmp_path.iterdir()] == ["pareto.json"]
+    tag(tmp_path)
     (first,), told = trials_of(tmp_path), []
     result = run(VIEWS, tmp_path, CONFIG, on_progress=lambda *event: told.append(event))
-    assert trials_done == [1, 2, 1] and result.skipped == ()
+    assert kept(tmp_path) == [True, False, False] and result.skipped == ()
     assert trials_of(tmp_path)[0] == first and untimed(trials_of(tmp_path)) == untimed(trials_of(done.folder))
     assert [event[:2] for event in told if event[0] == "budget"] == [("budget", index) for index in range(4)]
     assert all(event[1] <= event[2] for event in told)
@@ -136,35 +141,37 @@ def test_a_killed_run_goes_on_with_the_trials_done(done: RunResult, tmp_path: Pa
     ],
     ids=str,
 )
-def test_what_else_is_asked_for_is_chosen_anew(tmp_path: Path, trials_done: list[int | None], change: dict[str, object]) -> None:
+def test_what_else_is_asked_for_is_chosen_anew(tmp_path: Path, change: dict[str, object]) -> None:
     """Trials of another budget, or of other fits, do not count, though they would answer the question."""
     killed_after_a_trial(tmp_path)
+    tag(tmp_path)
     other = dataclasses.replace(CONFIG, **change)  # type: ignore[arg-type]
     result = run(VIEWS, tmp_path, other)
-    assert trials_done == [1, *([1, 2, 1] if other.budget == CONFIG.budget else [1])] and result.skipped == ()
+    assert kept(tmp_path) == [False] * (3 if other.budget == CONFIG.budget else 1) and result.skipped == ()
     assert written(tmp_path)["budget"] == {"vertices": other.budget.vertices} and result.cloud.vertex_count <= (other.budget.vertices or 0)
 
 
-def test_how_often_a_state_is_kept_is_no_matter(tmp_path: Path, trials_done: list[int | None]) -> None:
+def test_how_often_a_state_is_kept_is_no_matter(tmp_path: Path) -> None:
     killed_after_a_trial(tmp_path)
+    tag(tmp_path)
     run(VIEWS, tmp_path, dataclasses.replace(CONFIG, fit=dataclasses.replace(FIT, checkpoint_every=7)))
-    assert trials_done == [1, 2, 1]
+    assert kept(tmp_path) == [True, False, False]
 
 
-def test_only_what_is_lost_is_made_again(tmp_path: Path, trials_done: list[int | None]) -> None:
+def test_only_what_is_lost_is_made_again(tmp_path: Path) -> None:
     run(VIEWS, tmp_path, CONFIG)
+    tag(tmp_path)
     before = snapshot(tmp_path)
-    trials_done.clear()
     (tmp_path / "pareto.png").unlink()
-    assert run(VIEWS, tmp_path, CONFIG).skipped == STAGES[1:] and trials_done == []
+    assert run(VIEWS, tmp_path, CONFIG).skipped == STAGES[1:]
     assert snapshot(tmp_path)["pareto.png"] == before["pareto.png"] and snapshot(tmp_path)["pareto.json"] == before["pareto.json"]
     (tmp_path / "pareto.json").unlink()
-    assert run(VIEWS, tmp_path, CONFIG).skipped == STAGES[1:] and trials_done == [1, 2, 1]
+    assert run(VIEWS, tmp_path, CONFIG).skipped == STAGES[1:] and kept(tmp_path) == [False] * 3
 
 
-def test_a_run_without_a_budget_chooses_nothing(tmp_path: Path, trials_done: list[int | None]) -> None:
+def test_a_run_without_a_budget_chooses_nothing(tmp_path: Path) -> None:
     result = run(VIEWS, tmp_path, RunConfig(fit=dataclasses.replace(FIT, billboards=1)))
-    assert trials_done == [] and result.missed is None
+    assert result.missed is None
     assert not list(tmp_path.glob("pareto*")) and "budget" not in json.loads((tmp_path / "run.json").read_text())["stages"]
 
 
@@ -178,40 +185,32 @@ def test_a_target_that_is_missed_is_told(tmp_path: Path, target: float, missed: 
     assert written(tmp_path)["met"] is (missed is None) and written(tmp_path)["budget"] == {"vertices": 4, "target_psnr": target}
 
 
-@pytest.mark.parametrize("crisper", [0.9, 4.0])
-def test_the_model_has_no_more_bytes_than_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crisper: float) -> None:
-    """Even if the fit turns out much larger than the trials spoke for; a second run finds it done."""
-    monkeypatch.setattr(choice, "COUNTS", (1, 2))
-    monkeypatch.setattr(choice, "_CRISPER", crisper)
-    sizes: list[int] = []
-    original = billboards.within_bytes
-
-    def watched(cloud: object, most: int | None, export: ExportConfig) -> object:
-        sizes.append(choice.model_bytes(cloud, export))  # type: ignore[arg-type]
-        return original(cloud, most, export)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(billboards, "within_bytes", watched)
-    config = RunConfig(fit=FIT, budget=BudgetConfig(bytes="20k"), export=ExportConfig(padding=48))
+def test_the_model_has_no_more_bytes_than_asked_for(tmp_path: Path) -> None:
+    """A second run finds it done."""
+    config = RunConfig(fit=FIT, budget=BudgetConfig(bytes="20k", vertices=8), export=ExportConfig(padding=48))
     result = run(VIEWS, tmp_path, config)
     size = (tmp_path / "model.glb").stat().st_size
-    assert 10_000 < size <= 20_000 and len(sizes) == 1 and (sizes[0] > 30_000 if crisper > 1 else sizes[0] >= size)
-    assert result.report.bytes.model == size and written(tmp_path)["budget"] == {"bytes": "20k"}
+    assert 10_000 < size <= 20_000
+    assert result.report.bytes.model == size and written(tmp_path)["budget"] == {"bytes": "20k", "vertices": 8}
     assert all(trial.bytes <= 20_000 for trial in trials_of(tmp_path) if trial == trials_of(tmp_path)[written(tmp_path)["chosen"]])
     assert run(VIEWS, tmp_path, config).skipped == STAGES
 
 
-def test_the_same_fit_within_fewer_bytes_is_another_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where trials speak for the same configuration the limit still counts, and so does how the model is written."""
-    trial = Trial(1, "one", "even", None, 4, 5000, 15_000, 20.0, 1.0)
-    same = choice.Choice(dataclasses.replace(FIT, billboards=1).resolve(), (trial,), 0, True, ("0002",))
-    monkeypatch.setattr(billboards, "choose", lambda *arguments, **options: same)
-    texels = []
-    for limit, export in (("20k", ExportConfig()), ("10k", ExportConfig()), ("10k", ExportConfig(padding=48))):
-        result = run(VIEWS, tmp_path, RunConfig(fit=FIT, budget=BudgetConfig(bytes=limit), export=export))
-        assert (tmp_path / "model.glb").stat().st_size <= {"20k": 20_000, "10k": 10_000}[limit]
-        assert result.skipped == ()
-        texels.append(len(result.cloud.texels))
-    assert texels[0] > texels[1] > texels[2]
+def test_a_fit_much_larger_than_its_limit_is_cut_to_it(tmp_path: Path) -> None:
+    """The same fit within fewer bytes is another result, and so is one that is exported otherwise."""
+    views, config = ViewDataset.load(VIEWS), dataclasses.replace(FIT, billboards=2)
+    keys, texels = set(), []
+    for limit in (None, (20_000, ExportConfig()), (10_000, ExportConfig()), (10_000, ExportConfig(padding=48))):
+        stage = fit_stage(tmp_path, views, None, config, limit)
+        stage.work(lambda *event: None)
+        cloud = BillboardCloud.load(tmp_path / "cloud.safetensors")
+        if limit is None:
+            assert model_bytes(cloud, ExportConfig()) > 30_000
+        else:
+            assert 0.5 * limit[0] < model_bytes(cloud, limit[1]) <= limit[0]
+        keys.add(stage.key)
+        texels.append(len(cloud.texels))
+    assert len(keys) == 4 and texels[0] > texels[1] > texels[2] > texels[3]
 
 
 def test_a_limit_of_texels_holds_in_the_result(tmp_path: Path) -> None:
@@ -223,17 +222,13 @@ def test_a_limit_of_texels_holds_in_the_result(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("config", "says"),
     [
-        (dataclasses.replace(CONFIG, fit=dataclasses.replace(FIT, billboards=2)), "billboards: 2 are asked for and a budget"),
+        (dataclasses.replace(CONFIG, fit=dataclasses.replace(FIT, billboards=2)), "billboards: 2 are requested in addition to a budget"),
         (RunConfig(fit=FitConfig(preset="thesis"), budget=BudgetConfig(vertices=8)), "preset: 'thesis'"),
         (RunConfig(fit=FitConfig(sides="two"), budget=BudgetConfig(vertices=4)), "vertices: 4 are too few"),
     ],
 )
-def test_what_does_not_go_together_is_found_before_any_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: RunConfig, says: str
-) -> None:
-    nothing: Callable[..., None] = lambda *arguments, **options: pytest.fail("work was begun")  # noqa: E731
-    monkeypatch.setattr(choice, "fit", nothing)
-    monkeypatch.setattr(billboards, "fit", nothing)
+def test_what_does_not_go_together_is_found_before_any_work(tmp_path: Path, config: RunConfig, says: str) -> None:
+    fitted: list[str] = []
     with pytest.raises(InputError, match=says):
-        run(VIEWS, tmp_path, config)
-    assert not list(tmp_path.iterdir())
+        run(VIEWS, tmp_path, config, on_progress=lambda stage, done, total, note="": fitted.extend([stage] * (done > 0)))
+    assert not list(tmp_path.iterdir()) and fitted == []

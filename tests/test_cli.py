@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import resource
@@ -17,8 +18,12 @@ import trimesh
 
 import bbfit
 from bbfit.cli import main
+from bbfit.cli.console import out_console
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import write_png
+from bbfit.reporting.tables import report_table
+from bbfit.stages.results import original_tree
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.species import figures_file, known_species
 
 DATA = Path(__file__).resolve().parents[1] / "data"
@@ -62,14 +67,35 @@ def test_fit_writes_what_run_writes_for_the_same_views(views_folder: Path, fitte
         assert (tmp_path / name).read_bytes() == (fitted / name).read_bytes()
 
 
-def test_evaluate_writes_and_shows_the_measures(
-    fitted: Path, views_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "again.json"
-    assert main(["evaluate", str(fitted / "cloud.safetensors"), str(views_folder), "--out", str(path)]) == 0
-    again, before = json.loads(path.read_text()), json.loads((fitted / "metrics.json").read_text())
-    assert again["views"] == before["views"]
-    assert f"{before['over_white']['psnr']:.2f}" in capsys.readouterr().out
+EXPORTS = {
+    "default": ([], bbfit.ExportConfig()),
+    "blended": (
+        ["--export.alpha", "blend", "--export.split", "True", "--export.hull", "6", "--export.mip-files"],
+        bbfit.ExportConfig(alpha="blend", split=True, hull=6, mip_files=True),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", EXPORTS)
+def test_there_is_one_evaluation(kind: str, views_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A fit's metrics.json, the command's JSON and printout, and the library's report are equal but for the seconds."""
+    options, export = EXPORTS[kind]
+    run, again = tmp_path / "run", tmp_path / "again.json"
+    tree = ["--tree", str(DATA / "tree.glb")]
+    assert main(["fit", str(views_folder), "--out", str(run), "--placement", "even", *tree, *QUICK, *options]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(run / "cloud.safetensors"), str(views_folder), "--out", str(again), *tree, *options]) == 0
+    printed = capsys.readouterr().out
+    views = bbfit.ViewDataset.load(views_folder)
+    cloud, original = BillboardCloud.load(run / "cloud.safetensors"), original_tree(views, TreeFile.open(DATA / "tree.glb"))
+    report = dataclasses.replace(bbfit.evaluate(cloud, views.test, export=export, original=original), seconds={})
+    assert report.bytes.model == (run / "model.glb").stat().st_size and report.overdraw and report.sizes and report.vertices.ratio
+    for path in (run / "metrics.json", again):
+        found = bbfit.Report.load(path)
+        assert dataclasses.replace(found, seconds={}) == report and set(found.seconds) == {"fit", "export", "evaluate"}
+    out_console.print(report_table(report, thesis=False))
+    expected = [line.rstrip() for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert [line.rstrip() for line in printed.splitlines() if line.strip()][: len(expected)] == expected
 
 
 @pytest.mark.parametrize("name", ["tree.glb", "tree.obj"])
@@ -135,13 +161,11 @@ TRIALS = ["--placement", "even", "--steps", "3", "--views-per-step", "1"]
 def test_fit_within_a_budget(
     views_folder: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     options: list[str],
     limits: dict[str, object],
     tried: list[tuple[int, str]] | None,
 ) -> None:
-    monkeypatch.setattr("bbfit.budget.choice.COUNTS", (1, 2))
     assert main(["fit", str(views_folder), "--out", str(tmp_path), *TRIALS, *options]) == 0
     written = json.loads((tmp_path / "pareto.json").read_text())
     assert written["budget"] == limits and (tmp_path / "pareto.png").stat().st_size > 0
@@ -203,23 +227,21 @@ def test_a_budget_that_cannot_be_is_one_line(
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--vertices", "8", "--billboards", "2"], "bbfit: billboards: 2 are asked for and a budget as well; leave one of them out"),
-        (["--auto", "--preset", "thesis"], "bbfit: preset: 'thesis' is a schedule of its own"),
+        (["--vertices", "8", "--billboards", "2"], "bbfit: billboards: 2 are requested in addition to a budget; leave out one of them"),
+        (["--auto", "--preset", "thesis"], "bbfit: preset: 'thesis' cannot be combined with a budget"),
         (["--vertices", "4", "--sides", "two"], "bbfit: vertices: 4 are too few for one billboard"),
-        (["--bytes", "10"], "bbfit: budget: 1 billboard with "),
+        (["--bytes", "10", "--vertices", "4"], "bbfit: budget: 1 billboard with "),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_a_budget_that_cannot_be_kept_is_exit_code_2(
     views_folder: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     options: list[str],
     says: str,
 ) -> None:
     """What is wrong stands in the last line, after the progress."""
-    monkeypatch.setattr("bbfit.budget.choice.COUNTS", (1,))
     quick = [] if "--preset" in options else TRIALS
     assert main(["fit", str(views_folder), "--out", str(tmp_path), *quick, *options]) == 2
     assert capsys.readouterr().err.strip().splitlines()[-1].startswith(says)

@@ -85,7 +85,7 @@ def test_nothing_is_done_twice_and_a_missing_package_leaves_one_out(done: Compar
     times = {path: path.stat().st_mtime_ns for path in done.folder.glob("*/result.json")}
     told = list[str]()
     again = compare(TREE, done.folder, SMALL, STAGES, on_progress=lambda stage, now, total, note="": told.append(stage))
-    assert again.rows == done.rows and set(told) == {"views", "systems"}
+    assert again.rows == done.rows and set(told) == {"systems"}
     assert times == {path: path.stat().st_mtime_ns for path in done.folder.glob("*/result.json")}
     (done.folder / "draco" / "result.json").unlink()
     monkeypatch.setitem(sys.modules, "DracoPy", None)
@@ -98,7 +98,7 @@ def test_bad_input(tmp_path: Path) -> None:
         CompareConfig(systems=("octree",))
     with pytest.raises(InputError, match="slices: expected at least 1"):
         CompareConfig(slices=0)
-    with pytest.raises(InputError, match="billboards: the comparison says how many"):
+    with pytest.raises(InputError, match="billboards: the comparison sets their numbers"):
         compare(TREE, tmp_path, SMALL, RunConfig(fit=FitConfig(billboards=3)))
 
 

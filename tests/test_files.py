@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from full_disk import FULL, full_disk
 from safetensors import safe_open
 
 from bbfit.checks import InputError
@@ -26,21 +27,33 @@ def test_writing_replaces_and_leaves_nothing_else(tmp_path: Path) -> None:
     assert stat.S_IMODE(path.stat().st_mode) == 0o644
 
 
-@pytest.mark.parametrize("broken", ["os.fsync", "pathlib.Path.replace"])
+def test_a_full_disk_leaves_the_old_file_and_no_part(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    write_bytes(path, b"old")
+    with full_disk(), pytest.raises(InputError, match=FULL):
+        write_bytes(path, b"new")
+    assert path.read_bytes() == b"old" and names(tmp_path) == ["a.bin"]
+
+
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
-def test_a_failure_leaves_the_old_file_and_no_part(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, error: BaseException
-) -> None:
+def test_a_failure_leaves_the_old_file_and_no_part(tmp_path: Path, error: BaseException) -> None:
     path = tmp_path / "a.bin"
     write_bytes(path, b"old")
 
-    def break_off(*_: object) -> None:
+    def pieces() -> Iterator[bytes]:
+        yield b"ne"
         raise error
 
-    monkeypatch.setattr(broken, break_off)
     with pytest.raises(InputError if isinstance(error, OSError) else type(error)):
-        write_bytes(path, b"new")
+        write_pieces(path, pieces())
     assert path.read_bytes() == b"old" and names(tmp_path) == ["a.bin"]
+
+
+def test_what_cannot_be_put_in_its_place_leaves_no_part(tmp_path: Path) -> None:
+    (tmp_path / "a.bin" / "in the way").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"a\.bin cannot be written"):
+        write_bytes(tmp_path / "a.bin", b"new")
+    assert names(tmp_path) == ["a.bin"] and names(tmp_path / "a.bin") == ["in the way"]
 
 
 def test_pieces_make_one_file_or_none(tmp_path: Path) -> None:
@@ -116,10 +129,7 @@ def test_an_output_folder_that_is_a_file_or_within_one_is_refused(tmp_path: Path
     assert (tmp_path / "file").read_text() == "x"
 
 
-def test_an_output_folder_that_cannot_be_written_to_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(**_: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
-    with pytest.raises(InputError, match=r"^out: .* cannot be written to \(Permission denied\); choose"):
-        output_folder("out", tmp_path)
+def test_an_output_folder_that_cannot_be_written_to_is_refused() -> None:
+    """The system's own folder of processes holds no files of ours."""
+    with pytest.raises(InputError, match=r"^out: .* cannot be written to \(.*\); choose"):
+        output_folder("out", "/proc")

@@ -87,11 +87,10 @@ def stand_ins(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def place(stand_ins: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
+def place(stand_ins: Path, tmp_path: Path) -> Iterator[Place]:
     """A copy of the stand-ins, in which the test works."""
     folder = Path(shutil.copytree(stand_ins, tmp_path / "place"))
     (tmp_path / "scratch").mkdir()
-    monkeypatch.setattr("bbfit.budget.choice.COUNTS", (1, 2))
     with contextlib.chdir(folder):
         yield Place(folder, tmp_path / "scratch")
 
@@ -106,7 +105,13 @@ def small(words: list[str]) -> list[str]:
     if command == "views":
         return options(SMALL_VIEWS)
     page = ["--port", "0"] if "--watch" in given else []
-    few = {} if given & (BUDGETS | {"--billboards", "--fit.billboards"}) else {"billboards": 2}
+    few = (
+        {"vertices": 8}
+        if command == "fit" and given & BUDGETS
+        else {}
+        if given & (BUDGETS | {"--billboards", "--fit.billboards"})
+        else {"billboards": 2}
+    )
     if command == "fit":
         return [*options(SMALL_FIT | few), *page]
     if command == "run":
@@ -141,7 +146,7 @@ def run_bbfit(words: list[str], place: Place) -> None:
     arguments = expanded([*words, *small(words)])
     if "--ray" in words:
         with one_at_a_time("ray"):
-            subprocess.run([sys.executable, "-m", "bbfit.cli", *arguments], check=True)
+            subprocess.run([sys.executable, "-m", "bbfit.cli", *arguments], check=True, timeout=600)  # Ray may hang
     else:
         assert main(arguments) == 0
     if "--out" in words:
@@ -163,10 +168,10 @@ def look(words: list[str]) -> None:
                 line = process.stdout.readline()
                 assert line, f"bbfit view ended: {said}"
                 said += line
-            with urllib.request.urlopen(address[0], timeout=30) as answer:
+            with urllib.request.urlopen(address[0]) as answer:
                 assert b"<html" in answer.read().lower()
             process.send_signal(signal.SIGINT)
-            rest = process.communicate(timeout=60)[0]
+            rest = process.communicate()[0]
             assert process.returncode == 0, rest
         finally:
             process.kill()
@@ -206,7 +211,7 @@ def run_demo(words: list[str], place: Place) -> None:
 
 def run_tests(words: list[str], place: Place) -> None:
     """These tests are what the script runs: continuous integration calls nothing else."""
-    assert not words and re.search(r"^exec bash .*/scripts/test\b", (ROOT / ".ci/run").read_text(), re.MULTILINE)
+    assert words in ([], ["--fast"]) and re.search(r"^exec bash .*/scripts/test\b", (ROOT / ".ci/run").read_text(), re.MULTILINE)
     assert re.search(r"^.venv/bin/python -m pytest\b", (ROOT / "scripts/test").read_text(), re.MULTILINE)
 
 
@@ -263,7 +268,7 @@ def work_small(patch: pytest.MonkeyPatch, size: int = SMALL_VIEWS["size"]) -> No
         "grow": lambda species, **given: real["grow"](species, **given | SMALL_TREE),
         "render_views": lambda tree, out, config=None: real["render_views"](tree, out, views(config)),
         "fit": lambda data, config=None, **given: real["fit"](data, fit(config), **given),
-        "choose": lambda data, config, budget: real["choose"](data, fit(config), budget),
+        "choose": lambda data, config, budget: real["choose"](data, fit(config), replace(budget, vertices=8)),
         "run": lambda source, out, config=None: real["run"](source, out, stages(config)),
         "run_sweep": lambda out, config, **given: real["run_sweep"](
             out, replace(config, billboards=(2,), loss=("l2",), variants=("base",), steps=4, workers=1), grown, **given
@@ -328,7 +333,7 @@ def offered() -> set[str]:
 @each(PAGES)
 def test_options_and_commands_that_are_mentioned_exist(page: Path, offered: set[str]) -> None:
     text = prose(page)
-    other = {"--help", "--out", "--quick", "--fit...", "--strict"}
+    other = {"--help", "--fast", "--out", "--quick", "--fit...", "--strict"}
     mentioned = {option.rstrip(".") for option in re.findall(r"(?<![\w-])--[a-z][\w.-]*", text)}
     assert mentioned - other - offered <= {"--fit", "--views", "--export"}
     assert {name for name in re.findall(r"`bbfit ([a-z]+)", text)} <= set(_COMMANDS)

@@ -1,4 +1,4 @@
-"""Trees of any format as one GLB file, thinned out if asked, by Blender."""
+"""Convert a tree of any format to one GLB file with Blender, decimated on request."""
 
 from __future__ import annotations
 
@@ -14,37 +14,41 @@ _PIECE = 1 << 20
 
 
 def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int | None = None) -> Path:
-    """Write a tree as one self-contained GLB file, Y up in meters, where and how large :func:`~bbfit.blender.render_views` sees it.
+    """Write a tree as one self-contained GLB file, Y up in meters, at the place and size of :func:`~bbfit.blender.render_views`.
 
-    What Blender's glTF exporter keeps is kept: materials, texture coordinates, textures with their alpha, and vertex colors that a
-    material uses. Modifiers, shape keys and poses are applied, collections and curves turned into meshes; objects that share a mesh
-    go on to share it. Only what renders is written, without cameras, lights or animations. Surfaces without a material get the
-    renderer's plain one, gray or of their vertex colors. The same input gives the same bytes.
+    The file has everything that Blender's glTF exporter supports: materials, texture coordinates, textures with their alpha, and the
+    vertex colors that a material uses. Modifiers, shape keys and poses are applied. Collections and curves become meshes. Objects that
+    share a mesh still share it. The file contains only what renders, without cameras, lights and animations. Surfaces without a material
+    get the renderer's plain material, gray or in their vertex colors. The same input gives the same bytes.
 
-    With ``triangles`` edges are collapsed (Blender's Decimate modifier) over the whole tree at once, in one joint mesh; what is left
-    of the leaves is enlarged until they cover what they did before (Cook et al., "Stochastic Simplification of Aggregate Detail",
-    SIGGRAPH 2007). Leaves are told from stems by their material: none of its connected parts may be longer than a quarter of the
-    tree. So where leaves and bark share a material, leaves get fewer and the crown thinner. Enlarged leaves may stick out of the
-    tree's bounds a little.
+    ``triangles`` collapses edges (Blender's Decimate modifier) over the whole tree at once, in one joined mesh. The remaining leaves are
+    enlarged until they have their former area (Cook et al., "Stochastic Simplification of Aggregate Detail", SIGGRAPH 2007). A material
+    counts as foliage if none of its connected components is longer than a quarter of the tree. If leaves and bark share a material, the
+    tree loses leaves and its crown gets sparser. Enlarged leaves can extend slightly beyond the bounds of the tree.
 
     Parameters
     ----------
-    tree : .glb .gltf .obj .fbx .usd .usda .usdc .usdz (Y up, or as the file says), .ply .stl .blend (Z up).
-    out : the .glb file to write, in an existing folder; replaced at one go, or left as it was when anything fails.
-    triangles : at most so many triangles in all, at least 1; a mesh that several objects share counts for each. None, or more than
-        the tree has: all of them. Closed surfaces keep a few triangles each, so very small numbers are exceeded.
+    tree
+        A .glb, .gltf, .obj, .fbx, .usd, .usda, .usdc or .usdz file (Y up unless the file says otherwise), or a .ply, .stl or .blend file
+        (Z up).
+    out
+        The .glb file to write, in an existing folder. It is replaced atomically. If anything fails, it stays as it was.
+    triangles
+        The largest number of triangles, at least 1. A shared mesh counts once for each of its objects. ``None`` keeps all triangles.
+        Closed surfaces keep a few triangles each, so the result can exceed very small numbers.
 
     Returns
     -------
-    ``out`` as a path.
+    Path
+        ``out``.
 
     Raises
     ------
     MissingFileError, InputError
-        if the tree cannot be used, if ``out`` is no .glb, is the tree itself or cannot be written, if no triangle would be left, or
-        if there is no Blender.
+        If the tree cannot be used. If ``out`` is not a .glb, is the tree itself or cannot be written. If no triangle would remain. If
+        Blender is not installed.
     BlenderError
-        if Blender crashes.
+        If Blender crashes.
     """
     if triangles is not None:
         check_count("triangles", triangles)

@@ -1,4 +1,4 @@
-"""Rendering a tree by any cameras into a folder, slab by slab if asked, and what that shares with rendering views of it."""
+"""Render a tree with arbitrary cameras and clip distances, and the parts that this shares with rendering views."""
 
 from __future__ import annotations
 
@@ -23,15 +23,14 @@ from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, camera_to_nerf
 from bbfit.images import read_rgba
 from bbfit.tree_files.tree_file import TreeFile
 
-RECORD_FILE = "pictures.json"
-"""What :func:`render_pictures` notes beside its pictures: the tree, the light, the cameras and the clip distances."""
+PICTURES_FILE = "pictures.json"
+"""The file in which :func:`render_pictures` records its request: the tree, the light, the cameras and the clip distances."""
 FILTER_REACH = 2.0
-"""Pixels that a surface's picture reaches beyond it, rounded up: Cycles' filter (Blackman-Harris) spreads it 1.5 pixels about a pixel's
-center."""
-# Settings of views that cameras given one by one replace.
+"""How far, in pixels, the filter of Cycles spreads a surface beyond its outline. The Blackman-Harris filter reaches 1.5 pixels."""
+# The options of views that explicit cameras replace.
 _UNUSED = ("count", "size", "elevations", "fov_degrees", "orthographic", "axis")
-# How far a camera's intrinsics may be from what Blender is told, in pixels.
-_CENTERD = 1e-6
+# The largest difference in pixels between a camera's intrinsics and those that Blender can represent.
+_INTRINSICS_TOLERANCE = 1e-6
 
 
 def render_pictures(
@@ -43,32 +42,39 @@ def render_pictures(
     clips: Sequence[tuple[float, float]] | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
-    """Render a tree by given cameras with Blender's Cycles, in the light of its views.
+    """Render a tree with given cameras with Blender's Cycles, in the light of its views.
 
-    Writes ``0000.png`` and so on (straight-alpha RGBA, fully transparent where a camera sees nothing) and ``pictures.json`` with what
-    was asked. Started again with the same request, it renders what is missing or damaged, and nothing else; workers and device may
-    differ. Clip distances cut what the camera sees, and nothing else: what is cut away still casts shadows and reflects light.
+    Writes ``0000.png`` and so on (straight-alpha RGBA, fully transparent where a camera sees nothing), and ``pictures.json`` with the
+    request. A second call with the same request renders only missing and damaged pictures. Workers and device may differ. Clip distances
+    affect only what the camera sees: clipped parts still cast shadows and reflect light.
 
     Parameters
     ----------
-    tree : as for :func:`~bbfit.blender.views_folder.render_views`.
-    cameras : V pinhole or parallel cameras with square pictures of at most 16384 pixels, square pixels and a centerd principal point.
-    out : folder to write to; made if need be.
-    config : light, samples, denoising, device, workers and seed; the rest of it is not used.
-    clips : nearest and farthest distance from each camera along its axis that is seen, in meters, V pairs with 0 < nearest < farthest;
-        everything when left out.
-    on_progress : called with the number of finished pictures and of all pictures, at the start and after each picture.
+    tree
+        A tree, as for :func:`~bbfit.blender.views_folder.render_views`.
+    cameras
+        V pinhole or orthographic cameras with square pictures of at most 16384 pixels, square pixels and a centered principal point.
+    out
+        The folder for the pictures. It is created if it does not exist.
+    config
+        Light, samples, denoising, device, workers and seed. Its other options are ignored.
+    clips
+        The nearest and the farthest visible distance from each camera along its axis, in meters: V pairs with 0 < nearest < farthest. By
+        default everything is visible.
+    on_progress
+        Called with the number of finished pictures and the total number, at the start and after each picture.
 
     Returns
     -------
-    The V pictures' paths.
+    list of Path
+        The paths of the V pictures.
 
     Raises
     ------
     MissingFileError, InputError
-        if the tree or the cameras cannot be used, if ``out`` holds other pictures or cannot be written to, or if there is no Blender.
+        If the tree or the cameras cannot be used. If ``out`` contains other pictures or cannot be written to. If Blender is not installed.
     BlenderError
-        if Blender crashes again and again; finished pictures are kept.
+        If Blender crashes repeatedly. Finished pictures are kept.
     """
     cameras, out = cameras.batch().to(torch.float64), Path(out)
     _check(cameras, clips)
@@ -77,30 +83,30 @@ def render_pictures(
     request = replace(
         request,
         config={name: value for name, value in request.config.items() if name not in _UNUSED},
-        cameras=_described(cameras),
+        cameras=_cameras_as_json(cameras),
         clips=None if clips is None else [[float(end) for end in clip] for clip in clips],
     )
-    if request.check_same(out, RECORD_FILE) is None and out.is_dir() and any(out.glob("[0-9][0-9][0-9][0-9]*.png")):
-        fail("out", f"{out} holds pictures from elsewhere", f"choose another output folder, or remove {out} to render again")
+    if request.check_same(out, PICTURES_FILE) is None and out.is_dir() and any(out.glob("[0-9][0-9][0-9][0-9]*.png")):
+        fail("out", f"{out} contains pictures from elsewhere", f"choose another output folder, or remove {out} to render again")
     count, size = len(cameras), cameras.width
     paths = [out / f"{index:04}.png" for index in range(count)]
-    missing = [index for index, path in enumerate(paths) if not is_whole(path, size)]
+    missing = [index for index, path in enumerate(paths) if not is_intact(path, size)]
     on_progress = on_progress or (lambda done, total: None)
     on_progress(count - len(missing), count)
     if not missing:
         return paths
     require_bpy()
-    with BlenderPool(job(tree, config, size, len(missing))) as pool:
+    with BlenderPool(worker_settings(tree, config, size, len(missing))) as pool:
         points = to_y_up(pool.load()["payload"])
         output_folder("out", out)
-        request.save(out / RECORD_FILE)
-        seen = clips or [whole(points, position) for position in cameras.position]
-        report, kept = on_progress, count - len(missing)
-        pool.render(frames(cameras, paths, missing, seen, config.seed), config.workers, kept, lambda done: report(done, count))
+        request.save(out / PICTURES_FILE)
+        visible = clips or [clip_distances(points, position) for position in cameras.position]
+        report, finished = on_progress, count - len(missing)
+        pool.render(frames(cameras, paths, missing, visible, config.seed), config.workers, finished, lambda done: report(done, count))
     return paths
 
 
-def is_whole(path: Path, size: int) -> bool:
+def is_intact(path: Path, size: int) -> bool:
     """Whether a picture exists, can be decoded, and has the right size."""
     try:
         return read_rgba(path).shape == (size, size, 4)
@@ -109,17 +115,20 @@ def is_whole(path: Path, size: int) -> bool:
 
 
 def to_y_up(payload: bytes) -> NDArray[np.float64]:
-    """The vertices that Blender sends, in our world, [P, 3]."""
+    """Convert the vertices that Blender sends (raw float32, Z up) to the Y-up world, [P, 3]."""
     points = np.frombuffer(payload, np.float32).reshape(-1, 3)
     return points.astype(np.float64) @ np.array(Z_UP_TO_Y_UP)[:3, :3].T
 
 
 def vertical_axis(low: NDArray[np.floating], high: NDArray[np.floating], axis: str) -> Tensor:
-    """The point in the middle of a tree's height on the vertical line that cameras circle (``ViewsConfig.axis``), [3] float64.
+    """The point at half the tree's height on the vertical line that the cameras circle (``ViewsConfig.axis``), [3] float64.
 
     Parameters
     ----------
-    low, high : [3] corners of the tree's bounding box in meters.
+    low, high
+        The corners of the tree's bounding box in meters, [3] each.
+    axis
+        ``"auto"``, ``"origin"`` or ``"center"``.
     """
     target = torch.from_numpy((np.asarray(low, np.float64) + high) / 2)
     through_origin = all(low[i] <= 0 <= high[i] for i in (0, 2))
@@ -128,8 +137,8 @@ def vertical_axis(low: NDArray[np.floating], high: NDArray[np.floating], axis: s
     return target
 
 
-def job(tree: TreeFile, config: ViewsConfig, size: int, count: int) -> dict[str, Any]:
-    """What the worker needs to know for all of ``count`` pictures of ``size`` x ``size`` pixels."""
+def worker_settings(tree: TreeFile, config: ViewsConfig, size: int, count: int) -> dict[str, Any]:
+    """The worker's settings for ``count`` pictures of ``size`` x ``size`` pixels."""
     azimuth, elevation = math.radians(config.sun_azimuth), math.radians(config.sun_elevation)
     across = math.cos(elevation)
     return {
@@ -147,8 +156,8 @@ def job(tree: TreeFile, config: ViewsConfig, size: int, count: int) -> dict[str,
     }
 
 
-def whole(points: NDArray[np.float64], position: Tensor) -> tuple[float, float]:
-    """Clip distances of a camera at ``position``, [3], between which every point, [P, 3], lies if it lies before the camera."""
+def clip_distances(points: NDArray[np.float64], position: Tensor) -> tuple[float, float]:
+    """Clip distances in meters of a camera at ``position``, [3], that contain every point, [P, 3], in front of the camera."""
     reach = float(np.linalg.norm(points - position.numpy(), axis=-1).max() + 2 * np.ptp(points, axis=0).sum())
     return reach * 1e-5, reach
 
@@ -156,12 +165,12 @@ def whole(points: NDArray[np.float64], position: Tensor) -> tuple[float, float]:
 def frames(
     camera: Camera, paths: Sequence[Path], indices: Sequence[int], clips: Sequence[tuple[float, float]], seed: int
 ) -> list[dict[str, Any]]:
-    """What the worker needs for each picture; Blender's camera axes and its Z-up world are those of the NeRF-synthetic layout."""
+    """The worker's requests for the pictures ``indices``. Blender has the camera axes and the Z-up world of the NeRF-synthetic layout."""
     matrices = camera_to_nerf(camera.world_to_camera)
-    found = []
+    requests = []
     for index in indices:
         extent = camera.width / float(camera.intrinsics[index, 0, 0])  # at distance 1, or in meters when orthographic
-        found.append(
+        requests.append(
             {
                 "frame": index,
                 "path": str(paths[index].resolve()),
@@ -172,7 +181,7 @@ def frames(
                 "seed": (seed + index) % 2**31,
             }
         )
-    return found
+    return requests
 
 
 def _check(cameras: Camera, clips: Sequence[tuple[float, float]] | None) -> None:
@@ -183,8 +192,8 @@ def _check(cameras: Camera, clips: Sequence[tuple[float, float]] | None) -> None
     expected = torch.zeros_like(k)
     expected[:, 0, 0] = expected[:, 1, 1] = k[:, 0, 0]
     expected[:, :2, 2], expected[:, 2, 2] = (size - 1) / 2, 1
-    if not torch.allclose(k, expected, rtol=1e-9, atol=_CENTERD):
-        fail("cameras", "expected square pixels and the principal point in the middle of the picture")
+    if not torch.allclose(k, expected, rtol=1e-9, atol=_INTRINSICS_TOLERANCE):
+        fail("cameras", "expected square pixels and the principal point at the center of the picture")
     if clips is not None:
         if len(clips) != len(cameras):
             fail("clips", f"expected one pair for each of {len(cameras)} cameras, got {len(clips)}")
@@ -193,7 +202,7 @@ def _check(cameras: Camera, clips: Sequence[tuple[float, float]] | None) -> None
                 fail("clips", f"expected 0 < nearest < farthest, got {near} and {far}")
 
 
-def _described(cameras: Camera) -> dict[str, Any]:
+def _cameras_as_json(cameras: Camera) -> dict[str, Any]:
     return {
         "size": cameras.width,
         "orthographic": cameras.orthographic,

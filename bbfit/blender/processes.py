@@ -1,4 +1,4 @@
-"""Blender in processes of its own: started, fed frame by frame, watched, and replaced when one crashes."""
+"""Blender in worker processes: start them, send them frames, and replace those that crash."""
 
 from __future__ import annotations
 
@@ -18,16 +18,24 @@ from typing import Any
 from bbfit.checks import InputError, fail
 
 WORKER = Path(__file__).with_name("worker.py")
+"""The script that each worker process runs."""
 RESTARTS = 2
+"""How many crashed processes a render replaces."""
 _LOG_LINES = 3
 
 
 class BlenderError(InputError):
-    """Blender crashed; the message says where, what is kept, and what it said last."""
+    """Blender crashed. The message gives the place, the finished pictures, and the end of Blender's output."""
 
 
 def require_bpy() -> None:
-    """Refuse, with what to install, where there is no Blender."""
+    """Require that Blender's module bpy is installed.
+
+    Raises
+    ------
+    InputError
+        If it is not. The message says what to install.
+    """
     if importlib.util.find_spec("bpy") is None:
         fail(
             "Blender",
@@ -38,11 +46,11 @@ def require_bpy() -> None:
 
 
 class Blender:
-    """One worker process and the thread that listens to it. Events go to a queue as (worker, event) pairs."""
+    """One worker process, and a thread that reads its answers and puts them on a queue as (worker, event) pairs."""
 
-    def __init__(self, job: dict[str, Any], scratch: str, events: queue.Queue[tuple[Blender, dict[str, Any]]]) -> None:
+    def __init__(self, settings: dict[str, Any], scratch: str, events: queue.Queue[tuple[Blender, dict[str, Any]]]) -> None:
         self._log = tempfile.TemporaryFile()
-        # Own folders for what Blender leaves behind when it is killed, and no settings or add-ons of the user's.
+        # A scratch folder for the files that a killed Blender leaves behind, and no settings or add-ons of the user.
         environment = os.environ | {"TMPDIR": scratch, "TEMP": scratch, "TMP": scratch, "BLENDER_USER_RESOURCES": scratch}
         self._process = subprocess.Popen(
             [sys.executable, "-P", str(WORKER)],
@@ -50,11 +58,11 @@ class Blender:
             stdout=subprocess.PIPE,
             stderr=self._log,
             env=environment,
-            start_new_session=True,  # an interrupt from the keyboard is the parent's to handle
+            start_new_session=True,  # the parent handles keyboard interrupts
         )
         self._listener = threading.Thread(target=self._listen, args=(events,), daemon=True)
         self._listener.start()
-        self.send(job)
+        self.send(settings)
 
     @property
     def pid(self) -> int:
@@ -62,7 +70,7 @@ class Blender:
         return self._process.pid
 
     def send(self, request: dict[str, Any]) -> None:
-        """Hand over a job or a frame. A worker that is gone says so through its queue, not here."""
+        """Send the settings or a frame. If the worker has died, the queue gets an ``exit`` event, and this method raises nothing."""
         assert self._process.stdin
         try:
             self._process.stdin.write(json.dumps(request).encode() + b"\n")
@@ -82,17 +90,17 @@ class Blender:
             events.put((self, event | {"payload": payload}))
         events.put((self, {"event": "exit"}))
 
-    def last_words(self) -> str:
-        """Why the process ended and the last lines that it printed, on one line."""
+    def exit_reason(self) -> str:
+        """How the process ended, and the last lines of its output, on one line."""
         code = self._process.wait()
         self._log.seek(0)
         lines = self._log.read().decode(errors="replace").splitlines()
-        told = [line.strip() for line in lines if line.strip() and not line.startswith("Fra:")][-_LOG_LINES:]
+        output = [line.strip() for line in lines if line.strip() and not line.startswith("Fra:")][-_LOG_LINES:]
         reason = f"signal {-code}" if code < 0 else f"exit code {code}"
-        return f"{reason}; its last words: {' | '.join(told)}" if told else reason
+        return f"{reason}; its last output: {' | '.join(output)}" if output else reason
 
     def stop(self) -> None:
-        """End the process now."""
+        """Kill the process."""
         self._process.kill()
         self._process.wait()
         self._listener.join()
@@ -100,15 +108,15 @@ class Blender:
             try:
                 assert stream
                 stream.close()
-            except OSError:  # what was still to be flushed to a process that is gone
+            except OSError:  # data could not be flushed, because the process has ended
                 pass
 
 
 class BlenderPool:
-    """Blender processes that hold the same tree. A context manager: leaving it ends them all."""
+    """Blender processes that load the same tree. This is a context manager: leaving it kills all processes."""
 
-    def __init__(self, job: dict[str, Any]) -> None:
-        self._job = job
+    def __init__(self, settings: dict[str, Any]) -> None:
+        self._settings = settings
         self._events: queue.Queue[tuple[Blender, dict[str, Any]]] = queue.Queue()
         self._scratch = tempfile.TemporaryDirectory(prefix="bbfit-", ignore_cleanup_errors=True)
         self._workers: list[Blender] = []
@@ -122,7 +130,7 @@ class BlenderPool:
         self._scratch.cleanup()
 
     def _start(self, *, measure: bool) -> Blender:
-        self._workers.append(Blender(self._job | {"measure": measure}, self._scratch.name, self._events))
+        self._workers.append(Blender(self._settings | {"measure": measure}, self._scratch.name, self._events))
         return self._workers[-1]
 
     def _next(self) -> tuple[Blender, dict[str, Any]]:
@@ -132,62 +140,85 @@ class BlenderPool:
         return worker, event
 
     def load(self) -> dict[str, Any]:
-        """Start a first process and return what it says of the tree: ``vertices``, ``faces``, ``blender``, ``payload``."""
-        return self._first("reading", measure=True)
+        """Start the first process, which loads and measures the tree.
 
-    def convert(self, triangles: int | None) -> Path:
-        """Write the tree as a GLB file with at most about so many triangles; the file goes when the pool does.
+        Returns
+        -------
+        dict
+            ``vertices`` and ``faces`` (counts), ``blender`` (version), and ``payload`` (the vertices as raw float32, Z up).
 
         Raises
         ------
         BlenderError
-            when Blender crashes.
+            If Blender crashes.
         InputError
-            when the tree cannot be read or written.
+            If the tree cannot be used.
+        """
+        return self._start_first("reading", measure=True)
+
+    def convert(self, triangles: int | None) -> Path:
+        """Write the tree as a GLB file with at most about ``triangles`` triangles. Leaving the pool removes the file.
+
+        Raises
+        ------
+        BlenderError
+            If Blender crashes.
+        InputError
+            If the tree cannot be read or written.
         """
         path = Path(self._scratch.name) / "tree.glb"
-        self._job = self._job | {"convert": {"path": str(path), "triangles": triangles}}
-        self._first("converting", measure=False)
+        self._settings = self._settings | {"convert": {"path": str(path), "triangles": triangles}}
+        self._start_first("converting", measure=False)
         return path
 
-    def _first(self, doing: str, *, measure: bool) -> dict[str, Any]:
+    def _start_first(self, activity: str, *, measure: bool) -> dict[str, Any]:
         """Start a process and return its first answer."""
         self._start(measure=measure)
         worker, event = self._next()
         if event["event"] == "exit":
             raise BlenderError(
-                f"Blender: crashed while {doing} {self._job['tree']} ({worker.last_words()}); "
-                "open the file in Blender itself to see whether it is damaged"
+                f"Blender: crashed while {activity} {self._settings['tree']} ({worker.exit_reason()}); "
+                "open the file in Blender to see whether it is damaged"
             )
         return event
 
-    def render(self, frames: list[dict[str, Any]], workers: int, kept: int, on_done: Callable[[int], None]) -> None:
+    def render(self, frames: list[dict[str, Any]], workers: int, finished: int, on_done: Callable[[int], None]) -> None:
         """Render frames on the loaded process and ``workers - 1`` more.
 
-        A process that crashes is replaced and its frame tried again, :data:`RESTARTS` times in all. ``on_done`` is called with the
-        number of finished views after each; ``kept`` of them stood before.
+        A process that crashes is replaced, and its frame is rendered again. This happens at most :data:`RESTARTS` times.
+
+        Parameters
+        ----------
+        frames
+            The requests for pictures (:func:`~bbfit.blender.pictures.frames`).
+        workers
+            The number of processes.
+        finished
+            The number of pictures that exist already.
+        on_done
+            Called after each picture with the number of finished pictures, including those that existed already.
 
         Raises
         ------
         BlenderError
-            when Blender crashes once more.
+            If Blender crashes once more.
         InputError
-            when a picture cannot be written.
+            If a picture cannot be written.
         """
-        waiting, crashes, total = deque(frames), 0, kept + len(frames)
-        in_hand: dict[Blender, dict[str, Any]] = {}
+        waiting, crashes, total = deque(frames), 0, finished + len(frames)
+        assigned: dict[Blender, dict[str, Any]] = {}
 
-        def give(worker: Blender) -> None:
+        def assign(worker: Blender) -> None:
             if waiting:
-                in_hand[worker] = waiting.popleft()
-                worker.send(in_hand[worker])
+                assigned[worker] = waiting.popleft()
+                worker.send(assigned[worker])
 
-        give(self._workers[0])
+        assign(self._workers[0])
         for _ in range(min(workers, len(frames)) - 1):
             self._start(measure=False)
-        while kept < total:
+        while finished < total:
             worker, event = self._next()
-            frame = in_hand.pop(worker, None)
+            frame = assigned.pop(worker, None)
             if event["event"] == "exit":
                 crashes += 1
                 if frame is not None:
@@ -195,12 +226,12 @@ class BlenderPool:
                 if crashes > RESTARTS:
                     where = f"at {Path(frame['path']).name}" if frame else "while reading the tree"
                     raise BlenderError(
-                        f"Blender: crashed {crashes} times, last {where} ({worker.last_words()}); "
-                        f"{kept} of {total} views are finished and kept, start again to go on"
+                        f"Blender: crashed {crashes} times, last {where} ({worker.exit_reason()}); "
+                        f"{finished} of {total} views are finished and kept, start again to continue"
                     )
                 self._start(measure=False)
                 continue
             if event["event"] == "done":
-                kept += 1
-                on_done(kept)
-            give(worker)
+                finished += 1
+                on_done(finished)
+            assign(worker)

@@ -1,4 +1,4 @@
-"""What was asked of Blender for a folder of pictures, and what it found of the tree: the files ``views.json`` and ``pictures.json``."""
+"""The request for a folder of pictures and the measurements of the tree, as stored in ``views.json`` and ``pictures.json``."""
 
 from __future__ import annotations
 
@@ -17,52 +17,52 @@ from bbfit.tree_files.tree_file import TreeFile
 
 @dataclass(frozen=True)
 class RenderedTree:
-    """The tree that pictures show; ``None`` where a fact is not known."""
+    """The tree in the pictures. ``None`` marks an unknown value."""
 
     name: str | None = None
-    """Name of its file."""
+    """Name of its main file."""
     sha256: str | None = None
     """Digest of the tree (:class:`~bbfit.tree_files.tree_file.TreeFile`)."""
     bytes: int | None = None
-    """Size of all of its files."""
+    """Total size of its files."""
     up_axis: str | None = None
-    """The axis of its file that points up, ``"y"`` or ``"z"``."""
+    """The axis that points up in its file, ``"y"`` or ``"z"``."""
     vertices: int | None = None
-    """Vertices that Blender counted."""
+    """Number of vertices in Blender."""
     faces: int | None = None
-    """Triangles that Blender counted."""
+    """Number of triangles in Blender."""
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     """Lowest and highest corner of its bounding box in meters, Y up."""
 
 
 @dataclass(frozen=True)
 class ViewsRequest:
-    """A request to render pictures of a tree, and what is known of its outcome."""
+    """A request to render pictures of a tree, and its outcome as far as it is known."""
 
     config: Mapping[str, Any]
     """The :func:`~bbfit.provenance.identity` of the :class:`~bbfit.blender.config.ViewsConfig`."""
     tree: RenderedTree
     """The tree."""
     version: int = VERSIONS["views"]
-    """Version of the rendering."""
+    """Version of the rendering (:data:`~bbfit.provenance.VERSIONS`)."""
     bbfit: str | None = None
     """Version of bbfit."""
     blender: str | None = None
     """Version of Blender."""
     camera: Mapping[str, Any] | None = None
-    """Views on rings: ``target``, the point in meters that all cameras look at, and ``distance``, theirs from it in meters."""
+    """For views on rings: ``target``, the point that all cameras look at, and ``distance``, their distance from it, both in meters."""
     cameras: Mapping[str, Any] | None = None
-    """Pictures by cameras that were given one by one: those cameras."""
+    """For pictures with explicit cameras: the cameras."""
     clips: list[list[float]] | None = None
-    """Their clip distances in meters, if there are any."""
+    """For pictures with explicit cameras: the clip distances in meters, if there are any."""
     seconds: float = 0.0
     """Time spent rendering, over all attempts."""
     complete: bool = False
-    """Whether all pictures were rendered."""
+    """Whether all pictures are rendered."""
 
     @staticmethod
     def of(tree: TreeFile, config: ViewsConfig) -> ViewsRequest:
-        """The request for views of a tree, before anything is rendered.
+        """The request for views of a tree before rendering.
 
         Raises
         ------
@@ -76,7 +76,7 @@ class ViewsRequest:
 
     @staticmethod
     def load(path: Path) -> ViewsRequest | None:
-        """Read a request; ``None`` if the file was not written by bbfit. Facts of another type than expected count as unknown.
+        """Read a request. The result is ``None`` if bbfit did not write the file. Values of an unexpected type count as unknown.
 
         Raises
         ------
@@ -89,7 +89,8 @@ class ViewsRequest:
         kinds = {"name": str, "sha256": str, "bytes": int, "up_axis": str, "vertices": int, "faces": int, "bounds": list}
         facts: dict[str, Any] = {name: value for name, kind in kinds.items() if isinstance(value := content["tree"].get(name), kind)}
         types = {"version": int, "bbfit": str, "blender": str, "camera": dict, "cameras": dict, "clips": list, "complete": bool}
-        known: dict[str, Any] = {name: value for name, kind in types.items() if isinstance(value := content.get(name), kind)}
+        known: dict[str, Any] = {"version": 1}  # files from before there was a version
+        known |= {name: value for name, kind in types.items() if isinstance(value := content.get(name), kind)}
         config = content.get("config")
         seconds = content.get("seconds")
         return ViewsRequest(
@@ -100,18 +101,30 @@ class ViewsRequest:
         )
 
     def save(self, path: Path) -> None:
-        """Write the request, without what is not known."""
+        """Write the request. Unknown values are omitted."""
         content = {name: value for name, value in asdict(self).items() if value is not None}
         content["tree"] = {name: value for name, value in content["tree"].items() if value is not None}
         write_json(path, content)
 
     def check_same(self, folder: Path, file: str) -> ViewsRequest | None:
-        """The earlier request in ``folder``, which must be for the same pictures; ``None`` if there is none.
+        """Compare the request with an earlier one, which must be for the same pictures.
+
+        Parameters
+        ----------
+        folder
+            The folder of the pictures.
+        file
+            The name of the request's file in it.
+
+        Returns
+        -------
+        ViewsRequest or None
+            The earlier request. ``None`` if the file does not exist.
 
         Raises
         ------
         InputError
-            If ``folder`` holds pictures of another request; the message names the first difference.
+            If the earlier request differs. The message names the first difference.
         """
         path, hint = folder / file, f"choose another output folder, or remove {folder} to render again"
         if not path.is_file():
@@ -122,13 +135,13 @@ class ViewsRequest:
         for name, value in self.config.items():
             before = earlier.config.get(name)
             if before != value:
-                fail("out", f"{folder} holds pictures with {name} {_shown(before)}, not {_shown(value)}", hint)
+                fail("out", f"{folder} contains pictures with {name} {_shown(before)}, not {_shown(value)}", hint)
         if earlier.tree.sha256 != self.tree.sha256:
             other = "another tree," if earlier.tree.name != self.tree.name else "an earlier version of"
-            fail("out", f"{folder} holds pictures of {other} {earlier.tree.name}", hint)
+            fail("out", f"{folder} contains pictures of {other} {earlier.tree.name}", hint)
         for name in ("version", "cameras", "clips"):
             if getattr(earlier, name) != getattr(self, name):
-                fail("out", f"{folder} holds pictures with other {name}", hint)
+                fail("out", f"{folder} contains pictures with other {name}", hint)
         return earlier
 
 

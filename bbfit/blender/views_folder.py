@@ -1,4 +1,4 @@
-"""Rendering views of a tree into a folder: what is asked, what stands already, what is still to do."""
+"""Render views of a tree into a folder. Views that exist already are kept."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.pictures import FILTER_REACH, frames, is_whole, job, to_y_up, vertical_axis, whole
+from bbfit.blender.pictures import FILTER_REACH, clip_distances, frames, is_intact, to_y_up, vertical_axis, worker_settings
 from bbfit.blender.processes import BlenderError, BlenderPool, require_bpy
 from bbfit.blender.request import ViewsRequest
 from bbfit.checks import fail
@@ -34,35 +34,40 @@ def render_views(
 ) -> Path:
     """Render views of a tree with Blender's Cycles.
 
-    Writes ``images/0000.png`` and so on (straight-alpha RGBA), ``transforms_train.json``, ``transforms_test.json`` and
-    ``views.json`` (what was asked and what was found of the tree; ``"complete": true`` when all is there). The transforms are
-    written last, so a half-finished folder has none. Every vertex is in every picture. Started again with the same tree and the
-    same settings, other than workers and device, it renders the views that are still missing or damaged, and no others.
+    Writes ``images/0000.png`` and so on (straight-alpha RGBA), ``transforms_train.json``, ``transforms_test.json`` and ``views.json``
+    (the request and the measurements of the tree, with ``"complete": true`` once all views are rendered). The transforms are written
+    last, so an unfinished folder has none. Every picture contains every vertex. A second call with the same tree and options renders only
+    missing and damaged views. Workers and device may differ.
 
     Parameters
     ----------
-    tree : .glb .gltf .obj .fbx .usd .usda .usdc .usdz (Y up, or as the file says), .ply .stl .blend (Z up).
-    out : folder to write to; made if need be.
-    on_progress : called with the number of finished views and of all views, at the start and after each view.
+    tree
+        A .glb, .gltf, .obj, .fbx, .usd, .usda, .usdc or .usdz file (Y up unless the file says otherwise), or a .ply, .stl or .blend file
+        (Z up).
+    out
+        The folder for the views. It is created if it does not exist.
+    on_progress
+        Called with the number of finished views and the total number, at the start and after each view.
 
     Returns
     -------
-    ``out`` as a path.
+    Path
+        ``out``.
 
     Raises
     ------
     MissingFileError, InputError
-        if the tree cannot be used, if ``out`` holds other views or cannot be written to, or if there is no Blender. Earlier views
-        are left as they were.
+        If the tree cannot be used. If ``out`` contains other views or cannot be written to. If Blender is not installed. Existing views
+        stay as they were.
     BlenderError
-        if Blender crashes again and again; finished views are kept.
+        If Blender crashes repeatedly. Finished views are kept.
     """
     config, out, tree = config or ViewsConfig(), Path(out), TreeFile.open(tree)
     request = ViewsRequest.of(tree, config)
     earlier = _earlier(out, request)
     images = out / "images"
     paths = [images / f"{index:04}.png" for index in range(config.count)]
-    missing = [index for index, path in enumerate(paths) if not is_whole(path, config.size)]
+    missing = [index for index, path in enumerate(paths) if not is_intact(path, config.size)]
     report = on_progress or (lambda done, total: None)
     if earlier and earlier.complete and not missing and (out / TRAIN_FILE).is_file() and (out / TEST_FILE).is_file():
         report(config.count, config.count)
@@ -70,7 +75,7 @@ def render_views(
 
     started, spent = time.monotonic(), earlier.seconds if earlier else 0.0
     require_bpy()
-    with BlenderPool(job(tree, config, config.size, len(missing))) as pool:
+    with BlenderPool(worker_settings(tree, config, config.size, len(missing))) as pool:
         measured = pool.load()
         points = to_y_up(measured["payload"])
         camera, target, distance = _cameras(points, config)
@@ -92,10 +97,10 @@ def render_views(
             save()
             report(done, config.count)
 
-        kept = config.count - len(missing)
-        on_done(kept)
-        clips = [whole(points, camera.position[0])] * config.count
-        pool.render(frames(camera, paths, missing, clips, config.seed), config.workers, kept, on_done)
+        finished = config.count - len(missing)
+        on_done(finished)
+        clips = [clip_distances(points, camera.position[0])] * config.count
+        pool.render(frames(camera, paths, missing, clips, config.seed), config.workers, finished, on_done)
     train, test = split_views(config.count, config.seed)
     write_transforms(out, camera, [f"images/{path.name}" for path in paths], train, test)
     save(complete=True)
@@ -103,7 +108,7 @@ def render_views(
 
 
 def _earlier(out: Path, request: ViewsRequest) -> ViewsRequest | None:
-    """The request that an earlier start left in ``out``, which must be the same."""
+    """The request that an earlier call recorded in ``out``. It must be for the same views."""
     if out.exists() and not out.is_dir():
         fail("out", f"{out} is a file, not a folder", "choose another output folder")
     earlier = request.check_same(out, REQUEST_FILE)
@@ -111,12 +116,12 @@ def _earlier(out: Path, request: ViewsRequest) -> ViewsRequest | None:
         foreign = [out / name for name in (TRAIN_FILE, TEST_FILE, SINGLE_FILE) if (out / name).exists()]
         foreign += sorted((out / "images").glob("[!.]*"))[:1]
         if foreign:
-            fail("out", f"{out} holds views from elsewhere ({foreign[0].name})", "choose another output folder")
+            fail("out", f"{out} contains views from elsewhere ({foreign[0].name})", "choose another output folder")
     return earlier
 
 
 def _cameras(points: NDArray[np.float64], config: ViewsConfig) -> tuple[Camera, torch.Tensor, float]:
-    """Cameras that see every point, the point that they look at and their distance from it in meters."""
+    """Cameras that see every point, the point that they look at, and their distance from it in meters."""
     target = vertical_axis(points.min(0), points.max(0), config.axis)
     orbit = Orbit(config.count, tuple(config.elevations))
     camera = orbit.frame(

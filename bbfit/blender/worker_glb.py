@@ -1,7 +1,7 @@
-"""The worker's other trade: writes the tree that it loaded as one GLB file, thinned out if asked.
+"""Write the loaded tree as one GLB file, decimated on request. This module runs in the worker's process.
 
-Runs in the worker's process, which imports it by path when a job asks for it, and like the worker it knows nothing of bbfit. What is
-written is what the worker shows and measures: every instance of every surface of the evaluated scene, and nothing else.
+``worker.py`` imports it by path, so it does not import bbfit. The file contains what the worker renders and measures: every instance of
+every surface of the evaluated scene, and nothing else.
 """
 
 from __future__ import annotations
@@ -11,31 +11,31 @@ from typing import Any
 
 import numpy as np
 
-# A material is foliage if none of its islands is longer than this part of the tree's diagonal: leaves and cards are, stems are not.
+# A material is foliage if none of its islands is longer than this share of the tree's diagonal. Leaves and cards are shorter, stems longer.
 FOLIAGE_LENGTH = 0.25
-# Leaves grow at most so much to make up for lost ones.
-LARGEST_GROWTH = 4.0
-JOINED_AT_ONCE = 64
+# Leaves are enlarged by at most this factor to compensate for removed leaves.
+MAX_GROWTH = 4.0
+JOIN_BATCH = 64
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedMesh:
     """One object of the tree to write."""
 
     name: str
-    """The object's name in the file that was loaded."""
+    """The object's name in the loaded file."""
     mesh: Any
-    """Its mesh with all modifiers applied; objects may share one."""
+    """Its mesh with all modifiers applied. Objects may share a mesh."""
     matrix: Any
-    """From the mesh's frame to the world's, 4 x 4."""
+    """The transform from the mesh's frame to the world, 4 x 4."""
 
 
 @dataclass(frozen=True)
 class Islands:
-    """The connected parts of a mesh of P vertices and T triangles."""
+    """The connected components ("islands") of a mesh of P vertices and T triangles."""
 
     labels: np.ndarray
-    """Part of each vertex, [P]."""
+    """Island of each vertex, [P]."""
     triangles: np.ndarray
     """Vertices of each triangle, [T, 3]."""
     materials: np.ndarray
@@ -43,25 +43,25 @@ class Islands:
     areas: np.ndarray
     """Area of each triangle, [T]."""
     lengths: np.ndarray
-    """Diagonal of the bounding box of the part that each triangle belongs to, [T]."""
+    """Diagonal of the bounding box of each triangle's island, [T]."""
 
 
 def write(path: str, triangles: int | None) -> int:
-    """Write the scene to ``path`` with at most about ``triangles`` triangles, all if None; return how many were left."""
+    """Write the scene to ``path`` with at most about ``triangles`` triangles (all if None). Return the number of triangles written."""
     import bpy
 
     placed = realized()
-    kept = {item.mesh for item in placed}
+    meshes = {item.mesh for item in placed}
     bpy.data.batch_remove(list(bpy.data.objects))
-    bpy.data.batch_remove([mesh for mesh in bpy.data.meshes if mesh not in kept])
-    for mesh in kept:
+    bpy.data.batch_remove([mesh for mesh in bpy.data.meshes if mesh not in meshes])
+    for mesh in meshes:
         share_normals(mesh)
-    total = count(placed)
+    total = count_triangles(placed)
     if triangles is not None and total > triangles:
-        placed = thinned(placed, triangles / total)
+        placed = decimated(placed, triangles / total)
     for item in placed:
         link(item)
-    # Every setting that decides what is written; the rest is by default.
+    # Every setting that decides what is written. All other settings keep their defaults.
     bpy.ops.export_scene.gltf(
         filepath=path,
         export_format="GLB",
@@ -82,50 +82,50 @@ def write(path: str, triangles: int | None) -> int:
         export_extras=False,
         will_save_settings=False,
     )
-    return count(placed)
+    return count_triangles(placed)
 
 
-def count(placed: list[Placed]) -> int:
-    """Triangles of all objects; a mesh that several share counts for each."""
+def count_triangles(placed: list[PlacedMesh]) -> int:
+    """Triangles of all objects. A shared mesh counts once for each of its objects."""
     return sum(len(item.mesh.loop_triangles) for item in placed)
 
 
-def realized() -> list[Placed]:
-    """Everything in the evaluated scene that has faces, as meshes without modifiers; what shares its evaluated mesh still does."""
+def realized() -> list[PlacedMesh]:
+    """All objects of the evaluated scene that have faces, as meshes without modifiers. Objects that share an evaluated mesh still do."""
     import bpy
 
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    known: dict[tuple[int, ...], Any] = {}
-    found = list[Placed]()
+    meshes: dict[tuple[int, ...], Any] = {}
+    placed = list[PlacedMesh]()
     for instance in depsgraph.object_instances:
         evaluated = instance.object
-        if evaluated.type != "MESH" or not instance.show_self:  # curves, texts and so on come a second time as the mesh that they make
+        if evaluated.type != "MESH" or not instance.show_self:  # curves, texts and so on occur again as the meshes made of them
             continue
         own = {index: slot.material for index, slot in enumerate(evaluated.material_slots) if slot.link == "OBJECT"}
         key = (evaluated.data.as_pointer(), *(material.as_pointer() if material else 0 for material in own.values()))
-        if key not in known:
+        if key not in meshes:
             mesh = bpy.data.meshes.new_from_object(evaluated, preserve_all_data_layers=True, depsgraph=depsgraph)
             mesh.name = evaluated.original.data.name if evaluated.original and evaluated.original.data else evaluated.name
             for index, material in own.items():
                 if index < len(mesh.materials) and material:
                     mesh.materials[index] = material.original
             mesh.calc_loop_triangles()
-            known[key] = mesh
-        if len(known[key].polygons):
-            found.append(Placed(evaluated.name, known[key], instance.matrix_world.copy()))
-    return [unsheared(item) for item in found]
+            meshes[key] = mesh
+        if len(meshes[key].polygons):
+            placed.append(PlacedMesh(evaluated.name, meshes[key], instance.matrix_world.copy()))
+    return [unsheared(item) for item in placed]
 
 
-def unsheared(item: Placed) -> Placed:
-    """The same object, its matrix applied to a mesh of its own where glTF's and Blender's objects cannot have it: where it shears."""
+def unsheared(item: PlacedMesh) -> PlacedMesh:
+    """The object without a shear, which objects of glTF and Blender cannot have: a matrix that shears is applied to a copy of the mesh."""
     from mathutils import Matrix
 
     error = np.abs(np.array(Matrix.LocRotScale(*item.matrix.decompose())) - np.array(item.matrix))
     return in_world(item) if error[:3, :3].max() > 1e-6 * np.abs(np.array(item.matrix)[:3, :3]).max() else item
 
 
-def in_world(item: Placed) -> Placed:
-    """The same object with a mesh of its own in the world's frame."""
+def in_world(item: PlacedMesh) -> PlacedMesh:
+    """The object with a copy of its mesh in the world's frame."""
     from mathutils import Matrix
 
     mesh = item.mesh.copy()
@@ -133,14 +133,14 @@ def in_world(item: Placed) -> Placed:
     if item.matrix.determinant() < 0:
         mesh.flip_normals()
     mesh.calc_loop_triangles()
-    return Placed(item.name, mesh, Matrix())
+    return PlacedMesh(item.name, mesh, Matrix())
 
 
 def share_normals(mesh: Any) -> None:
-    """Make one normal of those that a vertex's corners have, if they are the same but for rounding.
+    """Give all corners of a vertex one normal, if their normals differ only by rounding.
 
-    Blender keeps a given normal to 16 bits, in a frame that differs from face to face where the faces are flat, and its exporter
-    would write a vertex for each of the results: 22,000 for the 13,000 of a crown of leaves.
+    Blender stores a custom normal in 16 bits, relative to a frame that differs between flat faces. Its exporter would write a vertex for
+    each of the different results: 22,000 for a crown of leaves with 13,000 vertices.
     """
     if not mesh.has_custom_normals:
         return
@@ -149,92 +149,92 @@ def share_normals(mesh: Any) -> None:
     normals = np.empty((len(corners), 3), np.float32)
     mesh.corner_normals.foreach_get("vector", normals.ravel())
     shared = np.zeros((len(mesh.vertices), 3), np.float32)
-    shared[corners] = normals  # of each vertex some corner's
+    shared[corners] = normals  # the normal of any one corner of each vertex
     if np.abs(normals - shared[corners]).max(initial=0) < 2e-3:
         mesh.shade_smooth()
         mesh.normals_split_custom_set_from_vertices(shared)
 
 
-def link(item: Placed) -> Any:
-    """Put an object into the scene."""
+def link(item: PlacedMesh) -> Any:
+    """Add an object to the scene."""
     import bpy
 
-    made = bpy.data.objects.new(item.name, item.mesh)
-    made.matrix_world = item.matrix
-    bpy.context.scene.collection.objects.link(made)
-    return made
+    linked = bpy.data.objects.new(item.name, item.mesh)
+    linked.matrix_world = item.matrix
+    bpy.context.scene.collection.objects.link(linked)
+    return linked
 
 
-def thinned(placed: list[Placed], ratio: float) -> list[Placed]:
-    """The tree with that part of its triangles, by collapsing edges, and with leaves enlarged until they cover what they did before.
+def decimated(placed: list[PlacedMesh], ratio: float) -> list[PlacedMesh]:
+    """Reduce the number of triangles by ``ratio`` with edge collapses, then enlarge the leaves until they have their former area.
 
-    All meshes are joined first, so that edges collapse where that changes the tree's shape least, wherever they are: by the same
-    ratio for each mesh leaves of a few triangles would lose as many as bark that has far too many. Foliage still loses area, since
-    a card of two triangles turns into one and then goes; so what is left of each foliage material is enlarged, every island about
-    its middle, until the material has its area again (Cook, Halstead, Planck, Ryu, "Stochastic Simplification of Aggregate Detail",
+    All meshes are joined first, so that edges collapse wherever this changes the tree's shape least. With the same ratio for each mesh,
+    leaves of a few triangles would lose as large a share as finely tessellated bark. Foliage still loses area, because a card of two
+    triangles turns into one triangle and then disappears. So the remaining islands of each foliage material are enlarged about their
+    centers until the material has its former area (Cook, Halstead, Planck, Ryu, "Stochastic Simplification of Aggregate Detail",
     SIGGRAPH 2007).
     """
     import bpy
 
-    joined = [join(members) for members in groups(placed)]
+    joined = [join(members) for members in joinable_groups(placed)]
     bpy.context.view_layer.update()
-    bpy.data.batch_remove([mesh for mesh in bpy.data.meshes if mesh not in [made.data for made in joined]])
-    corners = np.concatenate([np.array(made.bound_box) for made in joined])
+    bpy.data.batch_remove([mesh for mesh in bpy.data.meshes if mesh not in [item.data for item in joined]])
+    corners = np.concatenate([np.array(item.bound_box) for item in joined])
     length = FOLIAGE_LENGTH * float(np.linalg.norm(np.ptp(corners, axis=0)))
-    before = [islands(made.data) for made in joined]
-    for made in joined:
-        modifier = made.modifiers.new("bbfit", "DECIMATE")
+    originals = [islands(item.data) for item in joined]
+    for item in joined:
+        modifier = item.modifiers.new("bbfit", "DECIMATE")
         modifier.ratio, modifier.use_collapse_triangulate = ratio, True
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    found = [bpy.data.meshes.new_from_object(made.evaluated_get(depsgraph), depsgraph=depsgraph) for made in joined]
-    left = list[Placed]()
-    for made, mesh, whole in zip(joined, found, before, strict=True):
-        restore(mesh, whole, length)
+    meshes = [bpy.data.meshes.new_from_object(item.evaluated_get(depsgraph), depsgraph=depsgraph) for item in joined]
+    remaining = list[PlacedMesh]()
+    for item, mesh, original in zip(joined, meshes, originals, strict=True):
+        restore_area(mesh, original, length)
         mesh.calc_loop_triangles()
         if len(mesh.polygons):
-            left.append(Placed(made.name, mesh, made.matrix_world.copy()))
+            remaining.append(PlacedMesh(item.name, mesh, item.matrix_world.copy()))
     bpy.data.batch_remove(joined)
-    return left
+    return remaining
 
 
-def groups(placed: list[Placed]) -> list[list[Placed]]:
-    """Objects that can be joined without their materials changing: of the same colors and texture coordinates, or without the latter."""
-    found: dict[tuple[Any, ...], dict[tuple[str, ...], list[Placed]]] = {}
+def joinable_groups(placed: list[PlacedMesh]) -> list[list[PlacedMesh]]:
+    """Groups of objects whose materials survive joining: they have the same color layers, and the same UV layers or none."""
+    groups: dict[tuple[Any, ...], dict[tuple[str, ...], list[PlacedMesh]]] = {}
     for item in sorted(placed, key=lambda item: not item.mesh.uv_layers):
         colors = item.mesh.color_attributes
-        shades = (*((layer.name, layer.domain, layer.data_type) for layer in colors), colors.render_color_index)
-        sheets = (*(layer.name for layer in item.mesh.uv_layers), *(layer.name for layer in item.mesh.uv_layers if layer.active_render))
-        alike = found.setdefault(shades, {})
-        alike.setdefault(sheets or next(iter(alike), ()), []).append(item)
-    return [members for alike in found.values() for members in alike.values()]
+        color_key = (*((layer.name, layer.domain, layer.data_type) for layer in colors), colors.render_color_index)
+        uv_key = (*(layer.name for layer in item.mesh.uv_layers), *(layer.name for layer in item.mesh.uv_layers if layer.active_render))
+        by_uv = groups.setdefault(color_key, {})
+        by_uv.setdefault(uv_key or next(iter(by_uv), ()), []).append(item)
+    return [members for by_uv in groups.values() for members in by_uv.values()]
 
 
-def join(members: list[Placed]) -> Any:
-    """One object of many, in the world's frame, in the scene."""
-    # Blender's time grows with the square of what is joined at once, and of what else there is.
-    if len(members) > JOINED_AT_ONCE:
-        objects = [join(members[start : start + JOINED_AT_ONCE]) for start in range(0, len(members), JOINED_AT_ONCE)]
+def join(members: list[PlacedMesh]) -> Any:
+    """Join many objects to one object of the scene, in the world's frame."""
+    # Blender's time grows with the square of the number of joined objects, and of all other objects.
+    if len(members) > JOIN_BATCH:
+        objects = [join(members[start : start + JOIN_BATCH]) for start in range(0, len(members), JOIN_BATCH)]
     else:
         objects = [link(in_world(item)) for item in members]
     return merge(objects)
 
 
 def merge(objects: list[Any]) -> Any:
-    """Blender's own join of objects, into the first."""
+    """Join objects into the first one with Blender's own operator."""
     import bpy
 
     if len(objects) > 1:
-        emptied = [made.data for made in objects[1:]]
+        unused = [item.data for item in objects[1:]]
         bpy.context.view_layer.update()
-        chosen = {"active_object": objects[0], "object": objects[0], "selected_objects": objects, "selected_editable_objects": objects}
-        with bpy.context.temp_override(**chosen):
+        context = {"active_object": objects[0], "object": objects[0], "selected_objects": objects, "selected_editable_objects": objects}
+        with bpy.context.temp_override(**context):
             bpy.ops.object.join()
-        bpy.data.batch_remove(emptied)
+        bpy.data.batch_remove(unused)
     return objects[0]
 
 
 def islands(mesh: Any) -> Islands:
-    """The connected parts of a mesh."""
+    """Compute the connected components of a mesh."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -264,18 +264,18 @@ def coordinates(mesh: Any) -> np.ndarray:
     return values
 
 
-def restore(mesh: Any, whole: Islands, length: float) -> None:
-    """Enlarge the foliage of a thinned mesh, the materials whose parts were all shorter than ``length``, to its area in ``whole``."""
-    left = islands(mesh)
+def restore_area(mesh: Any, original: Islands, length: float) -> None:
+    """Enlarge the foliage of a decimated mesh to its area in ``original``. Foliage is a material with all islands below ``length``."""
+    current = islands(mesh)
     points = coordinates(mesh)
-    growth = np.ones(int(left.labels.max(initial=0)) + 1)
-    for material in np.unique(left.materials):
-        earlier, now = whole.materials == material, left.materials == material
-        area = left.areas[now].sum(dtype=np.float64)
-        if whole.lengths[earlier].max() < length and area > 0:
-            lost = np.sqrt(whole.areas[earlier].sum(dtype=np.float64) / area)
-            growth[left.labels[left.triangles[now]].ravel()] = np.clip(lost, 1.0, LARGEST_GROWTH)
-    counts = np.bincount(left.labels)
-    middles = np.stack([np.bincount(left.labels, points[:, axis]) / counts for axis in range(3)], -1)[left.labels]
-    mesh.vertices.foreach_set("co", (middles + growth[left.labels, None] * (points - middles)).astype(np.float32).ravel())
+    growth = np.ones(int(current.labels.max(initial=0)) + 1)
+    for material in np.unique(current.materials):
+        before, after = original.materials == material, current.materials == material
+        area = current.areas[after].sum(dtype=np.float64)
+        if original.lengths[before].max() < length and area > 0:
+            factor = np.sqrt(original.areas[before].sum(dtype=np.float64) / area)
+            growth[current.labels[current.triangles[after]].ravel()] = np.clip(factor, 1.0, MAX_GROWTH)
+    counts = np.bincount(current.labels)
+    centers = np.stack([np.bincount(current.labels, points[:, axis]) / counts for axis in range(3)], -1)[current.labels]
+    mesh.vertices.foreach_set("co", (centers + growth[current.labels, None] * (points - centers)).astype(np.float32).ravel())
     mesh.update()

@@ -51,12 +51,12 @@ def run_command(
     from bbfit.pipeline import RunConfig, run
 
     config = RunConfig(species=species, grow=grow, views=views, fit=fit, budget=budget, export=export)
-    with watched(page, out, tree, None, fit) as onlooker:
-        with onlooker.progress() as tell:
-            result = run(tree, out, config, on_progress=tell, on_step=onlooker.on_step)
+    with watched(page, out, tree, None, fit) as display:
+        with display.progress() as tell:
+            result = run(tree, out, config, on_progress=tell, on_step=display.on_step)
         show(result, thesis=fit.preset == "thesis")
         show_missed(export)
-        onlooker.finish()
+        display.finish()
 
 
 def grow_command(
@@ -86,7 +86,7 @@ def grow_command(
         out_console.print(species_table([load_species(name, config.species_file) for name in known_species(config.species_file)]))
         out_console.print(f"figures in {config.species_file or figures_file()}", soft_wrap=True, highlight=False)
         return
-    from bbfit.trees.tree_file import write_tree
+    from bbfit.trees.tree_writer import write_tree
 
     figures = load_species(species, config.species_file)
     if out is None:
@@ -155,12 +155,12 @@ def fit_command(
         fail("views", f"{views} is a file", "give a folder of views; bbfit run takes a tree")
     check_folder("views", views)
     stages = RunConfig(tree=tree, fit=config, budget=budget, export=export)
-    with watched(page, out, views, tree, config) as onlooker:
-        with onlooker.progress() as tell:
-            result = run(views, out, stages, on_progress=tell, on_step=onlooker.on_step)
+    with watched(page, out, views, tree, config) as display:
+        with display.progress() as tell:
+            result = run(views, out, stages, on_progress=tell, on_step=display.on_step)
         show(result, thesis=config.preset == "thesis")
         show_missed(export)
-        onlooker.finish()
+        display.finish()
 
 
 def evaluate_command(

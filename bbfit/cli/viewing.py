@@ -1,4 +1,4 @@
-"""The commands' pages: one that shows results, and one that shows a fit while it goes on."""
+"""The command that shows results in the browser, and the option that shows a run there."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ Flag = tyro.conf.FlagCreatePairsOff[bool]
 
 @dataclass(frozen=True)
 class WatchConfig:
-    """Looking on in a browser."""
+    """Options for watching a run in the browser."""
 
     watch: Flag = False
-    """Show the fit on a page while it goes on. In a terminal the page stays until Ctrl-C, elsewhere it ends with the run."""
+    """Show the fit in the browser while it runs. In a terminal the viewer stays until Ctrl-C, elsewhere it ends with the run."""
     host: str = "127.0.0.1"
-    """Address that the page listens on: 127.0.0.1 is seen by this machine alone, 0.0.0.0 by everybody on the network."""
+    """Address that the viewer listens on: only this machine can reach 127.0.0.1, everybody on the network can reach 0.0.0.0."""
     port: int = 8080
-    """Port of the page; the next free one if it is taken."""
+    """Port of the viewer; the next free one if it is taken."""
     open: Flag = False
-    """Open the page in this machine's browser."""
+    """Open the viewer in this machine's browser."""
 
 
 def view_command(
@@ -47,53 +47,53 @@ def view_command(
     open: Flag = False,
     original_bytes: int = 64 << 20,
 ) -> None:
-    """Look at results in the browser: the original and the billboards side by side, levels of detail, and fields of trees.
+    """Show results in the browser: the original and the billboards side by side, levels of detail, and fields of trees.
 
-    The page is there until Ctrl-C. It needs no network.
+    The viewer runs until Ctrl-C. It needs no network.
 
     For example: bbfit view runs/tree
 
     Args:
         run: Folder of bbfit run, bbfit fit or bbfit lod.
-        host: Address to listen on: 127.0.0.1 is seen by this machine alone, 0.0.0.0 by everybody on the network.
+        host: Address to listen on: only this machine can reach 127.0.0.1, everybody on the network can reach 0.0.0.0.
         port: Port to listen on; the next free one if it is taken.
-        open: Open the page in this machine's browser.
-        original_bytes: Size of the original up to which it is sent to the browser.
+        open: Open the viewer in this machine's browser.
+        original_bytes: The largest size of the original's file that is sent to the browser.
     """
-    from bbfit.viewing.opening import view
+    from bbfit.viewing.server import view
 
     if original_bytes < 0:
         fail("original_bytes", f"expected at least 0, got {original_bytes}")
-    with view(run, host=host, port=port, original_bytes=original_bytes) as page:
-        with _until_ctrl_c() as stay:
-            _announce(page.url, port, " (Ctrl-C ends it)", open=open)
-            if page.notes:
-                out_console.print("\n".join(page.notes), style="yellow", soft_wrap=True, highlight=False)
-            stay()
+    with view(run, host=host, port=port, original_bytes=original_bytes) as viewer:
+        with _until_ctrl_c() as wait:
+            _announce(viewer.url, port, " (Ctrl-C ends it)", open=open)
+            if viewer.notes:
+                out_console.print("\n".join(viewer.notes), style="yellow", soft_wrap=True, highlight=False)
+            wait()
 
 
-class Onlooker:
-    """Shows a run in the terminal and, if there is one, on a page."""
+class RunDisplay:
+    """Shows a run in the terminal and, with ``--watch``, in the viewer."""
 
     def __init__(self, watch: Watch | None = None, url: str = "") -> None:
         self._watch, self._url = watch, url
 
     @property
     def on_step(self) -> Callable[[Step], None] | None:
-        """To be called after each step of the fit."""
+        """A function to call after each step of the fit, if there is one."""
         return None if self._watch is None else self._watch.on_step
 
     @contextlib.contextmanager
     def progress(self) -> Iterator[OnProgress]:
-        """As :func:`bbfit.cli.console.progress`, on the page too."""
-        with progress() as tell:
+        """The progress bars of :func:`bbfit.cli.console.progress`, and a line in the viewer."""
+        with progress() as show:
 
-            def both(stage: str, done: int, total: int, note: str = "") -> None:
-                tell(stage, done, total, note)
+            def show_both(stage: str, done: int, total: int, note: str = "") -> None:
+                show(stage, done, total, note)
                 if self._watch is not None:
                     self._watch.on_progress(stage, done, total, note)
 
-            yield both
+            yield show_both
 
     def finish(self) -> None:
         """Show the finished run; in a terminal, until Ctrl-C."""
@@ -101,48 +101,49 @@ class Onlooker:
             return
         self._watch.finish()
         if err_console.is_terminal:
-            with _until_ctrl_c() as stay:
-                out_console.print(f"the page stays at {self._url} until Ctrl-C", soft_wrap=True)
-                stay()
+            with _until_ctrl_c() as wait:
+                out_console.print(f"the viewer runs at {self._url} until Ctrl-C", soft_wrap=True)
+                wait()
 
 
 @contextlib.contextmanager
-def watched(config: WatchConfig, out: Path, source: Path | None, tree: Path | None, fit: FitConfig) -> Iterator[Onlooker]:
-    """What shows a run of ``source`` in the folder ``out``; with ``--watch`` there is a page meanwhile."""
+def watched(config: WatchConfig, out: Path, source: Path | None, tree: Path | None, fit: FitConfig) -> Iterator[RunDisplay]:
+    """The display of a run of ``source`` in the folder ``out``; with ``--watch`` a viewer runs meanwhile."""
     if not config.watch:
-        yield Onlooker()
+        yield RunDisplay()
         return
-    from bbfit.viewing.page import Page
-    from bbfit.viewing.watching import Watch
+    from bbfit.viewing.server import Viewer
+    from bbfit.viewing.watching import Watch, WatchedRun
 
     alpha = fit.resolve().alpha
     assert alpha is not None
-    with Page(host=config.host, port=config.port) as page, contextlib.closing(Watch(page, out, source, tree, alpha)) as watch:
-        _announce(page.url, config.port, open=config.open)
-        yield Onlooker(watch, page.url)
+    with Viewer(host=config.host, port=config.port) as viewer:
+        with contextlib.closing(Watch(viewer, WatchedRun(out, source, tree, alpha))) as watch:
+            _announce(viewer.url, config.port, open=config.open)
+            yield RunDisplay(watch, viewer.url)
 
 
 def _announce(url: str, port: int, ending: str = "", *, open: bool) -> None:
     taken = f"port {port} is taken; " if port and not url.endswith(f":{port}") else ""
-    out_console.print(f"{taken}look at {url}{ending}", soft_wrap=True)
+    out_console.print(f"{taken}viewer at {url}{ending}", soft_wrap=True)
     if open and not webbrowser.open(url):
         err_console.print("no browser could be opened", style="yellow")
 
 
 @contextlib.contextmanager
 def _until_ctrl_c() -> Iterator[Callable[[], None]]:
-    """A function that waits for Ctrl-C, which here is no failure; one pressed before it is called counts.
+    """A function that waits for Ctrl-C, which ends the command without an error. Ctrl-C counts even before the function is called.
 
-    A handler notes it, since an exception can be lost where none may leave, such as in what a collected object does last.
+    A signal handler records it, because an exception would be lost where none may leave, such as in the finalizer of an object.
     """
     pressed = list[int]()
     before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
 
-    def stay() -> None:
+    def wait() -> None:
         while not pressed:
             time.sleep(0.1)
 
     try:
-        yield stay
+        yield wait
     finally:
         signal.signal(signal.SIGINT, before)

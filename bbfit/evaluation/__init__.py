@@ -1,1 +1,1 @@
-"""Measuring how close a billboard cloud comes to the views of its tree."""
+"""Measures of how close a billboard cloud comes to the views of its tree."""

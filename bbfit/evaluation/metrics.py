@@ -1,11 +1,11 @@
-"""How much a render differs from its target, one view at a time, on the honest scale: data range 1.
+"""Differences between the render and the target of one view, with a data range of 1.
 
-All functions take the target first and give a plain ``float`` summed in float64. "Over white" pictures are RGB [H, W, 3] composited
+All functions take the target first and return a ``float`` that is summed in float64. "Over white" pictures are RGB [H, W, 3] composited
 over white (:func:`bbfit.images.over_color`), the others premultiplied RGBA [H, W, 4]; both hold display-referred values in [0, 1].
 
-No result is infinite or NaN, so that every one can stand in a JSON file. A mean squared error counts as at least :data:`MSE_FLOOR`, so
-identical pictures have a PSNR of 120 dB. A ratio to something that the target does not have (the sharpness of a flat picture, the
-brightness of an empty or black silhouette) is ``None`` and takes no part in averages.
+All results are finite, so JSON can hold them. A mean squared error counts as at least :data:`MSE_FLOOR`, so identical pictures have a PSNR
+of 120 dB. A ratio is ``None`` and left out of averages if the target has none of the quantity: the sharpness of a flat picture, the
+brightness of an empty or black silhouette.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from bbfit.checks import check_shape, fail
 Image = NDArray[np.floating[Any]]
 
 MSE_FLOOR = 1e-12
-"""Least mean squared error that enters a logarithm: a root mean square of one millionth of the data range."""
+"""Smallest mean squared error in a logarithm: a root mean square of one millionth of the data range."""
 SSIM_WINDOW = 11
-"""Side of the SSIM window in pixels, and so the smallest picture that can be measured."""
+"""Side of the SSIM window in pixels, which is the side of the smallest picture that can be measured."""
 ALPHA_THRESHOLD = 0.5
-"""Alpha from which on a pixel belongs to the silhouette."""
+"""Smallest alpha of a pixel of the silhouette."""
 _HAUSDORFF_SHARE = 0.95
 
 
@@ -77,7 +77,13 @@ def ssim(target: Image, render: Image) -> float:
 
 
 def check_size(width: int, height: int) -> None:
-    """Require pictures that the SSIM window fits into."""
+    """Require pictures of at least the size of the SSIM window.
+
+    Raises
+    ------
+    InputError
+        if a side is shorter.
+    """
     if min(width, height) < SSIM_WINDOW:
         fail(
             "views",
@@ -96,7 +102,7 @@ def flip_map(target: Image, render: Image) -> NDArray[np.float64]:
     check_shape("target", target.shape, (None, None, 3))
     check_shape("render", render.shape, target.shape)
     reference, test = (np.ascontiguousarray(image, dtype=np.float32) for image in (target, render))
-    # The implementation keeps what it used in the dictionary of parameters, so it gets a new one each time.
+    # The implementation writes into the dictionary of parameters, so each call gets a new one.
     errors, _, _ = flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False, computeMeanError=False, parameters={})
     return np.asarray(errors[..., 0], dtype=np.float64)
 
@@ -113,31 +119,31 @@ def alpha_iou(target: Image, render: Image) -> float:
     """
     check_shape("target", target.shape, (None, None, 4))
     check_shape("render", render.shape, target.shape)
-    ours, theirs = render[..., 3] >= ALPHA_THRESHOLD, target[..., 3] >= ALPHA_THRESHOLD
-    union = np.count_nonzero(ours | theirs)
-    return np.count_nonzero(ours & theirs) / union if union else 1.0
+    inside_render, inside_target = (picture[..., 3] >= ALPHA_THRESHOLD for picture in (render, target))
+    union = np.count_nonzero(inside_render | inside_target)
+    return np.count_nonzero(inside_render & inside_target) / union if union else 1.0
 
 
 def silhouette_distance(target: Image, render: Image) -> float:
-    """How far apart the silhouettes (alpha >= 0.5) of two RGBA pictures are, in pixels; lower is better.
+    """The 95 % Hausdorff distance between the silhouettes (alpha >= 0.5) of two RGBA pictures in pixels; lower is better.
 
-    The 95 % Hausdorff distance: so near to a pixel of the other silhouette, gaps within it taken into account, are 95 of 100 pixels of
-    either one (Huttenlocher et al. 1993, "Comparing images using the Hausdorff distance", section II-C, with the worse direction).
-    Two empty silhouettes are 0 apart; an empty one and another are the picture's diagonal apart.
+    95 % of the pixels of either silhouette are within this distance of a pixel of the other; gaps in a silhouette count (Huttenlocher et
+    al. 1993, "Comparing images using the Hausdorff distance", section II-C, the larger of both directions). Two empty silhouettes have
+    distance 0; an empty one and another have the length of the picture's diagonal.
     """
     from scipy.ndimage import distance_transform_edt
 
     check_shape("target", target.shape, (None, None, 4))
     check_shape("render", render.shape, target.shape)
-    ours, theirs = render[..., 3] >= ALPHA_THRESHOLD, target[..., 3] >= ALPHA_THRESHOLD
-    if not ours.any() or not theirs.any():
-        return math.hypot(*target.shape[:2]) if ours.any() or theirs.any() else 0.0
-    distances = [distance_transform_edt(~b)[a] for a, b in ((ours, theirs), (theirs, ours))]
+    inside_render, inside_target = (picture[..., 3] >= ALPHA_THRESHOLD for picture in (render, target))
+    if not inside_render.any() or not inside_target.any():
+        return math.hypot(*target.shape[:2]) if inside_render.any() or inside_target.any() else 0.0
+    distances = [distance_transform_edt(~b)[a] for a, b in ((inside_render, inside_target), (inside_target, inside_render))]
     return max(float(np.quantile(each, _HAUSDORFF_SHARE, method="inverted_cdf")) for each in distances)
 
 
 def sharpness(target: Image, render: Image) -> float | None:
-    """Mean absolute gradient of the render over that of the target, over white: 1 is as sharp, below is blurred, above is noisy.
+    """Ratio of the mean absolute gradients of render and target over white: 1 is as sharp, below is blurred, above is noisy.
 
     The gradient is the difference of neighboring pixels, across and down, averaged over both directions and over RGB. ``None`` for a
     flat target.
@@ -147,10 +153,10 @@ def sharpness(target: Image, render: Image) -> float | None:
 
 
 def brightness(target: Image, render: Image) -> float | None:
-    """Mean color of the render inside the target's silhouette over that of the target: 1 is as bright, below is darker.
+    """Ratio of the mean colors of render and target inside the target's silhouette: 1 is as bright, below is darker.
 
-    On the premultiplied RGB of two RGBA pictures (what is seen over black), so holes in the render darken it too. The silhouette is where
-    the target's alpha >= 0.5. ``None`` if the silhouette is empty or black.
+    The colors are premultiplied RGB, as over black, so holes in the render darken it too. The silhouette is where the target's
+    alpha >= 0.5. ``None`` if the silhouette is empty or black.
     """
     check_shape("target", target.shape, (None, None, 4))
     check_shape("render", render.shape, target.shape)

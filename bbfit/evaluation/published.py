@@ -1,7 +1,7 @@
-"""What the thesis reports, to be set beside our own figures.
+"""The results that the thesis reports, for comparison.
 
-Its trees are of the same species and not the same trees, rendered at 1024 x 1024 in a light of its own, so that its figures show what its
-method makes of what, and do not compare to the second digit.
+Its trees have the same species but are other trees, rendered at 1024 x 1024 pixels in another light. So its figures compare in tendency,
+not to the second digit.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Experiment:
 
 @cache
 def published_figures() -> dict[Experiment, ThesisScale]:
-    """The means over test views that the thesis reports for its experiments (figure 11)."""
+    """The means over test views of the thesis's experiments (figure 11)."""
     with _FIGURE_11.open(newline="", encoding="utf-8") as file:
         return {
             Experiment(row["species"], int(row["billboards"]), row["variant"], row["loss"]): ThesisScale(

@@ -1,4 +1,4 @@
-"""What an evaluation found: measures of every view, their averages, and what the model costs."""
+"""The report of an evaluation: the measures of each view, their means, and the costs of the model."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bbfit.files import read_json, write_json
 from bbfit.geometry.alpha import AlphaMode
 
 RING_GAP = 1.0
-"""Degrees between the elevations of two rings of views, at least."""
+"""Smallest difference in degrees between the elevations of two rings of views."""
 
 
 @dataclass(frozen=True)
@@ -41,29 +41,29 @@ class Rgba:
 
 @dataclass(frozen=True)
 class ThesisScale:
-    """Premultiplied RGBA as the thesis measured it, with a peak of 4095 (:mod:`bbfit.evaluation.thesis_scale`)."""
+    """Premultiplied RGBA with a peak of 4095, as in the thesis (:mod:`bbfit.evaluation.thesis_scale`)."""
 
     rmse: float
     """Root mean squared error over 4095."""
     ssim: float
     """Structural similarity with a data range of 4095."""
     psnr: float
-    """Peak signal-to-noise ratio in dB, 72.25 above the honest one."""
+    """Peak signal-to-noise ratio in dB, 72.25 above that of data range 1."""
     sre: float
-    """Signal-to-reconstruction-error ratio in dB, the error's norm not squared."""
+    """Signal-to-reconstruction-error ratio in dB, without the square of the error's norm."""
 
 
 @dataclass(frozen=True)
 class Measures:
-    """Every measure of one view, or their plain means over views."""
+    """All measures of one view, or their means over views."""
 
     over_white: OverWhite
     rgba: Rgba
     thesis_scale: ThesisScale
     sharpness: float | None
-    """Mean absolute gradient over the target's; ``None`` for a flat target."""
+    """Ratio of the mean absolute gradient to that of the target; ``None`` for a flat target."""
     brightness: float | None
-    """Mean color inside the target's silhouette over the target's; ``None`` for an empty or black silhouette."""
+    """Ratio of the mean color inside the target's silhouette to that of the target; ``None`` for an empty or black silhouette."""
 
 
 @dataclass(frozen=True)
@@ -73,34 +73,34 @@ class ViewScore:
     name: str
     """The picture's name."""
     azimuth_degrees: float
-    """Where the camera stands, in [0, 360): 0 looks from +Z, counter-clockwise seen from above."""
+    """Azimuth of the camera, in [0, 360): 0 looks from +Z, counter-clockwise seen from above."""
     elevation_degrees: float
-    """Height of the camera above the horizon, in [-90, 90]."""
+    """Angle of the camera above the horizon, in [-90, 90]."""
     measures: Measures
 
     def to_json(self) -> dict[str, Any]:
-        """The name, the angles and the groups of measures side by side."""
+        """The name, the angles and the groups of measures in one dictionary."""
         return {name: value for name, value in asdict(self).items() if name != "measures"} | asdict(self.measures)
 
 
 @dataclass(frozen=True)
 class RingScore:
-    """The views that look from about one elevation, and the plain means of their measures."""
+    """The views from about the same elevation, and the means of their measures."""
 
     elevation_degrees: float
     """Their mean elevation."""
     views: int
-    """How many there are."""
+    """Number of views."""
     measures: Measures
 
     def to_json(self) -> dict[str, Any]:
-        """Elevation, number of views and the groups of measures side by side."""
+        """The elevation, the number of views and the groups of measures in one dictionary."""
         return {"elevation_degrees": self.elevation_degrees, "views": self.views} | asdict(self.measures)
 
 
 @dataclass(frozen=True)
 class SizeScore:
-    """How close the model as it is exported comes to the held-out views in pictures of one size (:mod:`bbfit.evaluation.sizes`)."""
+    """The exported model against the held-out views in pictures of one size (:mod:`bbfit.evaluation.sizes`)."""
 
     width: int
     """Width of the pictures in pixels."""
@@ -109,37 +109,34 @@ class SizeScore:
     psnr: float
     """Peak signal-to-noise ratio over white in dB, at most 120, the mean over views (:func:`bbfit.evaluation.metrics.psnr`)."""
     coverage: float | None
-    """Mean alpha of the draws over that of the targets, of all views together: 1 is as dense, below thins out, above thickens; ``None``
-    if the targets are empty."""
+    """Ratio of the mean alpha of the renders to that of the targets, over all views: 1 is as dense, below is thinner, above is denser;
+    ``None`` if the targets are empty."""
     alpha: float
     """Root mean squared difference of alpha over all pixels of all views, in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """A count of the model beside that of the original tree; ``None`` where it is not known."""
+    """A cost of the model and of the original tree; ``None`` where it is unknown."""
 
     model: int | None = None
-    """Of the billboards."""
+    """Cost of the billboards."""
     original: int | None = None
-    """Of the tree."""
+    """Cost of the tree."""
 
     @property
     def ratio(self) -> float | None:
-        """Model over original: the ratio of the thesis's table 1, there in per cent."""
+        """Model over original: the ratio in table 1 of the thesis, where it is in percent."""
         return self.model / self.original if self.model is not None and self.original else None
 
     def to_json(self) -> dict[str, int | float | None]:
-        """Both counts and their ratio."""
+        """Both costs and their ratio."""
         return {"model": self.model, "original": self.original, "ratio": self.ratio}
 
 
 @dataclass(frozen=True)
 class Report:
-    """How close a billboard cloud comes to the held-out views, and what it costs.
-
-    ``dataclasses.replace`` fills in costs that become known later, such as the size of the exported file.
-    """
+    """How close an exported billboard cloud comes to the held-out views, and what it costs."""
 
     views: tuple[ViewScore, ...]
     """One entry per held-out view, in the order of the view set; at least one."""
@@ -150,23 +147,20 @@ class Report:
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall-clock seconds of each stage."""
     alpha: AlphaMode = field(default_factory=AlphaMode)
-    """The alpha mode that was measured."""
+    """The alpha mode of the exported model."""
     overdraw: float | None = None
-    """Share of the model's area that is drawn and shows nothing, in [0, 1]."""
+    """Share of the model's area that is drawn although nothing is visible there, in [0, 1]."""
     sizes: tuple[SizeScore, ...] = ()
-    """The exported model seen from afar, the largest size first."""
+    """The exported model in smaller and smaller pictures, the largest first."""
 
     @property
     def mean(self) -> Measures:
-        """Plain means over the views; decibels are averaged as decibels, as in the thesis.
-
-        A view in which a measure is ``None`` does not count for it.
-        """
+        """The means over the views (:func:`mean_measures`)."""
         return mean_measures(self.views)
 
     @property
     def rings(self) -> tuple[RingScore, ...]:
-        """Means by elevation, from low to high: views whose elevations follow each other within :data:`RING_GAP` degrees are one ring."""
+        """Means by elevation, from low to high; successive elevations within :data:`RING_GAP` degrees belong to one ring."""
         rings: list[list[ViewScore]] = []
         for view in sorted(self.views, key=lambda view: view.elevation_degrees):
             if not rings or view.elevation_degrees - rings[-1][-1].elevation_degrees > RING_GAP:
@@ -182,15 +176,15 @@ class Report:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """The contents of ``metrics.json``; every number is finite, what is unknown or undefined is ``None``.
+        """The contents of ``metrics.json``; all numbers are finite, and unknown or undefined ones are ``None``.
 
         Returns
         -------
         ``{"over_white": {"psnr", "ssim", "flip"}, "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
         "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw",
         "alpha": {"mode", "cutoff"}, "seconds": {stage: ..}, "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
-        "rings": [{"elevation_degrees", "views", and the measures as above}],
-        "views": [{"name", "azimuth_degrees", "elevation_degrees", and the measures as above}]}``
+        "rings": [{"elevation_degrees", "views", and the same measures}],
+        "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures}]}``
         """
         return asdict(self.mean) | {
             "vertices": self.vertices.to_json(),
@@ -204,7 +198,7 @@ class Report:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write :meth:`to_json`, completely or not at all."""
+        """Write :meth:`to_json` to a file, completely or not at all."""
         write_json(path, self.to_json())
 
     @staticmethod
@@ -214,14 +208,17 @@ class Report:
         Raises
         ------
         MissingFileError, InputError
-            if the file is missing, damaged or something else.
+            if the file is missing, damaged or not a report.
         """
         path = check_file("metrics", path)
         content = read_json("metrics", path)
         try:
             vertices, sizes = (Cost(content[name]["model"], content[name]["original"]) for name in ("vertices", "bytes"))
             alpha = AlphaMode(content["alpha"]["mode"], content["alpha"]["cutoff"])
-            scores = tuple(_view(entry) for entry in content["views"])
+            scores = tuple(
+                ViewScore(view["name"], view["azimuth_degrees"], view["elevation_degrees"], measures_from_json(view))
+                for view in content["views"]
+            )
             afar = tuple(SizeScore(**size) for size in content["sizes"])
             return Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar)
         except (KeyError, TypeError, ValueError):
@@ -229,20 +226,15 @@ class Report:
 
 
 def mean_measures(views: Sequence[ViewScore]) -> Measures:
-    """Plain means over views; decibels are averaged as decibels. A view in which a measure is ``None`` does not count for it."""
+    """The means over views; decibels are averaged as decibels, as in the thesis. A measure's mean leaves out views where it is ``None``."""
     means: Measures = _mean(Measures, [view.measures for view in views])
     return means
 
 
-def _view(entry: dict[str, Any]) -> ViewScore:
-    measures = Measures(
-        OverWhite(**entry["over_white"]),
-        Rgba(**entry["rgba"]),
-        ThesisScale(**entry["thesis_scale"]),
-        entry["sharpness"],
-        entry["brightness"],
-    )
-    return ViewScore(entry["name"], entry["azimuth_degrees"], entry["elevation_degrees"], measures)
+def measures_from_json(content: Mapping[str, Any]) -> Measures:
+    """The measures of a dictionary like that of ``dataclasses.asdict``; other keys are ignored."""
+    groups = OverWhite(**content["over_white"]), Rgba(**content["rgba"]), ThesisScale(**content["thesis_scale"])
+    return Measures(*groups, content["sharpness"], content["brightness"])
 
 
 def _mean(group: type[Any], items: Sequence[Any]) -> Any:

@@ -1,4 +1,4 @@
-"""Scoring whatever draws a tree when it is seen from afar: in pictures of a half, a quarter and so on of the views' size."""
+"""Scores of a tree seen from afar: in pictures of a half, a quarter and so on of the views' size."""
 
 from __future__ import annotations
 
@@ -23,30 +23,35 @@ HALVINGS = 4
 def score_sizes(
     draw: Callable[[Camera], Tensor], views: ViewSet, halvings: int = HALVINGS, *, on_size: Callable[[int, int], None] | None = None
 ) -> tuple[SizeScore, ...]:
-    """Compare what is drawn at the views' size, at a half of it and so on with the views averaged to that size.
+    """Compare renders at the views' size, at half of it and so on with the views averaged to the same size.
 
-    A smaller camera covers the same field of view with fewer pixels, as if the tree were farther away. A target's pixel is the mean of
-    what it covers of the view, by area, also where sides are odd: of the premultiplied display-referred values as they stand, as in all
-    of bbfit's scores, so without conversion to linear light. Coverage is then the same at all sizes. Draws are clamped to [0, 1].
+    A smaller camera covers the same field of view with fewer pixels, as if the tree were farther away. A pixel of the target is the mean,
+    by area, of the part of the view that it covers. The mean is taken of premultiplied display-referred values, as in all scores, without
+    conversion to linear light; so coverage is the same at all sizes. Renders are clamped to [0, 1].
 
-    Drawn with one sample a pixel, a small picture of a tree covers some per cent more or less by chance; where pixels are halved, the
-    coverage of draws is the mean of several, 4 at half of the size and 16 below, whose pixels are moved by fractions of their width.
+    With one sample per pixel the coverage of a small picture of a tree varies by some percent at random. Below the full size the coverage
+    of a render is therefore the mean of several renders, 4 at half the size and 16 below, shifted by fractions of a pixel.
 
     Parameters
     ----------
-    draw : premultiplied RGBA over nothing, [B, H, W, 4], as a batch of cameras sees it: a renderer of clouds, or of what was exported.
-    views : V held-out views.
-    halvings : how often to halve; sizes of which a side is below 11 pixels (:data:`bbfit.evaluation.metrics.SSIM_WINDOW`) are left out.
-    on_size : called after each size with the number of sizes done and of all.
+    draw : callable
+        Returns what a batch of B cameras sees: premultiplied RGBA over nothing, [B, H, W, 4].
+    views : ViewSet
+        V held-out views.
+    halvings : int
+        Number of halvings. Sizes with a side below 11 pixels (:data:`bbfit.evaluation.metrics.SSIM_WINDOW`) are left out.
+    on_size : callable
+        Called after each size with the number of finished sizes and their total.
 
     Returns
     -------
-    At most ``halvings + 1`` scores, the largest size first.
+    tuple of SizeScore
+        At most ``halvings + 1`` scores, the largest size first.
 
     Raises
     ------
     InputError
-        if there are no views, they are too small, ``halvings`` is negative, or what is drawn has another shape or is not finite.
+        if there are no views, they are too small, ``halvings`` is negative, or a render has another shape or values that are not finite.
     """
     check_count("halvings", halvings, 0)
     if len(views) == 0:
@@ -63,7 +68,7 @@ def score_sizes(
 
 
 def shrunk(picture: Tensor, width: int, height: int) -> Tensor:
-    """A picture at another size of no more pixels a side, every pixel the mean of what it covers, by area: [H, W, C] -> [h, w, C].
+    """A picture at a smaller size, [H, W, C] -> [h, w, C]; each pixel is the mean, by area, of what it covers.
 
     Raises
     ------
@@ -80,7 +85,7 @@ def shrunk(picture: Tensor, width: int, height: int) -> Tensor:
 
 
 def _means(values: Tensor, count: int) -> Tensor:
-    """Means of ``count`` equal parts of the first axis, by differences of the running sum, which is linear within a value."""
+    """Means of ``count`` equal parts of the first axis, from differences of the running sum, which is linear within a value."""
     edges = torch.arange(count + 1, dtype=values.dtype) * (len(values) / count)
     whole = edges.long().clamp(max=len(values) - 1)
     before = torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)[:-1]])
@@ -90,27 +95,27 @@ def _means(values: Tensor, count: int) -> Tensor:
 
 def _score(draw: Callable[[Camera], Tensor], views: ViewSet, halving: int, width: int, height: int) -> SizeScore:
     cameras = views.cameras.resized(width, height)
-    psnrs, squares, drawn, wanted = [], [], 0.0, 0.0
+    psnrs, squares, render_cover, target_cover = [], [], 0.0, 0.0
     for index, name in enumerate(views.names):
         target = shrunk(views.targets([index], torch.float64)[0], width, height)
         batch = _shifted(cameras[index], min(halving, 2))
         with torch.no_grad():
             images = draw(batch).detach().cpu().double()
-        check_shape(f"what is drawn of view {name}", tuple(images.shape), (len(batch), height, width, 4))
+        check_shape(f"the render of view {name}", tuple(images.shape), (len(batch), height, width, 4))
         if not images.isfinite().all():
-            fail("draw", f"gives numbers that are not finite for view {name} at {width} x {height} pixels", "check the model")
-        seen, *shifted = images.clamp(0, 1)
-        psnrs.append(metrics.psnr(over_color(target).numpy(), over_color(seen).numpy()))
-        squares.append(metrics.mean_squared_error(target[..., 3].numpy(), seen[..., 3].numpy()))
-        covers = [float(image[..., 3].sum()) for image in shifted or [seen]]
-        drawn += sum(covers) / len(covers)
-        wanted += float(target[..., 3].sum())
+            fail("draw", f"returned values that are not finite for view {name} at {width} x {height} pixels", "check the model")
+        centered, *shifted = images.clamp(0, 1)
+        psnrs.append(metrics.psnr(over_color(target).numpy(), over_color(centered).numpy()))
+        squares.append(metrics.mean_squared_error(target[..., 3].numpy(), centered[..., 3].numpy()))
+        covers = [float(image[..., 3].sum()) for image in shifted or [centered]]
+        render_cover += sum(covers) / len(covers)
+        target_cover += float(target[..., 3].sum())
     mean_square = sum(squares) / len(views)
-    return SizeScore(width, height, sum(psnrs) / len(views), drawn / wanted if wanted else None, mean_square**0.5)
+    return SizeScore(width, height, sum(psnrs) / len(views), render_cover / target_cover if target_cover else None, mean_square**0.5)
 
 
 def _shifted(camera: Camera, halvings: int) -> Camera:
-    """The camera, and if there are halvings itself with its pixels' centers moved to those of their 4^halvings parts."""
+    """The camera and, after halvings, the same camera with its pixels' centers moved to those of their 4^halvings parts."""
     parts = 2**halvings
     steps = [(part + 0.5) / parts - 0.5 for part in range(parts)]
     moves = [(0.0, 0.0), *(itertools.product(steps, steps) if halvings else ())]

@@ -1,12 +1,12 @@
 """The four measures of the thesis (section 6 and figure 11) on its own scale.
 
-The thesis took them from the package ``image-similarity-measures``, whose default peak of 4095 is meant for 12-bit satellite
-pictures, and gave it pictures in [0, 1]. That divides every RMSE by 4095, adds 20 log10(4095) = 72.25 dB to every PSNR and pushes
-every SSIM to within a few hundred-thousandths of 1. They are of use for one thing: to be set beside the thesis's figures.
+The thesis used the package ``image-similarity-measures``, whose default peak of 4095 is meant for 12-bit satellite pictures, on pictures
+in [0, 1]. This divides each RMSE by 4095, adds 20 log10(4095) = 72.25 dB to each PSNR and moves each SSIM to within a few
+hundred-thousandths of 1. These measures serve only the comparison with the thesis's figures.
 
-All functions take premultiplied RGBA pictures [H, W, 4] in [0, 1], the target first, and treat alpha as one channel among the others.
-They compute in float64, where the package rounds to float32, and stay finite where it does not: a root mean squared error counts as at
-least :data:`ERROR_FLOOR`, a signal-to-error ratio as at least :data:`RATIO_FLOOR`.
+All functions take premultiplied RGBA pictures [H, W, 4] in [0, 1], the target first, and treat alpha like the other channels. They
+compute in float64, where the package rounds to float32, and stay finite where it does not: a root mean squared error counts as at least
+:data:`ERROR_FLOOR`, a signal-to-error ratio as at least :data:`RATIO_FLOOR`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from bbfit.evaluation.metrics import MSE_FLOOR, Image, check_size
 PEAK = 4095.0
 """The package's default ``max_p``."""
 ERROR_FLOOR = MSE_FLOOR**0.5
-"""Least root mean squared error of a picture in a logarithm or a denominator; identical pictures get a PSNR of 192.25 dB."""
+"""Smallest root mean squared error in a logarithm or a denominator; identical pictures have a PSNR of 192.25 dB."""
 RATIO_FLOOR = 1e-12
-"""Least signal-to-error ratio in a logarithm; the SRE of an empty signal is -120 dB."""
+"""Smallest signal-to-error ratio in a logarithm; the SRE of an empty signal is -120 dB."""
 
 
 def rmse(target: Image, render: Image) -> float:
@@ -53,11 +53,11 @@ def ssim(target: Image, render: Image) -> float:
 def sre(target: Image, render: Image) -> float:
     """Signal-to-reconstruction-error ratio in dB: ``10 log10(mean over channels of mean(x)^2 / (|x - y| / (H W)))``.
 
-    x is the target, y the render, |.| the Euclidean norm over a channel's pixels. The norm is not squared, so that the figure grows with
-    the picture's size and is not what Lanaras et al. 2018, who defined SRE, mean by it; it is what the package computes.
+    x is the target, y the render, |.| the Euclidean norm over a channel's pixels. As in the package the norm is not squared, so the value
+    grows with the picture's size; Lanaras et al. 2018, who defined SRE, square it.
 
-    The thesis's own SRE fits x as the *render* better: for one tree at nearly equal RMSE it differs by up to 15 dB (acer, figure 11),
-    which a fixed target's mean could not do. Set SRE beside its figures with that in mind.
+    The thesis's figures suggest that its x was the *render*: for one tree at nearly equal RMSE they differ by up to 15 dB (acer, figure
+    11), which is impossible with the mean of a fixed target. Compare SRE with this in mind.
     """
     pixels = target.shape[0] * target.shape[1]
     # The norm over H W is the root mean squared error over sqrt(H W).

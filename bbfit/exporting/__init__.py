@@ -1,1 +1,1 @@
-"""Taking a billboard cloud to other programs as plain glTF or OBJ."""
+"""Export of billboard clouds to other programs as plain glTF or OBJ."""

@@ -1,4 +1,4 @@
-"""All textures of a cloud in one picture, packed by xatlas and filled so that filtering finds no foreign color."""
+"""All textures of a cloud in one atlas, packed by xatlas, with padding that keeps filtering from mixing their colors."""
 
 from __future__ import annotations
 
@@ -6,28 +6,31 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bbfit.exporting.packing import packed
 from bbfit.geometry.cards import Atlas
 from bbfit.images import bleed_color
+from bbfit.xatlas_process import packed
 
-# Graphics cards compress textures in blocks of 4 x 4 texels.
+# Side of the blocks in which graphics cards compress textures, in texels.
 BLOCK = 4
 
 
 def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
-    """Pack textures without resampling or turning them.
+    """Pack textures without resampling or rotating them.
 
-    Each texture gets a cell of its own, at least ``padding`` texels larger on every side and aligned to blocks of n x n texels, n
-    being the largest power of two up to ``padding`` (at least 4): so no texel of a mip level up to log2(n) mixes two textures.
+    Each texture gets a cell that is at least ``padding`` texels larger on every side and aligned to blocks of n x n texels, where n is the
+    largest power of two up to ``padding`` (at least 4). So no texel of a mip level up to log2(n) mixes two textures.
 
     Parameters
     ----------
-    textures : R >= 1 straight-alpha pictures, uint8 [h, w, 4].
-    padding : at least 1 texel, which the fade to transparent at a billboard's rim needs.
+    textures : list of ndarray
+        R >= 1 straight-alpha pictures, uint8 [h, w, 4].
+    padding : int
+        At least 1 texel, which the fade to transparent at a billboard's rim needs.
 
     Returns
     -------
-    :class:`Atlas`. Alpha is 0 outside the textures; transparent texels have a neighbor's color (:func:`fill_cell`).
+    Atlas
+        Alpha is 0 outside the textures; transparent texels have the color of a neighbor (:func:`fill_cell`).
     """
     sizes = np.array([texture.shape[1::-1] for texture in textures], dtype=np.int64)
     unit = max(BLOCK, 1 << (padding.bit_length() - 1))
@@ -35,7 +38,7 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
     places = packed(cells)
     width, height = ((places + cells).max(0) * unit).tolist()
     image = np.zeros((height, width, 4), np.uint8)
-    image[..., :3] = _mean_color(textures)  # the gaps between cells, which only the smallest mip levels see
+    image[..., :3] = _mean_color(textures)  # for the gaps between cells, which only the smallest mip levels mix in
     for texture, place, cell in zip(textures, places * unit, cells * unit, strict=True):
         (x, y), (w, h) = place.tolist(), cell.tolist()
         image[y : y + h, x : x + w] = fill_cell(texture, padding, w, h)
@@ -43,11 +46,12 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
 
 
 def fill_cell(texture: NDArray[np.uint8], padding: int, width: int, height: int) -> NDArray[np.uint8]:
-    """Put a texture into its cell, transparent texels and the margin in their neighbors' color (:func:`~bbfit.images.bleed_color`).
+    """Place a texture in its cell; transparent texels and the padding get their neighbors' color (:func:`~bbfit.images.bleed_color`).
 
     Returns
     -------
-    uint8 [height, width, 4] with the texture's top-left texel at (``padding``, ``padding``); visible texels are unchanged.
+    ndarray
+        uint8 [height, width, 4] with the texture's top-left texel at (``padding``, ``padding``); visible texels are unchanged.
     """
     h, w = texture.shape[:2]
     cell = np.pad(texture, ((padding, height - h - padding), (padding, width - w - padding), (0, 0)))

@@ -12,15 +12,14 @@ from bbfit.images import to_bytes
 
 
 def cloud_cards(cloud: BillboardCloud, padding: int) -> Cards:
-    """Rectangles and atlas that any renderer with bilinear filtering shows as :func:`~bbfit.rendering.dispatch.render` does.
+    """Rectangles and an atlas for which bilinear filtering gives the picture of :func:`~bbfit.rendering.dispatch.render`.
 
     A billboard's picture fades to transparent over one texel beyond its outermost texel centers, so half a texel beyond its
-    rectangle. Each card is half a texel larger than its rectangle on every side and reaches to the centers of the padding texels
-    around its texture. A two-sided billboard gives two cards at the same place, front and back, of opposite winding.
+    rectangle. Each card is therefore half a texel larger than its rectangle on every side and reaches to the centers of the padding texels
+    around its texture. A two-sided billboard becomes two cards in the same place, front and back, of opposite winding.
 
-    Textures are rounded to 8 bits, which moves a premultiplied color by at most 1/255 a layer. Transparent texels change their
-    color (:func:`~bbfit.exporting.atlas.fill_cell`); that shows within a texel of the silhouette, by at most 1/4 a layer, where they
-    had another color before. Alpha is not touched by it.
+    Textures are rounded to 8 bits, which changes a premultiplied color by at most 1/255 per layer. Transparent texels get another color
+    (:func:`~bbfit.exporting.atlas.fill_cell`), which changes colors near the silhouette by at most 1/4 per layer, but no alpha.
 
     Raises
     ------
@@ -31,7 +30,7 @@ def cloud_cards(cloud: BillboardCloud, padding: int) -> Cards:
         fail("cloud", "has no billboards, so there is nothing to export", "fit it with at least one")
     for name in ("centers", "rights", "ups", "half_extents", "texels"):
         if not getattr(cloud, name).isfinite().all():
-            fail("cloud", f"{name} are not all finite numbers", "fit it anew")
+            fail("cloud", f"{name} are not all finite numbers", "fit it again")
     atlas = pack_atlas([to_bytes(side) for texture in cloud.textures() for side in texture], padding)
 
     centers, rights, ups, half, two_sided = (

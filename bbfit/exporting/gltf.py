@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.encoders import encode_ktx2, encode_webp
-from bbfit.exporting.splitting import centerd
+from bbfit.exporting.splitting import centered
 from bbfit.geometry.cards import Card, Cards
 from bbfit.glb import joined_glb, split_glb
 from bbfit.images import encode_png
@@ -22,22 +22,22 @@ _EXTENSIONS = {"webp": ("EXT_texture_webp", "image/webp"), "ktx2": ("KHR_texture
 
 
 def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
-    """A GLB file: one mesh for the cards shown from both sides, one for those culled from behind, and one for each that has an origin.
+    """A GLB file with one mesh for the cards that show both sides, one for those with back-face culling, and one per card with an origin.
 
-    A mesh with an origin stands there, and its bounds are centerd on it, by two vertices that no triangle uses: programs sort what is
-    blended by the one or the other. Mip levels are asked for only where the file brings its own (``ktx2``): those that programs make
-    for themselves lose coverage.
+    The node of a card with an origin is at that origin, and two vertices that no triangle uses center the mesh's bounds on it: programs
+    sort blended meshes by one or the other. The sampler uses mip levels only if the file includes them (``ktx2``), because mip levels
+    that programs compute lose coverage.
     """
     import trimesh
     from PIL import Image
 
     config = config.resolve()
-    standin = Image.new("RGBA", (1, 1))  # trimesh writes texture coordinates for textured materials only
+    placeholder = Image.new("RGBA", (1, 1))  # trimesh writes texture coordinates for textured materials only
     scene = trimesh.Scene(base_frame="billboard_cloud")
     for name, chosen in _meshes(cards).items():
         material = trimesh.visual.material.PBRMaterial(
             name="billboards_two_sided" if chosen[0].culled else "billboards",
-            baseColorTexture=standin,
+            baseColorTexture=placeholder,
             alphaMode="MASK" if cards.alpha.kind == "mask" else "BLEND",
             alphaCutoff=float(cards.alpha.cutoff) if cards.alpha.kind == "mask" else None,
             doubleSided=not chosen[0].culled,
@@ -50,7 +50,7 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
             points,
             np.concatenate([card.triangles + start for card, start in zip(chosen, first, strict=False)]),
             vertex_normals=normals,
-            # trimesh counts v from the bottom and turns it over on writing.
+            # trimesh counts v from the bottom and flips it when it writes.
             visual=trimesh.visual.TextureVisuals(uv=np.stack([uvs[:, 0], 1 - uvs[:, 1]], -1), material=material),
             process=False,
         )
@@ -62,29 +62,29 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
 
 
 def _vertices(card: Card) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Points about the card's origin, texture coordinates and normals."""
+    """Points relative to the card's origin, texture coordinates and normals."""
     if card.origin is None:
         points, uvs = card.corners, card.uvs
     else:
-        points = centerd(card) - card.origin
+        points = centered(card) - card.origin
         uvs = np.concatenate([card.uvs, card.uvs[:1].repeat(len(points) - len(card.uvs), 0)])
     return points, uvs, np.tile(card.normal, (len(points), 1))
 
 
 def _meshes(cards: Cards) -> dict[str, list[Card]]:
-    """What goes into a mesh of its own, by name."""
+    """The cards of each mesh, by the mesh's name."""
     meshes = dict[str, list[Card]]()
     for name, culled in (("billboards", False), ("billboards_two_sided", True)):
-        together = [card for card in cards.cards if card.culled == culled and card.origin is None]
+        joined = [card for card in cards.cards if card.culled == culled and card.origin is None]
         apart = [card for card in cards.cards if card.culled == culled and card.origin is not None]
-        meshes |= {name: together} if together else {}
+        meshes |= {name: joined} if joined else {}
         meshes |= {f"{name}_{index}": [card] for index, card in enumerate(apart)}
     return meshes
 
 
 def _complete(tree: dict[str, Any], cards: Cards, config: ExportConfig) -> None:
-    """Add to trimesh's glTF what it has no means to say, but for the pictures."""
-    # trimesh lists the picture once for each material.
+    """Add to trimesh's glTF what trimesh cannot write, except for the pictures."""
+    # trimesh lists the picture once per material.
     assert len({image["bufferView"] for image in tree["images"]}) == 1
     tree["images"] = [{"bufferView": tree["images"][0]["bufferView"]}]
     tree["textures"] = [{"sampler": 0, "name": "atlas"}]
@@ -102,7 +102,7 @@ def _complete(tree: dict[str, Any], cards: Cards, config: ExportConfig) -> None:
 
 
 def _with_pictures(tree: dict[str, Any], views: list[bytes], cards: Cards, config: ExportConfig) -> list[bytes]:
-    """The contents of the buffer views with those of the pictures, which the JSON is made to name."""
+    """The contents of the buffer views, with the pictures added; the JSON gets the references to them."""
     pictures = {"image/png": encode_png(cards.atlas.image)}
     if config.textures in _EXTENSIONS:
         extension, kind = _EXTENSIONS[config.textures]

@@ -1,4 +1,4 @@
-"""Several models of one tree as levels of detail in one GLB, by the extension MSFT_lod."""
+"""Several models of one tree as levels of detail in one GLB, with the extension MSFT_lod."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from bbfit.glb import gltf_parts, is_glb, joined_glb, split_glb
 from bbfit.model_files import generator
 
-# The lists of a glTF that bbfit's own have.
+# The lists in a glTF that bbfit writes.
 _ITEMS = ("bufferViews", "accessors", "images", "samplers", "textures", "materials", "meshes", "nodes")
 
 
@@ -19,44 +19,45 @@ class LodLevel:
     """One level of a file of levels of detail."""
 
     name: str
-    """Of its node."""
+    """Name of its node."""
     planes: int | None
-    """Billboards; ``None`` for the tree itself."""
+    """Number of billboards; ``None`` for the tree itself."""
     vertices: int
-    """Vertices, counted in the file."""
+    """Number of vertices in the file."""
     triangles: int
-    """Triangles, counted in the file."""
+    """Number of triangles in the file."""
     bytes: int
-    """Size as a file of its own."""
+    """Size of the level as a separate file."""
     error_meters: float
-    """How far its silhouette is off (:func:`bbfit.evaluation.metrics.silhouette_distance`) in the training view that is worst; 0 for the
-    tree itself."""
+    """Error of its silhouette (:func:`bbfit.evaluation.metrics.silhouette_distance`) in the worst training view; 0 for the tree itself."""
     error_pixels: float
-    """The same on the screen where the level takes over."""
+    """The same error on the screen, where the level takes over."""
     held_out_error_pixels: float
-    """The same by the worst held-out view, which had no say."""
+    """The same error in the worst held-out view, which did not influence the levels."""
     psnr: float | None
-    """Over white, in held-out views at their full size; ``None`` for the tree itself."""
+    """PSNR over white in dB in the held-out views at their full size; ``None`` for the tree itself."""
     tree_pixels: float | None
-    """Height of the tree on the screen, in pixels, below which the level is shown; ``None`` for the finest, which has no such bound."""
+    """Height of the tree on the screen in pixels below which the level is shown; ``None`` for the finest level."""
     distance_meters: float
-    """Distance of the tree from the camera from which on the level is shown, on the screen that was asked for."""
+    """Smallest distance of the tree from the camera at which the level is shown, on the screen of the configuration."""
     screen_coverage: float
-    """Least share of the screen that the tree's bounding sphere covers where the level is shown; 0 for the coarsest."""
+    """Smallest share of the screen that the tree's bounding sphere covers where the level is shown; 0 for the coarsest level."""
 
 
 def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel]) -> bytes:
-    """Join models into one whose first node has the others as its coarser levels.
+    """Join models into one GLB whose first node lists the others as its coarser levels.
 
-    The scene holds the first level alone, under a node of its own; programs that do not know MSFT_lod show just that. The nodes of the
-    other levels stand beside the scene, as the extension has it. The first level's node says in its ``extras`` down to which coverage of
-    the screen each level is shown (``MSFT_screencoverage``) and from which distance on (``lod_distances``, in meters).
+    The scene holds only the first level, under a new node; programs without MSFT_lod show only this level. As the extension requires, the
+    nodes of the other levels are outside the scene. The ``extras`` of the first level's node hold the smallest screen coverage of each
+    level (``MSFT_screencoverage``) and its smallest distance in meters (``lod_distances``).
 
     Parameters
     ----------
-    models : GLB files, finest first. The first may be any for which :func:`stands_alone` holds, and keeps its items and their numbers;
-        the others are ones that :func:`~bbfit.exporting.gltf.glb_bytes` wrote.
-    levels : what they are, one for each.
+    models : sequence of bytes
+        GLB files, the finest first. The first may be any file that :func:`is_self_contained` accepts, and keeps its items and their
+        indices; :func:`~bbfit.exporting.gltf.glb_bytes` wrote the others.
+    levels : sequence of LodLevel
+        One for each model.
     """
     assert len(models) == len(levels) > 0
     tree, views = split_glb(models[0])
@@ -78,7 +79,7 @@ def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel]) -> bytes:
     return joined_glb(tree, views)
 
 
-def stands_alone(path: Path) -> bool:
+def is_self_contained(path: Path) -> bool:
     """Whether a file is a GLB of glTF 2.0 with all of its data in its one binary chunk, so that others can be joined to it.
 
     Raises
@@ -95,13 +96,13 @@ def stands_alone(path: Path) -> bool:
 
 
 def _scene(tree: dict[str, Any]) -> dict[str, Any]:
-    """The scene that is shown."""
+    """The scene that programs show."""
     scene: dict[str, Any] = tree["scenes"][tree.get("scene", 0)]
     return scene
 
 
 def _append(tree: dict[str, Any], other: dict[str, Any], name: str) -> int:
-    """Append the items of another glTF in place, called after a new node above its scene's; that node's number."""
+    """Append the items of another glTF in place under a new node, whose name prefixes theirs; return the node's index."""
     at = {kind: len(tree.setdefault(kind, [])) for kind in _ITEMS}
 
     def moved(item: dict[str, Any], **kinds: str) -> dict[str, Any]:
@@ -135,7 +136,7 @@ def _append(tree: dict[str, Any], other: dict[str, Any], name: str) -> int:
 
 
 def _rooted(tree: dict[str, Any], name: str, children: list[int]) -> int:
-    """Put nodes under a new one; its number."""
+    """Put nodes under a new one; return its index."""
     tree["nodes"].append({"name": name, "children": children})
     return len(tree["nodes"]) - 1
 

@@ -1,6 +1,6 @@
 """Wavefront OBJ with its material library.
 
-Written here rather than by trimesh, which splits polygons into triangles, rounds to a fixed number of decimals and has no alpha map.
+trimesh is not used because it splits polygons into triangles, rounds to a fixed number of decimals and writes no alpha map.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ _MATERIAL = "billboards"
 
 
 def obj_bytes(cards: Cards, config: ExportConfig, *, material_file: str) -> bytes:
-    """An OBJ file: a polygon for each card, in meters, ``config.up`` up; nine digits, which give every float32 back.
+    """An OBJ file with one polygon per card, in meters, with the up axis ``config.up`` and nine digits, which preserve float32.
 
-    OBJ cannot say whether a face is culled from behind. A two-sided billboard is written as two faces of opposite winding, and the
-    file's header asks for culling where there are any.
+    OBJ has no back-face culling. A two-sided billboard becomes two faces of opposite winding, and a comment at the top of the file asks
+    the user to turn culling on.
     """
     corners = np.concatenate([card.corners for card in cards.cards])
     normals = np.stack([card.normal for card in cards.cards])
@@ -39,7 +39,7 @@ def obj_bytes(cards: Cards, config: ExportConfig, *, material_file: str) -> byte
 
 
 def mtl_bytes(*, texture_file: str) -> bytes:
-    """The material library: the texture's color as it is (illumination model 0, no lighting) and its alpha as opacity."""
+    """The material library: the texture's unlit color (illumination model 0) and its alpha as opacity."""
     lines = [
         "# bbfit billboard cloud",
         f"newmtl {_MATERIAL}",
@@ -59,5 +59,5 @@ def _z_up(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _rows(keyword: str, values: NDArray[np.float64]) -> list[str]:
-    # Adding zero turns -0 into 0.
+    # Adding 0 turns -0 into 0.
     return [keyword + " " + " ".join(f"{value:.9g}" for value in row) for row in (values + 0.0).tolist()]

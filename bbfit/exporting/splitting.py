@@ -1,4 +1,4 @@
-"""Cards cut into pieces that can be drawn whole, one after another, in the right order from every side."""
+"""Cards split into pieces that programs can draw one after another in the right order from every side."""
 
 from __future__ import annotations
 
@@ -9,50 +9,42 @@ from numpy.typing import NDArray
 
 from bbfit.checks import check_count, check_range
 from bbfit.exporting.hulls import rimmed_alpha, shown_cells, texel_corners
-from bbfit.exporting.node_order import (
-    Overlaps,
-    VisibilitySamples,
-    check_rig,
-    fit_origins,
-    fit_rig,
-    frame,
-    left_wrong,
-    measure_order,
-    overlaps,
-    sample_visibility,
-    shown_by,
-)
+from bbfit.exporting.node_order import Overlaps, fit_origins, measure_order, overlaps, remaining_error
+from bbfit.exporting.visibility import VisibilitySamples, bounding_sphere, check_rig, fit_rig, sample_visibility, visible_cards
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.polygons import kept_half
 from bbfit.operators.drawing.compositing import TIE
 
-# Share of the pieces that are cut before origins are fitted again.
+# Share of the pieces that are split before origins are fitted again.
 _AT_ONCE = 0.2
-# A piece may be cut along the planes of so many partners, if it reaches this far beyond them on both sides, in radii of the tree.
+# Number of partners whose planes a piece may be split along, and how far it must reach beyond them on both sides, in radii of the tree.
 _PARTNERS, _BEYOND = 4, 0.02
 
 
 def split(cards: Cards, wrong: float = 1e-3, most: int = 200) -> Cards:
-    """Cut cards and give every piece an origin, so that sorting by depth or distance of the origins draws them in the right order.
+    """Split cards and give each piece an origin, such that sorting the origins by depth or by distance gives the right order.
 
-    Two flat convex pieces have an order from every camera once neither passes through the other, so for a pair it is enough to cut one of
-    them along the other's plane (Fuchs, Kedem and Naylor 1980, "On visible surface generation by a priori tree structures"). But one
-    origin each must then do for all pairs and all cameras (:func:`~bbfit.exporting.node_order.fit_origins`), which asks for more cuts,
-    and crossings where next to nothing shows ask for none: such pieces may still cross. So cuts are made where the picture is wrong.
-    Origins are fitted; of the pieces that most of the wrong order belongs to, those are cut that it helps most, along the plane of a
-    partner or across their length; and so on until ``wrong`` is kept, by the cameras that origins are fitted to and by others
-    (:func:`~bbfit.exporting.node_order.misordered`). Pieces that are wholly transparent are dropped.
+    Two flat convex pieces have an order from every camera if neither passes through the other, so for one pair it is enough to split one
+    piece along the other's plane (Fuchs, Kedem and Naylor 1980, "On visible surface generation by a priori tree structures"). But one
+    origin per piece must serve all pairs and all cameras (:func:`~bbfit.exporting.node_order.fit_origins`), which needs more splits. On
+    the other hand, pieces may cross where almost nothing is visible.
 
-    Four planes through one axis become eight half planes.
+    The algorithm therefore splits where the picture is wrong. It fits the origins, takes the pieces with the largest wrong share, and
+    splits those that gain most, along the plane of a partner or across their length. It repeats this until the wrong share is at most
+    ``wrong``, both with the cameras of the fit and with others (:func:`~bbfit.exporting.node_order.misordered`). Fully transparent pieces
+    are dropped. Four planes through one axis become eight half planes.
 
     Parameters
     ----------
-    wrong : share of the visible picture, in [0, 1], mean of sorting by depth and by distance.
-    most : pieces at which cutting ends, at least 1; cards are never joined, so there may be more if there were more.
+    wrong : float
+        Accepted share of the visible picture, in [0, 1]: the mean of sorting by depth and by distance.
+    most : int
+        Number of pieces at which splitting ends, at least 1. Cards are never joined, so more cards than this stay as they are.
 
     Returns
     -------
-    The pieces, each with an origin. Pieces of one card that lie next to each other share no vertices.
+    Cards
+        The pieces, each with an origin. Neighboring pieces of one card share no vertices.
 
     Raises
     ------
@@ -61,7 +53,7 @@ def split(cards: Cards, wrong: float = 1e-3, most: int = 200) -> Cards:
     """
     check_range("wrong share", wrong, 0, 1)
     check_count("most pieces", most)
-    middle, radius = frame(cards)
+    middle, radius = bounding_sphere(cards)
     rimmed = {card.rectangle: rimmed_alpha(cards, card.rectangle) for card in cards.cards}
 
     def shows(card: Card) -> bool:
@@ -72,10 +64,10 @@ def split(cards: Cards, wrong: float = 1e-3, most: int = 200) -> Cards:
     origins = _middles(pieces)
     while True:
         now = cards.with_cards(pieces)
-        card, middles = shown_by(now, fitted), _middles(pieces)
+        card, middles = visible_cards(now, fitted), _middles(pieces)
         origins = fit_origins(fitted, card, middles, [middles, _on_a_circle(middles, middle), origins], radius)
         share, each = measure_order(fitted, card, origins)
-        unseen = measure_order(checked, shown_by(now, checked), origins)[0]
+        unseen = measure_order(checked, visible_cards(now, checked), origins)[0]
         if max(share.mean, unseen.mean) <= wrong or len(pieces) >= most:
             break
         between = _between(fitted, card, each, len(pieces))
@@ -84,7 +76,7 @@ def split(cards: Cards, wrong: float = 1e-3, most: int = 200) -> Cards:
         gains = [_best_cut(now, index, between[index], overlaps(fitted, card, origins, index), origins[index]) for index in worst]
         chosen = dict[int, NDArray[np.float64]]()
         for _, index, height in sorted(gains, key=lambda gain: (-gain[0], gain[1])):
-            # Once the partner that it is most wrong with is cut, a piece may be right as it is.
+            # After a split of the partner with which its order is most wrong, a piece may be right as it is.
             if int(between[index].argmax()) not in chosen and len(chosen) < room:
                 chosen[index] = height
         if not chosen:
@@ -100,23 +92,23 @@ def split(cards: Cards, wrong: float = 1e-3, most: int = 200) -> Cards:
     return cards.with_cards([replace(piece, origin=origin) for piece, origin in zip(pieces, origins, strict=True)])
 
 
-def centerd(card: Card) -> NDArray[np.float64]:
-    """A card's corners and two points more, for no triangle to use, that center its bounds on its origin, [K + 2, 3].
+def centered(card: Card) -> NDArray[np.float64]:
+    """A card's corners and two more points, which no triangle uses and which center its bounds on its origin, [K + 2, 3].
 
-    Programs that sort by the center of the bounds then sort by the origin. The two are opposite corners of the smallest such box.
+    Programs that sort by the center of the bounds then sort by the origin. The two points are opposite corners of the smallest such box.
     """
-    assert card.origin is not None, "only cards with an origin are centerd on it"
+    assert card.origin is not None, "only cards with an origin are centered on it"
     reach = abs(card.corners - card.origin).max(0)
     return np.concatenate([card.corners, [card.origin - reach, card.origin + reach]])
 
 
 def _heights(card: Card, other: Card) -> NDArray[np.float64]:
-    """How far a card's corners lie in front of another's plane, in meters, [K]."""
+    """Signed distances of a card's corners from the plane of another card in meters, positive in front of it, [K]."""
     return (card.corners - other.corners.mean(0)) @ other.normal
 
 
 def _halves(card: Card, height: NDArray[np.float64], slack: float) -> list[Card]:
-    """A card cut where a height is zero, which is linear in space and given at its corners; those within ``slack`` are on the cut."""
+    """A card split where a linear function is zero, given its values at the corners, [K]; corners within ``slack`` lie on the split."""
     height = np.where(abs(height) <= slack, 0.0, height)
     both = np.concatenate([card.corners, card.uvs], -1)
     made = []
@@ -132,28 +124,28 @@ def _middles(pieces: list[Card]) -> NDArray[np.float64]:
 
 
 def _on_a_circle(middles: NDArray[np.float64], center: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The pieces' directions from the upright axis, all at one height and radius, which is right for half planes that end at the axis."""
+    """Points around the upright axis in the pieces' directions, at one height and radius: the right origins for half planes at the axis."""
     outwards = (middles - center) * [1.0, 0.0, 1.0]
     radius = np.linalg.norm(outwards, axis=-1, keepdims=True)
     return center + outwards * (radius.mean() / np.maximum(radius, 1e-3 * radius.max() + 1e-12))
 
 
-def _between(sight: VisibilitySamples, card: NDArray[np.int64], each: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """How much of the wrong order lies between every two pieces, [P, P], symmetric."""
+def _between(samples: VisibilitySamples, card: NDArray[np.int64], each: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """The wrong share of each pair of pieces, [P, P], symmetric."""
     bad = np.flatnonzero(each)
-    pairs = card[sight.front[bad]] * count + card[sight.back[bad]]
-    found = np.bincount(pairs, each[bad], count * count).reshape(count, count)
-    return found + found.T
+    pairs = card[samples.front[bad]] * count + card[samples.back[bad]]
+    wrong = np.bincount(pairs, each[bad], count * count).reshape(count, count)
+    return wrong + wrong.T
 
 
 def _best_cut(
     cards: Cards, index: int, wrong: NDArray[np.float64], against: Overlaps, origin: NDArray[np.float64]
 ) -> tuple[float, int, NDArray[np.float64]]:
-    """How much of the wrong share goes if a card is cut where that helps most, its index, and its corners' heights over the cut.
+    """The gain of the best split of a card in wrong share, the card's index, and its corners' distances from the split, [K].
 
-    Tried are the planes of the cards that it is most wrong with and a cut across its length.
+    The candidates are the planes of the cards with which its order is most wrong, and a split across its length.
     """
-    card, radius = cards.cards[index], frame(cards)[1]
+    card, radius = cards.cards[index], bounding_sphere(cards)[1]
     away = card.corners - card.corners.mean(0)
     tried = [away @ np.linalg.svd(away)[2][0]]
     for partner in np.argsort(-wrong, kind="stable")[:_PARTNERS]:
@@ -165,6 +157,6 @@ def _best_cut(
     for height in tried:
         slope = np.linalg.lstsq(at - at.mean(0), height - height.mean(), rcond=None)[0]
         above = (against.points - at.mean(0)) @ slope + height.mean() > 0
-        left = sum(left_wrong(against, part, origin, radius) for part in (above, ~above) if part.any())
+        left = sum(remaining_error(against, part, origin, radius) for part in (above, ~above) if part.any())
         best = max(best, (float(wrong.sum()) - left, index, height), key=lambda gain: gain[0])
     return best

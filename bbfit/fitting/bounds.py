@@ -1,4 +1,4 @@
-"""Bounding billboards by what the views show, with OpenCV's bounding rectangles and convex hulls."""
+"""Bounds of billboards, from the silhouettes in the views or from opaque texels, by OpenCV's bounding rectangles and convex hulls."""
 
 from __future__ import annotations
 
@@ -14,35 +14,40 @@ from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.views import ViewSet
 
-# Views that meet a billboard more obliquely than this say nothing useful about its extent.
+# Least cosine between a billboard's normal and a view. More oblique views do not determine the extent of a billboard well.
 _OBLIQUE = math.cos(math.radians(60))
-# Alpha from which a texel counts as being something.
+# Least alpha of a texel that bounds include.
 _OPAQUE = 0.3
-# Alpha that does not round to 0 in 8 bits.
+# Least alpha that does not round to 0 in 8 bits.
 _VISIBLE = 0.5 / 255
-# Billboards whose cosines differ by less face a view equally well.
+# Billboards whose cosines differ by less than this face a view equally well.
 _TIE = 1e-3
 
 
-def facing(camera: Camera, normals: Tensor, target: Tensor) -> Tensor:
-    """Cosines between billboard normals and the directions towards each camera, [V, N]; 1 is face on."""
+def facing_cosines(camera: Camera, normals: Tensor, target: Tensor) -> Tensor:
+    """Compute the cosines between billboard normals, [N, 3], and the directions from a target, [3], to each camera, [V, N]."""
     towards = -camera.forward if camera.orthographic else torch.nn.functional.normalize(camera.position - target, dim=-1)
     return towards @ normals.mT
 
 
 def facing_view_bounds(planes: BillboardCloud, views: ViewSet, *, pairs: bool) -> Tensor:
-    """Bounds of every billboard in the one view that faces it best (thesis, section 6.3).
+    """Bound every billboard by the silhouette in the view that it faces best (thesis, section 6.3).
 
     Parameters
     ----------
-    planes : billboards through a common center, of any extent.
-    pairs : whether odd entries are the backs of pairs, which face the other way.
+    planes
+        Billboards through a common center, of any extent.
+    views
+        Views of the tree.
+    pairs
+        Whether odd entries are the backs of pairs, which face the opposite direction.
 
     Returns
     -------
-    [N, 4] left, right, bottom, top in meters along the billboard's axes from its center.
+    Tensor
+        Left, right, bottom and top along the billboard's axes from its center, in meters, [N, 4].
     """
-    cosines = facing(views.cameras, planes.normals, planes.centers[0])
+    cosines = facing_cosines(views.cameras, planes.normals, planes.centers[0])
     if pairs:
         cosines = cosines * torch.tensor([1.0, -1.0]).repeat(len(planes) // 2)
     best = cosines.argmax(0).tolist()
@@ -50,30 +55,30 @@ def facing_view_bounds(planes: BillboardCloud, views: ViewSet, *, pairs: bool) -
 
 
 def silhouette_bounds(planes: BillboardCloud, views: ViewSet) -> Tensor:
-    """Bounds such that in every view the billboard that faces it best covers the whole silhouette.
+    """Bound the billboards so that in every view the billboard that faces it best covers the whole silhouette.
 
-    Nothing of the tree is then cut off in any training view. Views more than 60 degrees off every billboard's normal (from above, say)
-    are covered only as far as the others reach. Same return as :func:`facing_view_bounds`.
+    These bounds cut off no part of the tree in any view, except in views that are more than 60 degrees off every billboard's normal, for
+    example from above. Parameters and result are those of :func:`facing_view_bounds`.
     """
-    cosines = facing(views.cameras, planes.normals, planes.centers[0]).abs()
+    cosines = facing_cosines(views.cameras, planes.normals, planes.centers[0]).abs()
     bounds = torch.tensor([math.inf, -math.inf, math.inf, -math.inf], dtype=planes.centers.dtype).repeat(len(planes), 1)
     for view, row in enumerate(cosines):
         outline = _outline(views, view)
-        # A view halfway between two billboards counts for both, as it does for both rectangles of a pair.
+        # A view halfway between two billboards bounds both, and a view of a pair bounds both of its rectangles.
         for n in torch.nonzero((row > row.max() - _TIE) & (row > _OBLIQUE))[:, 0].tolist():
             bounds[n] = _union(bounds[n], _bounds_on_plane(planes, n, views.cameras[view], outline))
     seen = bounds[:, 0].isfinite()
-    if not seen.any():  # only oblique views: fall back to the best there is
+    if not seen.any():  # only oblique views
         return facing_view_bounds(planes, views, pairs=False)
     widest = torch.stack([bounds[seen, 0].amin(), bounds[seen, 1].amax(), bounds[seen, 2].amin(), bounds[seen, 3].amax()])
     return torch.where(seen[:, None], bounds, widest)
 
 
 def opaque_bounds(cloud: BillboardCloud) -> Tensor:
-    """Bounds of what is not transparent in each billboard's textures; same return as :func:`facing_view_bounds`.
+    """Bound the opaque texels of each billboard, with a margin of two texels. The result is that of :func:`facing_view_bounds`.
 
-    A margin of two texels is left around it. Where it reaches the border of the texture there may be more beyond, so the bounds then grow
-    by a tenth of the side. A billboard without anything on it keeps its bounds.
+    If opaque texels reach the border of the texture, the tree may extend beyond it, and the bounds grow by a tenth of that side. The bounds
+    of a billboard without opaque texels do not change.
     """
     bounds = []
     for n, texture in enumerate(cloud.textures()):
@@ -81,35 +86,32 @@ def opaque_bounds(cloud: BillboardCloud) -> Tensor:
         x, y, width, height = cv2.boundingRect(mask)
         sides = torch.tensor([mask.shape[1], mask.shape[0]])
         if not width:
-            bounds.append(
-                torch.stack([-cloud.half_extents[n, 0], cloud.half_extents[n, 0], -cloud.half_extents[n, 1], cloud.half_extents[n, 1]])
-            )
+            half_width, half_height = cloud.half_extents[n]
+            bounds.append(torch.stack([-half_width, half_width, -half_height, half_height]))
             continue
         low, high = torch.tensor([x, y]), torch.tensor([x + width, y + height])
-        spare = (sides / 10).ceil().clamp_min(2)
-        low = torch.where(low < 1, low - spare, (low - 2).clamp_min(0))
-        high = torch.where(high > sides - 1, high + spare, torch.minimum(high + 2, sides))
+        margin = (sides / 10).ceil().clamp_min(2)
+        low = torch.where(low < 1, low - margin, (low - 2).clamp_min(0))
+        high = torch.where(high > sides - 1, high + margin, torch.minimum(high + 2, sides))
         meters = (torch.stack([low, high]) / sides * 2 - 1) * cloud.half_extents[n]
         bounds.append(torch.stack([meters[0, 0], meters[1, 0], -meters[1, 1], -meters[0, 1]]))
     return torch.stack(bounds)
 
 
 def trimmed(cloud: BillboardCloud) -> BillboardCloud:
-    """The same picture with rectangles cut, texel by texel, to what eight bits of alpha show of them, and a margin of one texel.
+    """Crop rectangles to the texels whose alpha is not 0 in 8 bits, with a margin of one texel. Renders do not change.
 
-    Billboards that show nothing are left out, but for one if none shows anything.
+    Transparent billboards are removed. One remains if all of them are transparent.
     """
-    shown = [n for n, texture in enumerate(cloud.textures()) if (texture[..., 3] >= _VISIBLE).any()]
-    if len(shown) < len(cloud):
-        cloud = cloud.take(shown or [0])
+    visible = [n for n, texture in enumerate(cloud.textures()) if (texture[..., 3] >= _VISIBLE).any()]
+    if len(visible) < len(cloud):
+        cloud = cloud.take(visible or [0])
     parts, middles, texels, sizes = [], [], [], []
     for texture in cloud.textures():
         mask = (texture[..., 3].amax(0) >= _VISIBLE).numpy().astype(np.uint8)
         x, y, width, height = cv2.boundingRect(mask)
         left, top = max(x - 1, 0), max(y - 1, 0)
         right, bottom = min(x + width + 1, mask.shape[1]), min(y + height + 1, mask.shape[0])
-        if not width:
-            left, top, right, bottom = 0, 0, 1, 1
         parts.append([(right - left) / mask.shape[1], (bottom - top) / mask.shape[0]])
         middles.append([(left + right) / mask.shape[1] - 1, 1 - (top + bottom) / mask.shape[0]])
         sizes.append([bottom - top, right - left])
@@ -128,23 +130,25 @@ def _union(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(torch.tensor([True, False, True, False]), torch.minimum(a, b), torch.maximum(a, b))
 
 
+def _silhouette(views: ViewSet, view: int) -> np.ndarray:
+    return (views.image(view)[..., 3] > 0).numpy().astype(np.uint8)
+
+
 def _outline(views: ViewSet, view: int) -> Tensor:
-    """Corners of the convex hull of a view's pixels with alpha > 0, in pixel coordinates of pixel *edges*, [P, 2] float64."""
-    mask = (views.image(view)[..., 3] > 0).numpy().astype(np.uint8)
-    centers = torch.from_numpy(cv2.convexHull(cv2.findNonZero(mask))[:, 0]).double()
+    """Return the corners of the convex hull of a view's pixels with alpha > 0, with their outer edges, in pixels, float64 [P, 2]."""
+    centers = torch.from_numpy(cv2.convexHull(cv2.findNonZero(_silhouette(views, view)))[:, 0]).double()
     to_edges = torch.tensor([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]], dtype=torch.float64)
     return (centers[:, None] + to_edges).flatten(0, 1)
 
 
 def _box(views: ViewSet, view: int) -> Tensor:
-    """Corners of the bounding rectangle of a view's alpha > 0, as :func:`_outline`."""
-    mask = (views.image(view)[..., 3] > 0).numpy().astype(np.uint8)
-    x, y, width, height = cv2.boundingRect(mask)
+    """Return the corners of the bounding rectangle of a view's pixels with alpha > 0, as :func:`_outline`."""
+    x, y, width, height = cv2.boundingRect(_silhouette(views, view))
     return torch.tensor([[x, y], [x + width, y], [x + width, y + height], [x, y + height]], dtype=torch.float64) - 0.5
 
 
 def _bounds_on_plane(planes: BillboardCloud, n: int, camera: Camera, pixels: Tensor) -> Tensor:
-    """Bounds of pixels, [P, 2], projected through one camera onto plane ``n``: left, right, bottom, top, [4]."""
+    """Project pixels, [P, 2], through one camera onto plane ``n`` and return their left, right, bottom and top, [4]."""
     point = torch.stack([planes.rights[n], planes.ups[n], planes.centers[n]], -1)
     plane_to_world = torch.cat([point, torch.tensor([[0.0, 0.0, 1.0]], dtype=point.dtype)])
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], -1)
@@ -155,9 +159,18 @@ def _bounds_on_plane(planes: BillboardCloud, n: int, camera: Camera, pixels: Ten
 
 
 def smallest_rectangle(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Center, unit axis along its width, half width and height, [2] each, of the smallest rectangle around points of a plane, [P, 2].
+    """Find the smallest rectangle around points in a plane, [P, 2].
 
-    It is turned only if that makes it a fifth smaller, and then by 45 degrees at most.
+    The rectangle is rotated, by 45 degrees at most, only if that makes it at least a fifth smaller.
+
+    Returns
+    -------
+    center
+        [2].
+    axis
+        Unit vector along the width, [2].
+    half_extents
+        Half width and half height, [2].
     """
     low, high = points.amin(0), points.amax(0)
     upright = torch.tensor([1.0, 0.0], dtype=points.dtype)
@@ -166,6 +179,6 @@ def smallest_rectangle(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return (low + high) / 2, upright, (high - low) / 2
     while abs(degrees) > 45:
         width, height, degrees = height, width, degrees - math.copysign(90, degrees)
-    turn = math.radians(degrees)
-    axis = torch.tensor([math.cos(turn), math.sin(turn)], dtype=points.dtype)
+    angle = math.radians(degrees)
+    axis = torch.tensor([math.cos(angle), math.sin(angle)], dtype=points.dtype)
     return torch.tensor([x, y], dtype=points.dtype), axis, torch.tensor([width / 2, height / 2], dtype=points.dtype)

@@ -1,4 +1,4 @@
-"""The cloud that a fit starts from: where the billboards stand, how large they are, how many texels they own."""
+"""The initial cloud of a fit: placement, size and texture sizes of the billboards."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from bbfit.geometry.camera import Camera, convergence_point
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.views import ViewSet
 
-# Distance between the rectangles of a pair, as a share of their half width: "a very small distance" (thesis, section 6.4).
+# Distance between the rectangles of a pair, as a fraction of their half width: "a very small distance" (thesis, section 6.4).
 PAIR_GAP = 2e-3
 
 
 def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
-    """Evenly turned upright billboards through the tree's axis with seeded random textures, float32 on the CPU.
+    """Place upright billboards at equal angles through the tree's axis, with random textures, float32 on the CPU.
 
-    The axis is the vertical line through the point that the cameras converge on. Unbounded billboards fill the viewport of a camera
-    that faces them (thesis, sections 4.2 and 6.3).
+    The axis is the vertical line through the point that the cameras converge on. With the bounds ``viewport``, billboards fill the picture
+    of a camera that faces them (thesis, sections 4.2 and 6.3).
     """
     camera, config = views.cameras, config.resolve()
     assert config.billboards is not None and config.texel_density is not None
@@ -51,56 +51,75 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
 
 
 def pixels_a_meter(camera: Camera) -> Tensor:
-    """Pixels that a meter takes up where the tree's axis is seen face on, a scalar."""
+    """Compute the pixels per meter at the tree's axis, perpendicular to the viewing direction, a scalar."""
     focal = camera.intrinsics[:, 0, 0].mean()
     return focal if camera.orthographic else focal / (camera.position - convergence_point(camera)).norm(dim=-1).mean()
 
 
 def tree_radius(views: ViewSet) -> float:
-    """Root mean square distance of the tree from its middle, in meters, as some views show it; as deep as it is wide."""
+    """Estimate the root mean square distance of the tree from its center in meters, from a few views, as if as deep as wide."""
     alphas = torch.stack([views.image(i)[..., 3].double() for i in range(0, len(views), max(1, len(views) // 8))])
-    spread = 0.0
-    for weights, share in ((alphas.sum(1), 2.0), (alphas.sum(2), 1.0)):
+    variance = 0.0
+    for weights, dimensions in ((alphas.sum(1), 2.0), (alphas.sum(2), 1.0)):
         weights = weights / weights.sum(-1, keepdim=True)
-        at = torch.arange(weights.shape[1], dtype=torch.float64)
-        spread += share * float(((weights * at.square()).sum(-1) - (weights * at).sum(-1).square()).mean())
-    return math.sqrt(spread) / float(pixels_a_meter(views.cameras))
+        pixel = torch.arange(weights.shape[1], dtype=torch.float64)
+        variance += dimensions * float(((weights * pixel.square()).sum(-1) - (weights * pixel).sum(-1).square()).mean())
+    return math.sqrt(variance) / float(pixels_a_meter(views.cameras))
 
 
 def random_textures(cloud: BillboardCloud, sizes: Tensor, seed: int) -> BillboardCloud:
-    """The same rectangles with random textures of the given sizes, int64 [N, 2]."""
+    """Give a cloud random textures of the given heights and widths, int64 [N, 2]."""
     count = int((sizes.prod(-1) * (1 + cloud.two_sided.long())).sum())
     texels = torch.rand(count, 4, generator=torch.Generator().manual_seed(seed))
     return replace(cloud, texture_sizes=sizes, texels=texels)
 
 
-def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_meter: float, most: int | None = None) -> BillboardCloud:
-    """Cut billboards down to ``bounds``, [N, 4] left, right, bottom, top in meters from their centers, and size them (:func:`sized`)."""
+def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_meter: float, max_texels: int | None = None) -> BillboardCloud:
+    """Resize billboards to bounds and allocate their textures as :func:`sized` does.
+
+    Parameters
+    ----------
+    planes
+        N billboards.
+    bounds
+        Left, right, bottom and top along the billboards' axes from their centers, in meters, [N, 4].
+    texels_a_meter
+        Texels per meter along each side.
+    max_texels
+        Most texels of all billboards together.
+    """
     left, right, bottom, top = bounds.unbind(-1)
     middle, sides = torch.stack([left + right, bottom + top], -1) / 2, torch.stack([right - left, top - bottom], -1)
     centers = planes.centers + middle[:, :1] * planes.rights + middle[:, 1:] * planes.ups
-    return sized(replace(planes, centers=centers, half_extents=sides / 2), texels_a_meter, most)
+    return sized(replace(planes, centers=centers, half_extents=sides / 2), texels_a_meter, max_texels)
 
 
-def sized(cloud: BillboardCloud, texels_a_meter: float, most: int | None = None) -> BillboardCloud:
-    """The same billboards with transparent textures of ``texels_a_meter``, square texels, rectangles rounded up to whole ones.
+def sized(cloud: BillboardCloud, texels_a_meter: float, max_texels: int | None = None) -> BillboardCloud:
+    """Give billboards transparent textures with square texels, and round the rectangles up to whole texels.
 
-    With ``most`` there are fewer texels to the meter if it takes that to have no more of them than so many.
+    Parameters
+    ----------
+    cloud
+        N billboards.
+    texels_a_meter
+        Texels per meter along each side. It is lowered if ``max_texels`` requires it.
+    max_texels
+        Most texels of all billboards together.
 
     Raises
     ------
     InputError
-        if there are more textures than texels are allowed.
+        If there are more textures than ``max_texels`` allows texels.
     """
     sides = 1 + cloud.two_sided.long()
-    if most is not None and most < int(sides.sum()):
-        fail("max_texels", f"{most} are too few for {int(sides.sum())} textures", "allow more")
+    if max_texels is not None and max_texels < int(sides.sum()):
+        fail("max_texels", f"{max_texels} are too few for {int(sides.sum())} textures", "allow more")
     while True:
         sizes = _at_least_one(2 * cloud.half_extents * texels_a_meter).flip(-1)
         count = int((sizes.prod(-1) * sides).sum())
-        if most is None or count <= most:
+        if max_texels is None or count <= max_texels:
             break
-        texels_a_meter *= min(0.995, math.sqrt(most / count))
+        texels_a_meter *= min(0.995, math.sqrt(max_texels / count))
     half_extents = sizes.flip(-1).to(cloud.half_extents) / texels_a_meter / 2
     return replace(cloud, half_extents=half_extents, texture_sizes=sizes, texels=cloud.texels.new_zeros(1, 4).expand(count, 4))
 

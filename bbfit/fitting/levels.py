@@ -1,4 +1,4 @@
-"""Coarse to fine: views and textures at a fraction of their resolution (Burt and Adelson 1983 of pictures; here for textures as well)."""
+"""Coarse to fine: views and textures at a fraction of their resolution (Burt and Adelson 1983, for pictures; here also for textures)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bbfit.images import premultiply, unpremultiply
 from bbfit.views import ViewSet
 
 LEAST_SIDE = 16
-"""A level whose pictures would be smaller than this in pixels is left out."""
+"""Least side of the pictures of a level, in pixels. Coarser levels are skipped."""
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,15 @@ class Targets:
     """Training views at one resolution."""
 
     cameras: Camera
-    """V cameras of that resolution."""
+    """V cameras at that resolution."""
     views: ViewSet
     """The views at full resolution."""
     shrunk: Tensor | None
-    """Premultiplied RGBA, uint8 [V, H, W, 4]; ``None`` at full resolution, where the views themselves are read."""
+    """Premultiplied RGBA, uint8 [V, H, W, 4], or ``None`` at full resolution, which is read from ``views``."""
 
     @staticmethod
     def at(views: ViewSet, halvings: int) -> Targets:
-        """The views with sides ``2 ** halvings`` times shorter, every pixel the mean of those that it covers."""
+        """Shrink views by a factor of ``2 ** halvings`` along each side. Each pixel is the mean of the pixels that it covers."""
         if halvings == 0:
             return Targets(views.cameras, views, None)
         width, height = (max(1, round(side / 2**halvings)) for side in (views.cameras.width, views.cameras.height))
@@ -42,36 +42,36 @@ class Targets:
 
         def shrink(index: int) -> None:
             picture = views.image(index).float()
-            picture[..., :3] *= picture[..., 3:] / 255  # in place: large pictures come in numbers
+            picture[..., :3] *= picture[..., 3:] / 255  # in place, to save memory with many large pictures
             shrunk[index] = interpolate(picture.permute(2, 0, 1)[None], (height, width), mode="area")[0].permute(1, 2, 0).round()
 
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # each thread keeps memory of its own
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # each thread has memory of its own
             for _ in pool.map(shrink, range(len(views))):
                 pass
         return Targets(views.cameras.resized(width, height), views, shrunk)
 
     def packed(self, indices: Sequence[int]) -> Tensor:
-        """Some of the pictures, uint8 [B, H, W, 4], straight at full resolution and premultiplied otherwise."""
+        """Return the pictures at B indices, uint8 [B, H, W, 4], with straight alpha at full resolution and premultiplied otherwise."""
         pictures = [self.views.image(i) if self.shrunk is None else self.shrunk[i] for i in indices]
-        # By numpy: torch would wake its threads, which then keep spinning on the cores that the kernels are about to use.
+        # numpy instead of torch: torch would wake its threads, which then spin on the cores that the kernels need next.
         return torch.from_numpy(np.stack([picture.numpy() for picture in pictures]))
 
     def pictures(self, indices: Sequence[int]) -> Tensor:
-        """Some of the pictures, premultiplied RGBA in [0, 1], float32 [B, H, W, 4]."""
+        """Return the pictures at B indices as premultiplied RGBA in [0, 1], float32 [B, H, W, 4]."""
         return self.views.targets(indices) if self.shrunk is None else self.shrunk[list(indices)].float() / 255
 
 
 def resize_textures(cloud: BillboardCloud, sizes: Tensor) -> BillboardCloud:
-    """The same rectangles with textures of other sizes, int64 [N, 2], filtered as premultiplied colors.
+    """Resize the textures of a cloud to heights and widths, int64 [N, 2], and filter them as premultiplied colors.
 
-    The color of what is fully transparent is filtered as it is, since a fit goes on from it.
+    The colors of fully transparent texels are filtered as straight colors, because the next level of a fit starts from them.
     """
     textures = [_resized(texture, size).reshape(-1, 4) for texture, size in zip(cloud.textures(), sizes.tolist(), strict=True)]
     return replace(cloud, texture_sizes=sizes, texels=torch.cat(textures))
 
 
 def _resized(texture: Tensor, size: list[int]) -> Tensor:
-    """Textures of one billboard, [S, h, w, 4], in another size."""
+    """Resize the textures of one billboard, [S, h, w, 4], to a height and width."""
     shrinks = size[0] <= texture.shape[1] and size[1] <= texture.shape[2]
     both = torch.cat([premultiply(texture), texture], -1).permute(0, 3, 1, 2)
     both = interpolate(both, size, mode="area" if shrinks else "bilinear").permute(0, 2, 3, 1)
@@ -79,23 +79,35 @@ def _resized(texture: Tensor, size: list[int]) -> Tensor:
 
 
 def resampled(cloud: BillboardCloud, onto: BillboardCloud, sizes: Tensor) -> BillboardCloud:
-    """``onto`` with the textures of ``cloud``, whose rectangles lie in the same planes with the same axes but may be larger or smaller.
+    """Resample the textures of a cloud onto other rectangles in the same planes.
 
-    They get new sizes, int64 [N, 2].
+    The filter is that of :func:`resize_textures`. A texture continues beyond its border as transparent texels of the border's color.
 
-    Filtered as :func:`resize_textures` does it. Beyond the border of a texture there is nothing, in the color of the border.
+    Parameters
+    ----------
+    cloud
+        N billboards with textures.
+    onto
+        The rectangles to resample onto. Their axes are those of ``cloud``; their centers and extents may differ.
+    sizes
+        New texture heights and widths, int64 [N, 2].
+
+    Returns
+    -------
+    BillboardCloud
+        ``onto`` with the new textures.
     """
     if torch.equal(cloud.centers, onto.centers) and torch.equal(cloud.half_extents, onto.half_extents):
         return resize_textures(cloud, sizes)
     textures = []
     for n, (texture, size) in enumerate(zip(cloud.textures(), sizes.tolist(), strict=True)):
         scale = onto.half_extents[n] / cloud.half_extents[n]
-        finer = torch.tensor(texture.shape[1:3]) * scale.flip(0) / torch.tensor(size)  # texels of the old one to a new one, down and across
-        if float(finer.amax()) > 1:
-            coarse = [max(1, round(count / max(1.0, float(more)))) for count, more in zip(texture.shape[1:3], finer, strict=True)]
+        ratio = torch.tensor(texture.shape[1:3]) * scale.flip(0) / torch.tensor(size)  # old texels per new texel, down and across
+        if float(ratio.amax()) > 1:
+            coarse = [max(1, round(count / max(1.0, float(r)))) for count, r in zip(texture.shape[1:3], ratio, strict=True)]
             texture = _resized(texture, coarse)
         shift = onto.centers[n] - cloud.centers[n]
-        across = torch.stack([shift @ cloud.rights[n], -shift @ cloud.ups[n]]) / cloud.half_extents[n]  # middle of the new one in [-1, 1]
+        across = torch.stack([shift @ cloud.rights[n], -shift @ cloud.ups[n]]) / cloud.half_extents[n]  # new center, in [-1, 1]
         steps = [(2 * torch.arange(count, dtype=torch.float64) + 1) / count - 1 for count in size]
         grid = torch.stack(torch.meshgrid(across[1] + scale[1] * steps[0], across[0] + scale[0] * steps[1], indexing="ij")[::-1], -1)
         grid = grid[None].expand(len(texture), -1, -1, -1).to(texture)
@@ -108,5 +120,5 @@ def resampled(cloud: BillboardCloud, onto: BillboardCloud, sizes: Tensor) -> Bil
 
 
 def shrunk_sizes(cloud: BillboardCloud, halvings: int) -> Tensor:
-    """Texture sizes with sides ``2 ** halvings`` times shorter, rounded up, int64 [N, 2]."""
+    """Divide the texture heights and widths of a cloud by ``2 ** halvings``, rounded up, int64 [N, 2]."""
     return -(-cloud.texture_sizes // 2**halvings)

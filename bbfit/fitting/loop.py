@@ -1,4 +1,4 @@
-"""The optimization loop (thesis, algorithm 1), resumable."""
+"""The optimization loop (thesis, algorithm 1), which can resume from a checkpoint."""
 
 from __future__ import annotations
 
@@ -33,53 +33,54 @@ from bbfit.provenance import cache_key
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset
 
-_START, _FOUND = "start.", "found."
-# Share of the steps at full resolution in which a mask hardens.
+# Prefixes of the tensors of two clouds in a checkpoint.
+_START, _PLACEMENT = "start.", "found."
+# Fraction of the steps at full resolution during which a mask hardens.
 _HARDENING = 0.3
 
 
 @dataclass(frozen=True)
 class Step:
-    """What ``on_step`` is told after every optimizer step."""
+    """The state of a fit after an optimizer step."""
 
     index: int
-    """Steps done, from 1."""
+    """Number of the step, from 1."""
     total: int
-    """Steps in all."""
+    """Total number of steps."""
     loss: float
-    """The step's loss, before its update."""
+    """Loss of the step, before its update."""
     learning_rate: float
-    """Adam's rate in this step."""
+    """Adam's learning rate in this step."""
     snapshot: Callable[[], BillboardCloud]
-    """Copies the cloud as it is after the step, at the step's level of resolution, to the CPU."""
+    """Copies the current cloud, at the current resolution, to the CPU."""
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """A fitted billboard cloud and how it came about."""
+    """A fitted billboard cloud and the record of its fit."""
 
     cloud: BillboardCloud
-    """The result, float32 on the CPU."""
+    """The fitted cloud, float32 on the CPU."""
     losses: list[float]
     """Loss of every step."""
     config: FitConfig
     """The configuration, resolved."""
     seconds: float
-    """Time spent fitting, over all attempts when resumed."""
+    """Duration of the fit, including the time before it was resumed."""
 
 
 @dataclass
 class _FitState:
-    """What a checkpoint holds."""
+    """The contents of a checkpoint."""
 
     losses: list[float]
-    """Of the steps done."""
+    """Losses of the finished steps."""
     start: BillboardCloud
-    """The rectangles at the beginning of the level, with their texture sizes at full resolution; its texels mean nothing."""
-    found: BillboardCloud | None
-    """What the search for a placement has found, as long as no step is done."""
+    """The rectangles at the start of the level, with their texture sizes at full resolution. The texels are not used."""
+    placement: BillboardCloud | None
+    """Result of the search for a placement, before the first step."""
     tensors: dict[str, Tensor]
-    """The stepper's, after the last step."""
+    """State of the stepper after the last step."""
     seconds: float
 
 
@@ -92,70 +93,80 @@ def fit(
     on_step: Callable[[Step], None] | None = None,
     on_place: Callable[[int, int], None] | None = None,
 ) -> FitResult:
-    """Fit a billboard cloud to the training views; the test views are not looked at.
+    """Fit a billboard cloud to the training views. The test views are not used.
 
-    First a placement is searched for, unless it is to be the even one. Then each step draws some training views, renders the cloud from
-    their cameras, and lets Adam (Kingma and Ba 2015) move the texels, and at all but the finest level the billboards, down the gradient of
-    the loss; texels are kept in [0, 1]. Views and textures start coarse and are refined level by level; billboards that have moved are cut
-    to what they show at the end of a level. At the end transparent texels get their neighbors' color.
+    A search first finds a placement, unless the configuration requests the even placement. Each step then samples training views, renders
+    the cloud from their cameras, and updates the texels by Adam (Kingma and Ba 2015) on the gradient of the loss. At all levels but the
+    finest it also updates the placement. Texels are clamped to [0, 1].
+
+    Views and textures start at a coarse resolution, and each level doubles it. After a level that moves billboards, the rectangles get new
+    bounds around their opaque texels. At the end, transparent texels take the color of their neighbors.
 
     Parameters
     ----------
-    views : training views from around the tree.
-    config : the preset ``default`` when left out.
-    tree : the mesh that the views show, as glTF, OBJ, PLY or STL, to place billboards by; the visual hull of the views when left out.
-    checkpoint : file to keep the state in every ``config.checkpoint_every`` steps. If it holds the state of a fit of the same views by
-        the same configuration, that fit goes on, and ends with the same result as an unbroken one. The caller removes the file once
-        the result is safe.
-    on_step : called after every step.
-    on_place : called while a placement is searched for, with how much of the work is done and how much there is.
+    views
+        Views from around the tree.
+    config
+        Options of the fit. Default: the preset ``default``.
+    tree
+        The mesh that the views show, as glTF, OBJ, PLY or STL, for the search for a placement. Default: the visual hull of the views.
+    checkpoint
+        File that stores the state every ``config.checkpoint_every`` steps. If it contains the state of a fit of the same views and mesh
+        with the same configuration, the fit resumes from it and ends with the same result as an uninterrupted fit. The caller removes the
+        file once the result is saved.
+    on_step
+        Called after every step.
+    on_place
+        Called during the search for a placement, with the work done and the total work.
 
     Raises
     ------
+    MissingFileError
+        If the mesh is missing.
     InputError
-        if a view cannot be read or is empty, the mesh is not of the tree that the views show, or the device is not there.
+        If a view cannot be read or is empty, the mesh is not of the tree that the views show, or the device is not available.
     """
     if not isinstance(views, ViewDataset):
         raise InputTypeError(f"views: expected a ViewDataset, got {views!r}; ViewDataset.load(folder) reads one")
     config = (config or FitConfig()).resolve()
     assert config.steps is not None and config.views_per_step is not None and config.learning_rate is not None
     device = _device(config.device)
-    begun = time.perf_counter()
+    started = time.perf_counter()
     views.train.check()
-    opened = None if tree is None or config.placement == "even" else TreeFile.open(tree)
-    key = cache_key("fit", *fit_inputs(views, config, opened))
+    tree_file = None if tree is None or config.placement == "even" else TreeFile.open(tree)
+    key = cache_key("fit", *fit_inputs(views, config, tree_file))
     checkpoint = Path(checkpoint) if checkpoint is not None else None
-    done = _load(checkpoint, key) if checkpoint is not None else None
-    if done is None:
-        done = _begin(views, config, opened, on_place)
-        if checkpoint is not None and done.found is not None:
-            _save(checkpoint, key, replace(done, seconds=time.perf_counter() - begun))
-    begun -= done.seconds
+    state = _load(checkpoint, key) if checkpoint is not None else None
+    if state is None:
+        state = _initial_state(views, config, tree_file, on_place)
+        if checkpoint is not None and state.placement is not None:
+            _save(checkpoint, key, replace(state, seconds=time.perf_counter() - started))
+    started -= state.seconds
 
-    start, fitted, losses = done.start, done.found, done.losses
+    start, fitted, losses = state.start, state.placement, state.losses
     assert config.texel_density is not None
     density, radius = config.texel_density * float(pixels_a_meter(views.train.cameras)), tree_radius(views.train)
-    for level in (levels := levels_of(config, views.train.cameras)):
+    for level in (levels := resolution_levels(config, views.train.cameras)):
         if len(losses) > level.end:
-            continue  # the checkpoint is of a later level
+            continue  # the checkpoint is from a later level
         sizes = shrunk_sizes(start, level.halvings)
         cloud = random_textures(start, sizes, config.seed) if fitted is None else resampled(fitted, start, sizes)
         movement = Movement(cloud, radius) if config.placement_learning_rate and (level.halvings or len(levels) == 1) else None
-        asked = config.coarse() if level.halvings else config
-        stepper = Stepper(cloud.to(device), Targets.at(views.train, level.halvings), asked, movement)
-        del cloud  # the stepper has its own texels, and those of large views take hundreds of megabytes
+        level_config = config.coarse() if level.halvings else config
+        stepper = Stepper(cloud.to(device), Targets.at(views.train, level.halvings), level_config, movement)
+        del cloud  # the stepper has its own copy of the texels, which can take hundreds of megabytes
         fitted = None
-        if done.tensors and len(losses) > level.begin:
-            stepper.restore(done.tensors, len(losses) - level.begin)
+        if state.tensors and len(losses) > level.begin:
+            stepper.restore(state.tensors, len(losses) - level.begin)
         for index in range(len(losses), level.end):
             rate = learning_rate(config, index)
             placement_learning_rate = (config.placement_learning_rate or 0.0) * rate / config.learning_rate
-            chosen = sample_views(config, len(views.train), index, level.halvings)
-            losses.append(float(stepper.step(chosen, rate, placement_learning_rate, drawn_as(config, level, index))))
+            indices = sample_views(config, len(views.train), index, level.halvings)
+            losses.append(float(stepper.step(indices, rate, placement_learning_rate, step_alpha(config, level, index))))
             if on_step is not None:
-                on_step(Step(index + 1, config.steps, losses[-1], rate, partial(_cloud_of, stepper)))
+                on_step(Step(index + 1, config.steps, losses[-1], rate, partial(getattr, stepper, "cloud")))
             if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
-                _save(checkpoint, key, _FitState(losses, start, None, stepper.tensors(), time.perf_counter() - begun))
+                _save(checkpoint, key, _FitState(losses, start, None, stepper.tensors(), time.perf_counter() - started))
         fitted = stepper.finish()
         del stepper
         if movement is not None:
@@ -164,50 +175,44 @@ def fit(
     fitted = replace(fitted, alpha=AlphaMode(config.alpha, config.alpha_cutoff))
     if config.alpha == "mask":
         fitted = matched_coverage(fitted, views.train, config.backend)
-    # No view determines the color of what is transparent, yet filtering shows it; so it is settled here, and an export need not.
+    # No view determines the colors of transparent texels, but filtering shows them.
     bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
-    stand = config.placement == "even" and not config.placement_learning_rate
-    return FitResult(fitted if stand else trimmed(fitted), losses, config, time.perf_counter() - begun)
+    if config.placement != "even" or config.placement_learning_rate:
+        fitted = trimmed(fitted)
+    return FitResult(fitted, losses, config, time.perf_counter() - started)
 
 
 def fit_inputs(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> tuple[Any, ...]:
-    """What the result of :func:`fit` depends on: the configuration, the training views, and the mesh where billboards are placed by it."""
+    """Return the inputs that determine the result of :func:`fit`: configuration, training views, and the mesh if the placement uses it."""
     return config, views.train.fingerprint, None if tree is None or config.placement == "even" else tree.digest
 
 
-def _begin(views: ViewDataset, config: FitConfig, tree: TreeFile | None, on_place: Callable[[int, int], None] | None) -> _FitState:
-    """Before the first step: evenly placed billboards, or what the search finds."""
+def _initial_state(views: ViewDataset, config: FitConfig, tree: TreeFile | None, on_place: Callable[[int, int], None] | None) -> _FitState:
+    """Place the billboards evenly, or search for a placement."""
     if config.placement == "even":
         return _FitState([], start_cloud(views.train, config), None, {}, 0.0)
-    if tree is None:
-        points = hull_points(views.train, seed=config.seed)
-    else:
-        points = mesh_points(tree, views.train, seed=config.seed)
+    points = hull_points(views.train, seed=config.seed) if tree is None else mesh_points(tree, views.train, seed=config.seed)
     assert config.texel_density is not None
-    found = find_placement(views.train, points, config, on_place)
+    placement = find_placement(views.train, points, config, on_place)
     density = config.texel_density * float(pixels_a_meter(views.train.cameras))
-    return _FitState([], sized(found, density, config.max_texels), found, {}, 0.0)
-
-
-def _cloud_of(stepper: Stepper) -> BillboardCloud:
-    return stepper.cloud
+    return _FitState([], sized(placement, density, config.max_texels), placement, {}, 0.0)
 
 
 @dataclass(frozen=True)
 class ResolutionLevel:
-    """Steps that are taken at one resolution."""
+    """The steps of a fit at one resolution."""
 
     halvings: int
-    """How often the sides of views and textures are halved."""
+    """Number of times that the sides of views and textures are halved."""
     begin: int
-    """Steps before the level."""
+    """Number of steps before the level."""
     end: int
-    """Steps after the level."""
+    """Number of steps at the end of the level."""
 
 
-def levels_of(config: FitConfig, cameras: Camera) -> list[ResolutionLevel]:
-    """The levels of a resolved configuration, coarse to fine; levels of very small pictures are left out."""
+def resolution_levels(config: FitConfig, cameras: Camera) -> list[ResolutionLevel]:
+    """Divide the steps of a resolved configuration evenly among levels, from coarse to fine, without levels of very small pictures."""
     assert config.levels is not None and config.steps is not None
     side = min(cameras.width, cameras.height)
     halvings = [h for h in reversed(range(config.levels)) if h == 0 or side >> h >= LEAST_SIDE]
@@ -215,24 +220,25 @@ def levels_of(config: FitConfig, cameras: Camera) -> list[ResolutionLevel]:
     return [ResolutionLevel(*level) for level in zip(halvings, edges, edges[1:], strict=False)]
 
 
-def drawn_as(config: FitConfig, level: ResolutionLevel, index: int) -> AlphaMode:
-    """How step ``index`` (from 0) of a resolved configuration draws: as blend, but for a mask at full resolution.
+def step_alpha(config: FitConfig, level: ResolutionLevel, index: int) -> AlphaMode:
+    """Return the alpha mode that step ``index``, from 0, of a resolved configuration renders with.
 
-    There the ramp about the cutoff hardens over the first third of the level's steps, and then is a step. At lower resolutions what is cut
-    off at full resolution looks like a blend. A hash looks like one on average.
+    It is ``blend``, except for a ``mask`` at full resolution. There the ramp around the cutoff hardens over the first 30 % of the level's
+    steps and is a step function after that. At lower resolutions, a mask at full resolution looks like ``blend``. On average, so does
+    ``hash``.
     """
     if config.alpha != "mask" or level.halvings:
         return BLEND
-    share = (index - level.begin) / (_HARDENING * (level.end - level.begin))
+    progress = (index - level.begin) / (_HARDENING * (level.end - level.begin))
     first = max(2.0, 0.5 / min(config.alpha_cutoff, 1 - config.alpha_cutoff))
-    hardness = first * (max(first, HARDEST) / first) ** share if share < 1 else math.inf
+    hardness = first * (max(first, HARDEST) / first) ** progress if progress < 1 else math.inf
     return AlphaMode("mask", config.alpha_cutoff, hardness)
 
 
 def learning_rate(config: FitConfig, index: int) -> float:
-    """Adam's rate in step ``index`` (from 0) of a resolved configuration.
+    """Return Adam's learning rate in step ``index``, from 0, of a resolved configuration.
 
-    ``growth`` is the thesis's schedule, lr_i = lr_(i-1) * (1 + 0.1 / n): over n steps the rate grows by about a tenth.
+    ``growth`` is the schedule of the thesis, lr_i = lr_(i-1) * (1 + 0.1 / n): the rate grows by about a tenth over n steps.
     """
     assert config.learning_rate is not None and config.steps is not None
     if config.schedule == "growth":
@@ -241,41 +247,42 @@ def learning_rate(config: FitConfig, index: int) -> float:
 
 
 def sample_views(config: FitConfig, count: int, index: int, halvings: int = 0) -> list[int]:
-    """The training views of step ``index``, of ``count``: a function of the seed and the step alone, so that any step can be resumed.
+    """Sample the indices of the training views, out of ``count``, for step ``index``.
 
-    One view a step is drawn at random with replacement (thesis, algorithm 1); several are dealt from reshuffled decks, so that all
-    views come up equally often. Every halving of the resolution doubles their number.
+    The sample depends only on the seed and the step, so that a fit can resume at any step. A single view per step is sampled with
+    replacement (thesis, algorithm 1). Several views per step are taken from random permutations of all views, so that all views occur
+    equally often. Every halving of the resolution doubles the number of views.
     """
     assert config.views_per_step is not None
-    wanted = config.views_per_step << halvings
-    if wanted == 1:
+    requested = config.views_per_step << halvings
+    if requested == 1:
         return np.random.default_rng([config.seed, index]).integers(count, size=1).tolist()
-    batch = min(wanted, count)
-    per_deck = count // batch
-    deck = np.random.default_rng([config.seed, index // per_deck]).permutation(count)
-    return deck[index % per_deck * batch :][:batch].tolist()
+    batch = min(requested, count)
+    batches = count // batch  # of one permutation
+    permutation = np.random.default_rng([config.seed, index // batches]).permutation(count)
+    return permutation[index % batches * batch :][:batch].tolist()
 
 
 def _device(name: str) -> torch.device:
     try:
         torch.empty(0, device=name)
     except (RuntimeError, AssertionError):
-        fail("device", f"{name!r} is not available here", "use cpu, or cuda on a machine with a GPU and a CUDA build of torch")
+        fail("device", f"{name!r} is not available", "use cpu, or cuda on a machine with a GPU and a CUDA build of torch")
     return torch.device(name)
 
 
-def _save(path: Path, key: str, progress: _FitState) -> None:
-    tensors = {name: tensor.detach().cpu() for name, tensor in progress.tensors.items()}
-    tensors["losses"] = torch.tensor(progress.losses, dtype=torch.float64)
-    for prefix, cloud in {_START: progress.start, _FOUND: progress.found}.items():
+def _save(path: Path, key: str, state: _FitState) -> None:
+    tensors = {name: tensor.detach().cpu() for name, tensor in state.tensors.items()}
+    tensors["losses"] = torch.tensor(state.losses, dtype=torch.float64)
+    for prefix, cloud in {_START: state.start, _PLACEMENT: state.placement}.items():
         for name in TENSORS if cloud is not None else ():
-            if prefix == _FOUND or name != "texels":
-                tensors[prefix + name] = getattr(cloud, name).clone()  # no two may share memory
-    write_tensors(path, tensors, {"fit": key, "seconds": repr(progress.seconds)})
+            if prefix == _PLACEMENT or name != "texels":
+                tensors[prefix + name] = getattr(cloud, name).clone()  # safetensors refuses tensors that share memory
+    write_tensors(path, tensors, {"fit": key, "seconds": repr(state.seconds)})
 
 
 def _load(path: Path, key: str) -> _FitState | None:
-    """What is kept in a checkpoint, or ``None`` if there is none for this very fit."""
+    """Read a checkpoint, or return ``None`` if the file does not contain one of this fit."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
@@ -290,9 +297,9 @@ def _load(path: Path, key: str) -> _FitState | None:
         return None
     parts = {
         prefix: {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
-        for prefix in (_START, _FOUND)
+        for prefix in (_START, _PLACEMENT)
     }
     texels = parts[_START]["texture_sizes"].prod(-1) * (1 + parts[_START]["two_sided"].long())
     start = BillboardCloud(**parts[_START], texels=torch.zeros(1, 4).expand(int(texels.sum()), 4))
-    found = BillboardCloud(**parts[_FOUND]) if parts[_FOUND] else None
-    return _FitState(tensors.pop("losses").tolist(), start, found, tensors, float(metadata["seconds"]))
+    placement = BillboardCloud(**parts[_PLACEMENT]) if parts[_PLACEMENT] else None
+    return _FitState(tensors.pop("losses").tolist(), start, placement, tensors, float(metadata["seconds"]))

@@ -1,4 +1,4 @@
-"""Adam over where billboards stand: their position, orientation and extent, together with their texels."""
+"""The placement of billboards as an optimizable quantity: position, orientation and extent, their gradients, and Adam."""
 
 from __future__ import annotations
 
@@ -11,94 +11,115 @@ from torch import Tensor
 from bbfit.geometry.cloud import BillboardCloud
 
 BETAS, EPSILON = (0.8, 0.95), 1e-12
-# Extents move at this share of the rate: textures can shrink by becoming transparent, and grow when they are bounded anew.
+# Learning rate of extents, as a fraction of the rate of positions. It is low because textures can shrink by becoming transparent, and
+# grow when the billboards get new bounds.
 _EXTENT_RATE = 0.3
 
 
 class Movement:
-    """How far N billboards have moved from where they began, as eight numbers each.
+    """The movement of N billboards from their initial placement, as eight parameters each, and the state of Adam over them.
 
-    Three are a translation, in multiples of ``reach``; three a rotation vector in radians, about the billboard's center; two the
-    logarithms by which its half extents have grown. Gradients arrive through the homographies.
+    Three parameters are a translation, in multiples of ``reach``. Three are a rotation vector about the billboard's center, in radians.
+    Two are the logarithms of the growth of its half extents, in units of 0.3. Their gradients come from the homographies.
+
+    Parameters
+    ----------
+    cloud
+        The initial placement.
+    reach
+        Length of a unit of translation, in meters.
     """
 
     def __init__(self, cloud: BillboardCloud, reach: float) -> None:
         cloud = cloud.without_textures().to("cpu")
         self._cloud = replace(cloud, **{name: getattr(cloud, name).double() for name in ("centers", "rights", "ups", "half_extents")})
         self._units = torch.tensor([reach] * 3 + [1.0] * 3 + [_EXTENT_RATE] * 2, dtype=torch.float64)
-        self._kept = torch.zeros(3, len(cloud), 8, dtype=torch.float64)  # the numbers, and their first and second moments
+        self._state = torch.zeros(3, len(cloud), 8, dtype=torch.float64)  # parameters, their first and second moments
         self._steps = 0
 
     @property
     def parameters(self) -> Tensor:
-        """The numbers as they are now, float64 [N, 8], each in units of its own rate."""
-        return self._kept[0]
+        """The current parameters, float64 [N, 8]."""
+        return self._state[0]
 
     def placed(self, parameters: Tensor, texels: Tensor) -> BillboardCloud:
-        """The cloud after a movement, with the given texels; float64 placement, differentiable in the parameters."""
+        """Move the initial cloud by parameters, [N, 8], and give it texels. The float64 placement is differentiable in the parameters."""
         moved = parameters * self._units
-        turn = torch.linalg.matrix_exp(_cross_matrices(moved[:, 3:6]))
+        rotation = torch.linalg.matrix_exp(_cross_matrices(moved[:, 3:6]))
         cloud = self._cloud
         return replace(
             cloud,
             centers=cloud.centers + moved[:, :3],
-            rights=(turn @ cloud.rights[..., None])[..., 0],
-            ups=(turn @ cloud.ups[..., None])[..., 0],
+            rights=(rotation @ cloud.rights[..., None])[..., 0],
+            ups=(rotation @ cloud.ups[..., None])[..., 0],
             half_extents=cloud.half_extents * moved[:, 6:].exp(),
             texels=texels,
         )
 
     def placement(self) -> Tensor:
-        """Where the billboards are now: centers, rights, ups and half extents side by side, float64 [N, 11]; many times faster."""
+        """Concatenate the current centers, rights, ups and half extents to float64 [N, 11], many times faster than :meth:`placed`."""
         moved, cloud = self.parameters * self._units, self._cloud
         vectors = moved[:, 3:6]
         angles = vectors.norm(dim=-1, keepdim=True)
         first, second = torch.sinc(angles / math.pi), 0.5 * torch.sinc(angles / (2 * math.pi)).square()
-        turned = []
+        rotated = []
         for axes in (cloud.rights, cloud.ups):  # Rodrigues' formula
             across = torch.linalg.cross(vectors, axes)
-            turned.append(axes + first * across + second * torch.linalg.cross(vectors, across))
-        return torch.cat([cloud.centers + moved[:, :3], *turned, cloud.half_extents * moved[:, 6:].exp()], -1)
+            rotated.append(axes + first * across + second * torch.linalg.cross(vectors, across))
+        return torch.cat([cloud.centers + moved[:, :3], *rotated, cloud.half_extents * moved[:, 6:].exp()], -1)
 
     def pull_back(self, placement: Tensor, gradient: Tensor) -> Tensor:
-        """The gradient in :attr:`parameters`, [N, 8], from the one in what :meth:`placement` has returned, [N, 11] both."""
-        of_centers, of_rights, of_ups, of_extents = gradient.split((3, 3, 3, 2), -1)
+        """Transform the gradient of a placement to the gradient of :attr:`parameters`.
+
+        Parameters
+        ----------
+        placement
+            The current result of :meth:`placement`, [N, 11].
+        gradient
+            Gradient of the placement, [N, 11].
+
+        Returns
+        -------
+        Tensor
+            [N, 8].
+        """
+        center_gradient, right_gradient, up_gradient, extent_gradient = gradient.split((3, 3, 3, 2), -1)
         _, rights, ups, half_extents = placement.split((3, 3, 3, 2), -1)
         vectors = self.parameters[:, 3:6] * self._units[3:6]
-        torque = torch.linalg.cross(rights, of_rights) + torch.linalg.cross(ups, of_ups)
+        torque = torch.linalg.cross(rights, right_gradient) + torch.linalg.cross(ups, up_gradient)
         # The transpose of the left Jacobian of rotation vectors (Chirikjian 2012, equation 10.86).
         angles = vectors.norm(dim=-1, keepdim=True)
         second = 0.5 * torch.sinc(angles / (2 * math.pi)).square()
         third = torch.where(angles < 1e-4, 1 / 6, (1 - torch.sinc(angles / math.pi)) / angles.square())
         once = torch.linalg.cross(vectors, torque)
-        of_vectors = torque - second * once + third * torch.linalg.cross(vectors, once)
-        return torch.cat([of_centers, of_vectors, of_extents * half_extents], -1) * self._units
+        vector_gradient = torque - second * once + third * torch.linalg.cross(vectors, once)
+        return torch.cat([center_gradient, vector_gradient, extent_gradient * half_extents], -1) * self._units
 
     def now(self, texels: Tensor) -> BillboardCloud:
-        """The cloud where it is now, float32, with the given texels."""
+        """Return the cloud in its current placement, float32, with the given texels."""
         centers, rights, ups, half_extents = self.placement().float().split((3, 3, 3, 2), -1)
         return replace(self._cloud, centers=centers, rights=rights, ups=ups, half_extents=half_extents, texels=texels)
 
     def update(self, gradient: Tensor, rate: float) -> None:
-        """Take a step against ``gradient``, [N, 8], of about ``rate`` (in units) each."""
+        """Take a step of Adam (Kingma and Ba 2015) on the parameters with their gradient, [N, 8], and a learning rate."""
         self._steps += 1
-        value, first, second = self._kept
+        value, first, second = self._state
         first.lerp_(gradient, 1 - BETAS[0])
         second.lerp_(gradient.square(), 1 - BETAS[1])
         root = (second / (1 - BETAS[1] ** self._steps)).sqrt()
         value -= rate / (1 - BETAS[0] ** self._steps) * first / (root + EPSILON)
 
     def tensors(self) -> dict[str, Tensor]:
-        """All that changes from step to step."""
-        return {"movement": self._kept, "movement_steps": torch.tensor([self._steps])}
+        """Return the state that steps change."""
+        return {"movement": self._state, "movement_steps": torch.tensor([self._steps])}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from :meth:`tensors`."""
-        self._kept, self._steps = tensors["movement"].clone(), int(tensors["movement_steps"])
+        """Restore a state that :meth:`tensors` returned."""
+        self._state, self._steps = tensors["movement"].clone(), int(tensors["movement_steps"])
 
 
 def _cross_matrices(vectors: Tensor) -> Tensor:
-    """The matrices [N, 3, 3] whose products are cross products with vectors [N, 3]."""
+    """Return the matrices, [N, 3, 3], that multiply like cross products with vectors, [N, 3]."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).view(-1, 3, 3)

@@ -141,7 +141,7 @@ class Camera:
 
 
 def pinhole_intrinsics(fov_x_degrees: float, width: int, height: int) -> Tensor:
-    """Intrinsics of a pinhole with square pixels and a centerd principal point, [3, 3] float64.
+    """Intrinsics of a pinhole with square pixels and a centered principal point, [3, 3] float64.
 
     The field of view spans pixel *edges*, as in Blender and in the NeRF-synthetic layout, so the principal point in our center-based
     coordinates is ((width - 1) / 2, (height - 1) / 2).

@@ -1,4 +1,4 @@
-"""Cards: flat textured polygons that share an atlas, as model files hold them."""
+"""Cards: the flat textured polygons and the atlas that model files of a cloud contain."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bbfit.geometry.alpha import AlphaMode
 
 @dataclass(frozen=True)
 class Atlas:
-    """R textures in one picture, not resampled."""
+    """R textures in one picture, texel for texel."""
 
     image: NDArray[np.uint8]
     """Straight-alpha RGBA, [H, W, 4]; both sides are multiples of 4."""
@@ -39,11 +39,11 @@ class Card:
     normal: NDArray[np.float64]
     """Unit normal, [3]."""
     culled: bool
-    """Whether only the side that the normal points to is shown; otherwise both sides show the same."""
+    """Whether only the front is drawn, the side that the normal points to; otherwise both sides show the same."""
     rectangle: int
-    """Index of the texture in the atlas."""
+    """Index of its texture in the atlas."""
     origin: NDArray[np.float64] | None = None
-    """Point in meters by which programs sort transparent nodes, [3]; the card then gets a node of its own."""
+    """Point in meters by which programs sort the card if it is blended, [3]; such a card gets its own node."""
 
     @property
     def triangles(self) -> NDArray[np.int64]:
@@ -57,18 +57,18 @@ class Cards:
     """A cloud's cards and their textures."""
 
     cards: tuple[Card, ...]
-    """Q >= 1 of them."""
+    """Q >= 1 cards."""
     atlas: Atlas
-    """Textures: of each billboard the front, then the back if there is one."""
+    """The textures: for each billboard the front, then the back if it has one."""
     alpha: AlphaMode = field(default_factory=AlphaMode)
-    """Alpha mode."""
+    """The alpha mode of all cards."""
     chain: tuple[NDArray[np.uint8], ...] | None = None
-    """Exported mip levels, straight RGBA, from level 0 down to 1 x 1 texel; without levels the atlas is filtered bilinearly at every
+    """Mip levels of the files, straight RGBA, from level 0 to 1 x 1 texel. Without them level 0 is filtered bilinearly at every
     distance."""
 
     @property
     def vertex_count(self) -> int:
-        """Vertices of all cards, including the two that center the bounds of a card with an origin."""
+        """Vertices of all cards, with two more for each card with an origin, which center its bounds."""
         return sum(len(card.corners) + 2 * (card.origin is not None) for card in self.cards)
 
     @property
@@ -77,5 +77,5 @@ class Cards:
         return self.alpha.cutoff if self.alpha.kind == "mask" else 0.0
 
     def with_cards(self, cards: list[Card]) -> Cards:
-        """Other cards of the same textures."""
+        """Other cards with the same textures."""
         return replace(self, cards=tuple(cards))

@@ -178,7 +178,7 @@ def even_upright(
     Parameters
     ----------
     count : N >= 1.
-    axis : [3] point that all rectangles are centerd on horizontally and vertically.
+    axis : [3] point that all rectangles are centered on horizontally and vertically.
     half_extents : [2] or [N, 2] in meters.
     texture_sizes : [2] or [N, 2] height and width in texels.
     sides : ``"one"``, ``"two"`` (front and back texture), or ``"pair"``: two one-sided rectangles ``gap`` meters apart along the

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 
 def sides(polygon: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Unit normals n, [K, 2], and offsets d, [K], of a convex polygon's sides; n . p <= d inside. The winding does not matter."""
+    """Unit normals n, [K, 2], and offsets d, [K], of a convex polygon's sides: inside is n . p <= d. For either winding."""
     along = np.roll(polygon, -1, 0) - polygon
     length = np.linalg.norm(along, axis=-1)
     kept = length > 1e-12 * length.max()  # a doubled corner has no side
@@ -23,9 +23,9 @@ def area(polygon: NDArray[np.float64]) -> float:
 
 
 def kept_half(polygon: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Part of a convex polygon [K, D] in which a linear function, given at the corners [K], is not positive, [L, D].
+    """The part of a convex polygon [K, D] where a linear function with given values at the corners is at most 0, [L, D].
 
-    One step of the clipping of Sutherland and Hodgman (1974, "Reentrant polygon clipping").
+    This is one step of the clipping of Sutherland and Hodgman (1974, "Reentrant polygon clipping").
     """
     made = []
     for here, there, low, high in zip(polygon, np.roll(polygon, -1, 0), heights, np.roll(heights, -1), strict=True):

@@ -1,4 +1,4 @@
-"""Tables and pictures of systems that were given the same tree."""
+"""Tables and pictures of a comparison: one tree, several systems."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bbfit.evaluation.report import Measures, OverWhite, Rgba, ThesisScale
+from bbfit.evaluation.report import Measures, measures_from_json
 from bbfit.evaluation.scoring import OriginalTree, view_angles
 from bbfit.files import write_bytes
 from bbfit.images import encode_png, over_color, premultiply, read_rgba, to_bytes
@@ -21,48 +21,44 @@ from bbfit.reporting.plots import FAINT, INK, PAPER, picture_font, spread_views
 from bbfit.reporting.sweep_tables import markdown
 from bbfit.views import ViewSet
 
-# Tiles of the picture: pixels a side, tiles a row, size of the writing.
+# Tiles of the picture: side in pixels, tiles per row, size of the text.
 _TILE, _COLUMNS, _TEXT = 340, 5, 13
 
 
 @dataclass(frozen=True)
 class CompareRow:
-    """A system's result."""
+    """The result of one system."""
 
     system: str
     """Its short name."""
     title: str
-    """What it did."""
+    """What the system does, for the reader."""
     planes: int | None
-    """How many it uses; ``None`` for a mesh."""
+    """Number of planes; ``None`` for a mesh."""
     vertices: int | None
-    """Of its model."""
+    """Vertices of its model."""
     bytes: int | None
-    """Of its model as GLB."""
+    """Size of its model as GLB."""
     seconds: float | None
-    """That making it took, without the views that fits are made to."""
+    """Time of making the model, without rendering the views."""
     measures: Measures | None
     """Means over the held-out views; ``None`` where nothing was drawn."""
     note: str
-    """What is to be known of it."""
+    """A remark for the reader."""
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as JSON holds it."""
+        """All fields as JSON holds them."""
         return asdict(self)
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> CompareRow:
-        """What :meth:`to_json` gave."""
-        found = content["measures"]
-        measures = None
-        if found is not None:
-            groups = OverWhite(**found["over_white"]), Rgba(**found["rgba"]), ThesisScale(**found["thesis_scale"])
-            measures = Measures(*groups, found["sharpness"], found["brightness"])
-        return CompareRow(**{**content, "measures": measures})
+        """The row that :meth:`to_json` returned."""
+        measures = content["measures"]
+        return CompareRow(**{**content, "measures": None if measures is None else measures_from_json(measures)})
 
 
 def compare_csv(rows: Sequence[CompareRow]) -> bytes:
-    """A row a system with all measures and costs."""
+    """CSV with one line per system: all measures and costs."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     names = ("psnr", "ssim", "flip", "rgba_rmse", "rgba_psnr", "iou", "sharpness", "brightness", "thesis_psnr")
@@ -81,7 +77,7 @@ def _measures(measures: Measures | None) -> list[float | None]:
 
 
 def compare_markdown(rows: Sequence[CompareRow], original: OriginalTree) -> str:
-    """The same for people, the tree itself first."""
+    """A Markdown document with a table of all systems, the tree itself first."""
     table = [["the tree", "", _count(original.vertices), _count(original.bytes), *[""] * 7]]
     for row in rows:
         seconds = "" if row.seconds is None else f"{row.seconds:,.1f}"
@@ -89,7 +85,7 @@ def compare_markdown(rows: Sequence[CompareRow], original: OriginalTree) -> str:
         table.append([row.title, planes, _count(row.vertices), _count(row.bytes), seconds, *_shown(row.measures)])
     head = ["system", "planes", "vertices", "bytes", "seconds", "PSNR, dB", "SSIM", "FLIP", "silhouette IoU", "sharpness", "brightness"]
     notes = "".join(f"- {row.title}: {row.note}\n" for row in rows if row.note)
-    return f"# Comparison\n\nThe same held-out views for all; plain means over them.\n\n{markdown(head, table)}\n{notes}"
+    return f"# Comparison\n\nMeans over the held-out views, which are the same for all systems.\n\n{markdown(head, table)}\n{notes}"
 
 
 def _shown(measures: Measures | None) -> list[str]:
@@ -105,7 +101,7 @@ def _count(value: int | None) -> str:
 
 
 def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
-    """Write a PNG: PSNR over white and FLIP against bytes and against vertices, a point for each system that was drawn."""
+    """Write a PNG with PSNR over white and FLIP against bytes and vertices, one point for each system that was drawn."""
     from matplotlib.figure import Figure
 
     drawn = [row for row in rows if row.measures is not None]
@@ -113,7 +109,7 @@ def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
         return
     figure = Figure(figsize=(13, 8.5), layout="constrained")
     axes = figure.subplots(2, 2, sharex="col", sharey="row")
-    for line, name in enumerate(("PSNR over white, dB", "FLIP, less is better")):
+    for line, name in enumerate(("PSNR over white, dB", "FLIP, lower is better")):
         for column, cost in enumerate(("bytes", "vertices")):
             axis = axes[line][column]
             for number, row in enumerate(drawn):
@@ -135,11 +131,12 @@ def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
 
 
 def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) -> None:
-    """Write ``systems.png``: the tree in one held-out view over white, and how each system that was drawn shows it.
+    """Write ``systems.png``: one held-out view over white, and the picture of each system that was drawn.
 
     Parameters
     ----------
-    folder : with a folder for each system, whose ``held_out`` holds its pictures by the views' names.
+    folder : Path
+        Holds a folder for each system, with its pictures in ``held_out`` under the views' names.
     """
     from PIL import Image, ImageDraw
 
@@ -170,7 +167,8 @@ def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) ->
 
 
 def _around(alpha: Tensor) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of a square about what shows, [H, W], with a tenth of it to spare, within the picture if that is wide."""
+    """Left, top, right and bottom of a square around the visible part of an alpha channel [H, W], with a margin of a tenth, inside the
+    picture if that is large enough."""
     rows, columns = (torch.nonzero(alpha.amax(axis) > 0)[:, 0] for axis in (1, 0))
     middle = [(int(line[0]) + int(line[-1]) + 1) / 2 for line in (columns, rows)]
     half = 0.6 * max(int(line[-1]) - int(line[0]) + 1 for line in (columns, rows))

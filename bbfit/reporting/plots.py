@@ -263,7 +263,7 @@ def lod_picture(levels: Sequence[tuple[LodLevel, ShippedModel]], views: ViewSet,
 
 
 def running_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
-    """Centerd mean over ``window`` values, shorter at the ends, same length; NaN counts for nothing, and gives NaN where alone."""
+    """Centered mean over ``window`` values, shorter at the ends, same length; NaN counts for nothing, and gives NaN where alone."""
     valid = np.isfinite(values)
     sums, counts = (np.concatenate([[0.0], np.cumsum(part)]) for part in (np.where(valid, values, 0.0), valid))
     index = np.arange(len(values))

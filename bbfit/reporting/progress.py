@@ -1,4 +1,4 @@
-"""Progress of long work in a terminal."""
+"""Show the progress of a long computation in a terminal or a log."""
 
 from __future__ import annotations
 
@@ -10,18 +10,25 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-# Seconds between two lines of a stage in a log.
-_EVERY = 60.0
-
 
 @contextlib.contextmanager
-def progress_bars(console: Console) -> Iterator[Callable[..., None]]:
-    """A bar for each stage, with rate and time left; yields what the work has to tell (:class:`bbfit.stages.stage.OnProgress`).
+def progress_bars(console: Console, *, log_interval: float = 60.0) -> Iterator[Callable[..., None]]:
+    """Show a progress bar for each stage with its rate and remaining time. A log gets lines instead.
 
-    What is no terminal, as a log, gets a line when a stage is finished and every minute on the way.
+    Parameters
+    ----------
+    console
+        The terminal or log.
+    log_interval
+        Seconds between two lines of a stage in a log. A finished stage always gets a line.
+
+    Yields
+    ------
+    OnProgress
+        The callback that reports progress (:class:`bbfit.stages.stage.OnProgress`).
     """
     if not console.is_terminal:
-        yield _lines(console)
+        yield _lines(console, log_interval)
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -37,22 +44,22 @@ def progress_bars(console: Console) -> Iterator[Callable[..., None]]:
     ) as bars:
         tasks: dict[str, TaskID] = {}
 
-        def tell(stage: str, done: int, total: int, note: str = "") -> None:
+        def on_progress(stage: str, done: int, total: int, note: str = "") -> None:
             if stage not in tasks:
                 tasks[stage] = bars.add_task(stage, total=total, rate="", note="", completed=done - 1)
             speed = bars.tasks[list(tasks).index(stage)].speed
             bars.update(tasks[stage], completed=done, total=total, note=note, rate="" if speed is None else f"{speed:.1f}/s")
 
-        yield tell
+        yield on_progress
 
 
-def _lines(console: Console) -> Callable[..., None]:
-    told: dict[str, float] = {}
+def _lines(console: Console, interval: float) -> Callable[..., None]:
+    printed: dict[str, float] = {}
 
-    def tell(stage: str, done: int, total: int, note: str = "") -> None:
+    def on_progress(stage: str, done: int, total: int, note: str = "") -> None:
         now = time.monotonic()
-        if done == total or now - told.setdefault(stage, now) >= _EVERY:
-            told[stage] = now
+        if done == total or now - printed.setdefault(stage, now) >= interval:
+            printed[stage] = now
             console.print(f"{stage} {done}/{total} {note}".rstrip(), highlight=False, soft_wrap=True)
 
-    return tell
+    return on_progress

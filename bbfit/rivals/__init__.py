@@ -1,1 +1,1 @@
-"""Systems that bbfit is an alternative to, to be measured beside it: baked planes, simplified and compressed meshes, a learned mesh."""
+"""Methods to compare bbfit with: baked planes, simplified and compressed meshes, a learned mesh."""

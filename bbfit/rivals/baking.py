@@ -1,4 +1,4 @@
-"""Rectangles with textures of what lies about them: parallel renders of slabs of a tree."""
+"""Billboards whose textures are parallel renders of slabs of a tree."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import bleed_color, read_rgba
 from bbfit.tree_files.tree_file import TreeFile
 
-# Endings of Y-up files whose triangles are read as they stand; others go through Blender.
+# Endings of Y-up files whose triangles are read directly; others go through Blender.
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
 # What of the light from all around the inside of a stem reflects at most. In uncut pictures of an acer and an aspen nothing is as dark,
 # in those of a willow one texel in ten thousand.
@@ -33,16 +33,16 @@ _TENSORS = ("centers", "rights", "ups", "half_extents", "depths")
 
 @dataclass(frozen=True)
 class BakeConfig:
-    """How fine the textures are and in what light they are rendered."""
+    """Resolution and lighting of the baked textures."""
 
     texels_a_meter: float
-    """Texels along a meter of every rectangle."""
+    """Texels per meter along the sides of every rectangle."""
     two_sided: bool = False
-    """Whether a rectangle has a back texture, rendered from behind; else it shows what is seen from the front from both sides."""
+    """Whether a rectangle has a back texture, rendered from behind; otherwise both sides show the front's texture."""
     alpha: AlphaMode = field(default_factory=AlphaMode)
-    """What alpha means in the cloud."""
+    """Alpha mode of the cloud."""
     views: ViewsConfig = field(default_factory=ViewsConfig)
-    """Light, samples, denoising, device, workers and seed, which should be those of the views to compare with; the rest is not used."""
+    """Light, samples, denoising, device, workers and seed, which should equal those of the compared views; other options are not used."""
 
     def __post_init__(self) -> None:
         check_range("texels_a_meter", self.texels_a_meter, 0, math.inf, open_low=True)
@@ -50,7 +50,7 @@ class BakeConfig:
 
 @dataclass(frozen=True)
 class Slabs:
-    """N rectangles, and how far from their planes the tree is shown on them."""
+    """N rectangles, and the range of distances from their planes that each one shows."""
 
     centers: Tensor
     """Rectangle centers in meters, [N, 3] float64."""
@@ -61,7 +61,7 @@ class Slabs:
     half_extents: Tensor
     """Half width and half height in meters, [N, 2]."""
     depths: Tensor
-    """Least and greatest signed distance from the plane of what is shown, along the normal ``right x up``, in meters, [N, 2]."""
+    """Smallest and largest signed distance from the plane that is shown, along the normal ``right x up``, in meters, [N, 2]."""
 
     def __post_init__(self) -> None:
         n = len(self.centers)
@@ -75,7 +75,7 @@ class Slabs:
 
     @staticmethod
     def joined(parts: Sequence[Slabs]) -> Slabs:
-        """The slabs of several in one."""
+        """Concatenate slabs."""
         return Slabs(*(torch.cat([getattr(part, name) for part in parts]) for name in _TENSORS))
 
 
@@ -90,29 +90,34 @@ def bake(
 ) -> BillboardCloud:
     """Render what lies within each slab onto its rectangle, in parallel projection along the normal.
 
-    Texture and picture have the same texels; rectangles are cut to whole texels, to what their textures show. What is cut away by a
-    slab still casts its shadow. Transparent texels take the color of the nearest visible one, as straight alpha is filtered.
+    Pixels of the renders are texels of the textures. Rectangles are cropped to the visible part, in whole texels. Geometry outside a slab
+    still casts shadows. Transparent texels take the color of the nearest visible texel, because filtering uses straight alpha.
 
     Parameters
     ----------
-    tree : as for :func:`~bbfit.blender.views_folder.render_views`.
-    slabs : N rectangles. Their sides should leave nothing out that is to be seen; a margin for the renderer's filter is added.
-    fill_cuts : give texels that show the dark inside of a stem, cut open by the slab, the color of the nearest lit texel. The inside is
-        told by reflecting less than 3% of ``config.views.ambient_strength``, in sunlight or not.
-    folder : where the pictures are kept, so that a broken off start can go on (:func:`~bbfit.blender.pictures.render_pictures`); nowhere
-        when left out.
-    on_progress : called with the number of finished pictures and of all pictures.
+    tree
+        As for ``render_views``.
+    slabs
+        N rectangles. They must contain everything that is to be visible; a margin for the renderer's filter is added.
+    fill_cuts
+        Give texels that show the dark inside of a stem, which the slab cuts open, the color of the nearest lit texel. A texel counts as
+        inside if it reflects less than 3% of ``config.views.ambient_strength``, in sunlight or not.
+    folder
+        Keeps the pictures, so that an interrupted bake can resume (``render_pictures``); not kept when left out.
+    on_progress
+        Called with the number of finished pictures and of all pictures.
 
     Returns
     -------
-    :class:`BillboardCloud`, float32, in the order of the slabs without those that show nothing.
+    BillboardCloud
+        A float32 cloud in the order of the slabs, without empty ones.
 
     Raises
     ------
-    MissingFileError, InputError
-        if the tree or the folder cannot be used, if a picture would have more than 16384 texels a side, or if there is no Blender.
+    MissingFileError or InputError
+        If the tree or the folder cannot be used, if a picture would have more than 16384 texels a side, or if there is no Blender.
     BlenderError
-        if Blender crashes again and again.
+        If Blender crashes again and again.
     """
     if folder is None:
         with tempfile.TemporaryDirectory(prefix="bbfit-") as scratch:
@@ -146,10 +151,10 @@ def tree_triangles(tree: str | Path | TreeFile) -> NDArray[np.float64]:
 
     Raises
     ------
-    MissingFileError, InputError
-        if the file is missing, cannot be read or has no triangles, or if it takes Blender to read it and there is none.
+    MissingFileError or InputError
+        If the file is missing, cannot be read or has no triangles, or if it takes Blender to read it and there is none.
     BlenderError
-        if Blender crashes over it.
+        If Blender crashes over it.
     """
     tree = TreeFile.open(tree)
     if tree.suffix not in _MESH_SUFFIXES:
@@ -159,12 +164,12 @@ def tree_triangles(tree: str | Path | TreeFile) -> NDArray[np.float64]:
 
 
 def _whole_texels(lengths: Tensor) -> Tensor:
-    """Rounded up, int64; what exceeds a whole number by rounding alone is not."""
+    """Rounded up, int64; a rounding error above a whole number is ignored."""
     return (lengths - 1e-6).ceil().clamp_min(1).long()
 
 
 def _turned(slabs: Slabs) -> Slabs:
-    """The same rectangles seen from behind."""
+    """The same rectangles from behind."""
     return Slabs(slabs.centers, -slabs.rights, slabs.ups, slabs.half_extents, -slabs.depths.flip(-1))
 
 
@@ -185,7 +190,7 @@ def _facing(slabs: Slabs, size: int, texels_a_meter: float) -> tuple[Camera, lis
 def _cropped(sides: NDArray[np.uint8], across: int, along: int) -> tuple[Tensor, Tensor] | None:
     """The visible part of pictures [S, size, size, 4], at most ``across`` and ``along`` texels from their middle, [S, h, w, 4].
 
-    And that part's first and last edge, left, right, top, bottom, in texels from the middle, [4]. None if nothing is visible.
+    Also returns its left, right, top and bottom edges in texels from the middle, [4]. None if nothing is visible.
     """
     middle = sides.shape[1] // 2
     part = sides[:, middle - along : middle + along, middle - across : middle + across]
@@ -204,7 +209,7 @@ def _displayed(linear: float) -> float:
 
 
 def _bled(texture: Tensor, dark: float) -> Tensor:
-    """A texture [h, w, 4], uint8, whose transparent texels, and visible ones below ``dark``, have the color of the nearest other one."""
+    """A texture [h, w, 4], uint8, whose transparent texels, and visible ones below ``dark``, take the color of the nearest other texel."""
     lit = texture[..., :3].amax(-1) >= dark
     if not (lit & (texture[..., 3] > 0)).any():
         return bleed_color(texture)

@@ -1,17 +1,17 @@
 """Billboard clouds (Décoret, Durand, Sillion and Dorsey 2003, "Billboard Clouds for Extreme Model Simplification", SIGGRAPH).
 
-Taken from the paper, as its abstract and accounts of it have it (its full text was not at hand): planes are sought in a discretized
-plane space of a direction (theta, phi) and a distance rho from the origin; a face is valid for a plane if all its corners lie within
-epsilon of it; a plane's density is the area of the faces that are valid for it (coverage), each as large as it is in projection onto
-the plane; the densest plane is chosen, refined in finer plane space and its faces are removed, until none is left; and a face shows on
-every plane that it is valid for, which closes cracks.
+Implemented from the paper's abstract and descriptions of it, without its full text. Planes are searched in a discretized plane space of a
+direction (theta, phi) and a distance rho from the origin; a face is valid for a plane if all its corners lie within
+epsilon of it. A plane's density is the area of its valid faces (coverage), projected onto the plane. The densest plane is chosen and
+refined in finer plane space, and its faces are removed, until no face is left. A face appears on every plane for which it is valid, which
+closes cracks.
 
-Other than there: the paper is given epsilon and finds the number of planes, here epsilon is found for a number of planes by bisection,
-such that they hold a share of the area. Planes are chosen on random triangles, as a tree has millions. Each chosen plane is moved to
-the least-squares plane of its faces' corners where all of them stay valid. What makes the paper favor
-planes that are nearly tangent to the surface, a penalty, is left out, as scattered leaves have no such surface. Fuhrmann, Umlauf and
-Mantler 2005 ("Extreme Model Simplification for Forest Rendering") make 15 to 50 billboards of a tree in this way; what they change for
-trees was not at hand.
+Differences: the paper takes epsilon and returns the number of planes; this module takes the number of planes and finds epsilon by
+bisection, such that the planes hold a share of the area. Planes are chosen on random triangles, because a tree has millions. Each chosen
+plane is moved to the least-squares plane of its faces' corners if all of them stay valid. The paper's penalty on planes that are not
+tangent to the surface is left out, because scattered leaves form no surface. Fuhrmann, Umlauf and
+Mantler 2005 ("Extreme Model Simplification for Forest Rendering") make 15 to 50 billboards of a tree in this way; their
+changes for trees are not implemented.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from bbfit.tree_files.tree_file import TreeFile
 _STEP, _HALVINGS = 9.0, 4
 # Bins of rho to an epsilon, and in all at most.
 _BINS, _MOST_BINS = 4, 2000
-# Directions whose faces are looked at together, to bound the memory.
+# Directions that are processed together, to bound the memory.
 _TOGETHER = 16
-# Least epsilon that is tried, as a share of the greatest, and the bisections between.
+# Smallest epsilon as a share of the largest, and steps of the bisection.
 _LEAST, _BISECTIONS = 1e-3, 9
 # A normal nearer to the vertical than this, as a cosine, has no upright direction in its plane.
 _LEVEL = 0.999
-# Share of the area that counts as none: what sums of shares are out by is less.
+# Share of the area below which differences are rounding errors.
 _NOTHING = 1e-12
 # Share of epsilon by which corners may be beyond it through rounding.
 _ROUNDING = 1e-6
@@ -50,18 +50,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PlaneChoice:
-    """N planes and the triangles that each was chosen for."""
+    """N planes and the triangles of each."""
 
     normals: Array
     """Unit normals, [N, 3]."""
     distances: Array
     """Distances of the planes from the origin along their normals in meters, [N]."""
     members: tuple[NDArray[np.int64], ...]
-    """Indices of the triangles that each plane was chosen for, N arrays; each triangle is in one at most."""
+    """Indices of the triangles of each plane, N arrays; each triangle belongs to at most one plane."""
     epsilon: float
-    """How far at most a plane's triangles lie from it, in meters."""
+    """Largest distance of a plane's triangles from it, in meters."""
     share: float
-    """Share of the triangles' area that some plane was chosen for."""
+    """Share of the triangles' area that the planes hold."""
 
 
 def billboard_cloud(
@@ -76,15 +76,17 @@ def billboard_cloud(
 ) -> BillboardCloud:
     """Choose planes for a tree's triangles and bake onto each all that lies within epsilon of it.
 
-    A rectangle holds the triangles that its plane was chosen for; there it shows whatever of the tree is within epsilon, parts of
-    triangles that are not valid included, and the inside of stems that are cut open in the bark's color. What is not said here is as
-    for :func:`~bbfit.rivals.baking.bake`.
+    A rectangle bounds the triangles of its plane. It shows everything within epsilon, including parts of triangles that are not valid; the
+    inside of stems that are cut open takes the bark's color. For everything else see ``bake``.
 
     Parameters
     ----------
-    count : N >= 1 billboards at most.
-    share : of the tree's area that the planes must hold, in (0, 1].
-    samples : triangles that planes are chosen on, drawn by their areas with the seed ``config.views.seed``; all of a tree with fewer.
+    count
+        N >= 1 billboards at most.
+    share
+        Of the tree's area that the planes must hold, in (0, 1].
+    samples
+        Triangles on which planes are chosen, sampled by area with the seed ``config.views.seed``; all triangles if there are fewer.
     """
     check_count("samples", samples)
     triangles = tree_triangles(tree)
@@ -97,19 +99,23 @@ def billboard_cloud(
 
 
 def choose_planes(triangles: Array, count: int, *, areas: Array | None = None, share: float = 0.95) -> PlaneChoice:
-    """At most N planes that hold a share of triangles' area within the least epsilon for which that was found possible.
+    """Choose at most N planes that hold a share of the triangles' area within the smallest epsilon that the bisection finds.
 
     Parameters
     ----------
-    triangles : corners, [T, 3, 3] in meters.
-    count : N >= 1.
-    areas : how much each triangle counts, [T]; its area when left out.
-    share : in (0, 1].
+    triangles
+        Corners, [T, 3, 3] in meters.
+    count
+        N >= 1.
+    areas
+        Weight of each triangle, [T]; its area when left out.
+    share
+        In (0, 1].
 
     Raises
     ------
     InputError
-        if there are no triangles, or none has an area.
+        If there are no triangles, or all have zero area.
     """
     check_count("billboards", count)
     check_range("share", share, 0, 1, open_low=True)
@@ -119,7 +125,7 @@ def choose_planes(triangles: Array, count: int, *, areas: Array | None = None, s
         fail("triangles", "expected at least one that has an area")
     middle = (triangles.min((0, 1)) + triangles.max((0, 1))) / 2
     space = _PlaneSpace(triangles - middle, areas)
-    # In logarithm, from where one plane through the middle holds everything.
+    # Of epsilon's logarithm; the upper end is where one plane through the middle holds everything.
     low, high = math.log(_LEAST * space.radius), math.log(space.radius * (1 + _ROUNDING))
     best = space.choose(math.exp(high), count)
     for _ in range(_BISECTIONS):
@@ -132,7 +138,7 @@ def choose_planes(triangles: Array, count: int, *, areas: Array | None = None, s
 
 
 def slabs_of(choice: PlaneChoice, triangles: Array) -> Slabs:
-    """The upright rectangle around each plane's triangles, and all within epsilon of the plane."""
+    """The upright rectangle around each plane's triangles, and the slab within epsilon of the plane."""
     rows: list[tuple[Array, Array, Array, Array]] = []
     for normal, distance, members in zip(choice.normals, choice.distances, choice.members, strict=True):
         vertical = np.array([0.0, 1.0, 0.0] if abs(normal[1]) < _LEVEL else [0.0, 0.0, -1.0])
@@ -154,7 +160,7 @@ def _areas(triangles: Array) -> Array:
 
 
 def _directions(step_degrees: float) -> Array:
-    """Directions of a half-sphere about so far apart, on circles of equal polar angle, [K, 3]."""
+    """Directions of a half-sphere at about this angle from each other, on circles of equal polar angle, [K, 3]."""
     rows = [np.array([[0.0, 1.0, 0.0]])]
     circles = round(90 / step_degrees)
     for circle in range(1, circles + 1):
@@ -183,8 +189,8 @@ class _PlaneSpace:
         left = np.ones(len(self.triangles), bool)
         bins = min(_MOST_BINS, max(3, math.ceil(2 * self.radius / epsilon * _BINS)))
         slopes = self._slopes(self.directions, np.flatnonzero(left), epsilon, bins)
-        found: list[tuple[Array, float, NDArray[np.int64]]] = []
-        while len(found) < count and left.any():
+        planes: list[tuple[Array, float, NDArray[np.int64]]] = []
+        while len(planes) < count and left.any():
             density = slopes.cumsum(-1)
             best = int(density.argmax())
             if density.flat[best] <= _NOTHING:
@@ -196,19 +202,19 @@ class _PlaneSpace:
             if not len(members):
                 break
             normal, distance, members = self._fitted(normal, distance, members, left, epsilon)
-            found.append((normal, distance, members))
+            planes.append((normal, distance, members))
             slopes -= self._slopes(self.directions, members, epsilon, bins)
             left[members] = False
-        normals = np.stack([normal for normal, _, _ in found]) if found else np.zeros((0, 3))
+        normals = np.stack([normal for normal, _, _ in planes]) if planes else np.zeros((0, 3))
         held = float(self.areas[~left].sum())
-        return PlaneChoice(normals, np.array([d for _, d, _ in found]), tuple(m for _, _, m in found), epsilon, held)
+        return PlaneChoice(normals, np.array([d for _, d, _ in planes]), tuple(m for _, _, m in planes), epsilon, held)
 
     def _rho(self, index: int, bins: int) -> float:
         return (2 * (index + 0.5) / bins - 1) * self.radius
 
     def _slopes(self, directions: Array, faces: NDArray[np.int64], epsilon: float, bins: int) -> Array:
         """Differences along rho of the density at the bins' centers, [K, bins + 1], of some faces."""
-        found = np.zeros((len(directions), bins + 1))
+        slopes = np.zeros((len(directions), bins + 1))
         corners, normals, areas = self.triangles[faces], self.normals[faces], self.areas[faces]
         for start in range(0, len(directions), _TOGETHER):
             some = directions[start : start + _TOGETHER]
@@ -222,11 +228,11 @@ class _PlaneSpace:
             length = len(some) * (bins + 1)
             starts = np.bincount((first + row).ravel(), weight.ravel(), length)
             ends = np.bincount((np.maximum(last, first) + row).ravel(), weight.ravel(), length)
-            found[start : start + _TOGETHER] = (starts - ends).reshape(len(some), bins + 1)
-        return found
+            slopes[start : start + _TOGETHER] = (starts - ends).reshape(len(some), bins + 1)
+        return slopes
 
     def _refined(self, normal: Array, distance: float, value: float, left: NDArray[np.bool_], epsilon: float) -> tuple[Array, float]:
-        """The densest plane near one of the coarse plane space, by ever smaller turns and finer bins of rho; ``value`` is its density."""
+        """Refine a plane of the coarse plane space by smaller turns and finer bins of rho; ``value`` is its density."""
         reach = epsilon + self.radius * math.radians(_STEP)  # farther faces cannot become valid
         near = np.flatnonzero(left & (np.abs(self.triangles @ normal - distance).max(-1) <= reach))
         bins = min(_MOST_BINS, max(3, math.ceil(2 * self.radius / epsilon * _BINS * 2)))

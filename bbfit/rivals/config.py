@@ -1,4 +1,4 @@
-"""Which systems a tree is given to, to be compared."""
+"""The systems that ``bbfit compare`` runs on a tree."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ SYSTEMS = (
 
 @dataclass(frozen=True)
 class CompareConfig:
-    """What a tree's views are compared with."""
+    """Systems to compare, and their sizes."""
 
     systems: tuple[str, ...] = ()
-    """Which systems, by name; all if left out. Those that need a package which is not installed are said to be left out."""
+    """Names of the systems; all if left out. Systems whose package is not installed are skipped and reported."""
     billboards: int = 8
     """Planes of bbfit's smaller fits and of the smaller billboard cloud."""
     many: int = 32
-    """Planes of a larger fit and of the larger billboard cloud."""
+    """Planes of the larger fit and of the larger billboard cloud."""
     crossed: int = 4
-    """Crossed planes."""
+    """Number of crossed planes."""
     directions: int = 6
-    """Slicings."""
+    """Number of slicings."""
     slices: int = 5
-    """Slices of each."""
+    """Slices per slicing."""
     mesh_vertices: int = 500
     """Vertices of the smaller learned mesh."""
     mesh_vertices_many: int = 2000
     """Vertices of the larger learned mesh."""
     mesh_steps: int = 600
-    """Steps in which a mesh is learned."""
+    """Optimization steps of a learned mesh."""
 
     def __post_init__(self) -> None:
         for system in self.systems:

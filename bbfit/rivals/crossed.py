@@ -1,6 +1,6 @@
 """Crossed planes: upright planes through the tree's axis, each with the tree's picture as seen along its normal.
 
-What asset tools make of a tree far away (Unity's ``createBillboard``, SpeedTree's billboards, the crossed quads of countless games).
+Asset tools make them for distant trees (Unity's ``createBillboard``, SpeedTree's billboards, crossed quads in games).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rivals.baking import BakeConfig, Slabs, bake, tree_triangles
 from bbfit.tree_files.tree_file import TreeFile
 
-# What is added to a slab's depth on either side, as a share of the tree's size, so that what lies on its border is seen.
+# Margin of a slab's depth on either side as a share of the tree's size, so that geometry on its border is visible.
 _SLACK = 1e-4
 
 
@@ -34,12 +34,13 @@ def crossed_planes(
 ) -> BillboardCloud:
     """N upright billboards at k·180°/N degrees through the tree's axis, each showing all of the tree in parallel projection.
 
-    The axis is that which the views' cameras circle (``config.views.axis``). Billboard 0 faces the first view; rectangles are cut to
-    what they show. What is not said here is as for :func:`~bbfit.rivals.baking.bake`.
+    The axis is the one that the views' cameras circle (``config.views.axis``). Billboard 0 faces the first view. Rectangles are cropped to
+    their visible part. For everything else see ``bake``.
 
     Parameters
     ----------
-    count : N >= 1.
+    count
+        N >= 1.
     """
     check_count("billboards", count)
     points = tree_triangles(tree).reshape(-1, 3)
@@ -53,13 +54,16 @@ def crossed_planes(
 
 
 def upright_slabs(points: NDArray[np.floating], axis: Tensor, azimuth_degrees: float, count: int) -> Slabs:
-    """S parallel upright slabs of equal thickness that partition points, their planes in their middles, the farthest back first.
+    """S parallel upright slabs of equal thickness that partition points, with planes in their middles, ordered from back to front.
 
     Parameters
     ----------
-    points : [P, 3] in meters.
-    axis : [3] where azimuths are counted from; it fixes no more than which way is the front.
-    azimuth_degrees : direction of the normal: 0 is +Z, 90 is +X, as in :class:`~bbfit.geometry.orbit.Orbit`.
+    points
+        [P, 3] in meters.
+    axis
+        [3] origin of the azimuths; it only decides which side is the front.
+    azimuth_degrees
+        Direction of the normal: 0 is +Z, 90 is +X, as in ``Orbit``.
     """
     angle = math.radians(azimuth_degrees)
     right, up, normal = (

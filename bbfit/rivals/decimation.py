@@ -1,9 +1,9 @@
-"""Fewer triangles of the tree itself: collapsed edges (Garland and Heckbert 1997), and clustered vertices where those end.
+"""The tree with fewer triangles: edge collapse (Garland and Heckbert 1997), and vertex clustering where edge collapse ends.
 
-Quadric error metrics ("Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997) are what programs simplify meshes with; the
-implementation is that of the package fast-simplification. It collapses edges and so leaves every connected part with a few triangles, and
-a tree has tens of thousands of leaves. For less than that, vertices are merged on a grid (Rossignac and Borrel 1993, "Multi-resolution 3D
-approximations for rendering complex scenes"), which knows no parts.
+Quadric error metrics ("Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997) are the common method of mesh
+simplification; the package fast-simplification implements it. Edge collapse leaves a few triangles of every connected part, and a tree has
+tens of thousands of leaves. For smaller budgets, vertices are merged on a grid (Rossignac and Borrel 1993, "Multi-resolution 3D
+approximations for rendering complex scenes"), which ignores connectivity.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from bbfit.tree_files.tree_file import TreeFile
 if TYPE_CHECKING:
     import trimesh
 
-# Rounds of collapsing edges, each of the share that the last one left to do; steps of the search for a grid.
+# Rounds of edge collapse, each with the excess of the previous one as its target; steps of the search for a grid.
 _ROUNDS, _STEPS = 4, 24
 
 
@@ -32,13 +32,13 @@ class DecimatedTree:
     """A tree with fewer triangles, as a GLB file with the tree's materials."""
 
     glb: bytes
-    """The file."""
+    """Contents of the GLB file."""
     vertices: int
-    """That it has."""
+    """Number of vertices."""
     triangles: int
-    """That it has."""
+    """Number of triangles."""
     clustered: bool
-    """Whether collapsing edges was not enough."""
+    """Whether edge collapse was not enough and vertices were clustered."""
 
 
 @dataclass(frozen=True)
@@ -52,21 +52,25 @@ class _Part:
 
 
 def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: int | None = None) -> DecimatedTree:
-    """Reduce a tree to at most so many vertices, or bytes of its GLB.
+    """Reduce a tree to a number of vertices, or of bytes of its GLB.
 
-    Parts of different materials stay apart and share what is allowed by their triangles. Vertices that lie in the same place with the same
+    Parts of different materials stay separate and share the budget by their triangles. Vertices that lie in the same place with the same
     texture coordinates are welded first. Normals are left out: surfaces are flat.
 
     Parameters
     ----------
-    tree : .glb, .gltf or .obj.
-    vertices : at least 4.
-    size : bytes, textures and materials included.
+    tree
+        .glb, .gltf or .obj.
+    vertices
+        At least 4.
+    size
+        bytes, textures and materials included.
 
     Raises
     ------
-    MissingFileError, InputError
-        if the file cannot be used, the package fast-simplification is missing, not exactly one limit is given, or it cannot be kept.
+    MissingFileError or InputError
+        If the file cannot be used, the package fast-simplification is missing, both limits or neither are given, or the limit cannot be
+        reached.
     """
     if (vertices is None) == (size is None):
         fail("decimate", "expected either vertices or a size", "give one of them")
@@ -83,19 +87,19 @@ def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: 
     for _ in range(_ROUNDS):
         if now <= limit:
             break
-        share = limit / now if size is None else max(0.0, (limit - _bare(parts)) / max(1, now - _bare(parts)))
+        share = limit / now if size is None else max(0.0, (limit - _overhead(parts)) / max(1, now - _overhead(parts)))
         fewer = [part for part in (collapse(part, max(1, int(len(part.faces) * share))) for part in parts) if len(part.faces)]
-        if not fewer or cost(fewer) >= now:  # nothing is left, or nothing more can go
+        if not fewer or cost(fewer) >= now:  # nothing is left, or no further edge can collapse
             break
         now, parts = cost(fewer), fewer
     if now > limit:
-        # From the start again: what is left has lost its trunk for the sake of leaves that could not go.
+        # Start again from the whole tree: edge collapse has removed the trunk in favor of leaves that cannot collapse.
         parts, clustered = _clustered(whole, lambda parts: cost(parts) <= limit), True
     return DecimatedTree(_glb(parts), sum(len(part.points) for part in parts), sum(len(part.faces) for part in parts), clustered)
 
 
 def _collapser() -> Callable[[_Part, int], _Part]:
-    """Collapses edges of a part until about so many triangles are left, or no edge can go."""
+    """A function that collapses edges of a part to about a number of triangles, or until no edge can collapse."""
     try:
         import fast_simplification
     except ImportError:
@@ -134,7 +138,7 @@ def _parts(tree: TreeFile) -> list[_Part]:
 
 
 def _clustered(parts: list[_Part], fits: Callable[[list[_Part]], bool]) -> list[_Part]:
-    """Parts whose vertices are merged on the finest grid that fits."""
+    """Merge vertices on the finest grid whose result fits."""
     points = np.concatenate([part.points for part in parts])
     low, extent = points.min(0), float(np.ptp(points, axis=0).max())
     fine, coarse = math.log(extent / 1e4), math.log(2 * extent)
@@ -154,7 +158,7 @@ def _clustered(parts: list[_Part], fits: Callable[[list[_Part]], bool]) -> list[
 
 
 def _merged(part: _Part, low: NDArray[np.float64], cell: float) -> _Part:
-    """A part with the vertices in each cell of a grid at their mean place, without what has become of no area or twofold."""
+    """Merge the vertices in each cell of a grid at their mean position; drop degenerate and duplicate triangles."""
     cells = np.floor((part.points - low) / cell).astype(np.int64)
     _, first, became = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     became = became.reshape(-1)
@@ -171,7 +175,7 @@ def _taken(uv: NDArray[np.float64] | None, source: NDArray[np.int64]) -> NDArray
 
 
 def _used(part: _Part) -> _Part:
-    """A part without the vertices that no triangle has."""
+    """A part without unused vertices."""
     used, faces = np.unique(part.faces, return_inverse=True)
     return replace(part, points=part.points[used], faces=faces.reshape(-1, 3), uv=_taken(part.uv, used))
 
@@ -192,7 +196,7 @@ def _glb(parts: list[_Part]) -> bytes:
     return data
 
 
-def _bare(parts: list[_Part]) -> int:
+def _overhead(parts: list[_Part]) -> int:
     """Bytes of the file without its triangles: materials, textures and the frame."""
     numbers = sum(part.points.size * 4 + part.faces.size * 4 + (0 if part.uv is None else part.uv.size * 4) for part in parts)
     return len(_glb(parts)) - numbers

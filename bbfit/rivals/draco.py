@@ -11,18 +11,18 @@ import numpy as np
 from bbfit.checks import check_range, fail
 from bbfit.tree_files.tree_file import TreeFile
 
-# What the frame of a glTF file takes: its JSON for a mesh with its material, and for the scene.
+# Estimated bytes of a glTF's JSON for the scene, and for a mesh with its material.
 _FRAME, _FRAME_A_MESH = 600, 700
 
 
 @dataclass(frozen=True)
 class DracoSize:
-    """What a tree takes with Draco's compression of its meshes."""
+    """Size of a tree with Draco compression of its meshes."""
 
     bytes: int
-    """Compressed meshes, textures as they are, and an estimate of the JSON about them."""
+    """Compressed meshes, unchanged textures and an estimate of the JSON."""
     vertices: int
-    """That come out of it; quantization may have merged some."""
+    """Vertices after decompression; quantization may merge some."""
 
 
 def draco_size(tree: str | Path | TreeFile, *, position_bits: int = 14) -> DracoSize:
@@ -30,14 +30,16 @@ def draco_size(tree: str | Path | TreeFile, *, position_bits: int = 14) -> Draco
 
     Parameters
     ----------
-    tree : .glb, .gltf or .obj.
-    position_bits : bits for each coordinate of a position, of 1 to 30; texture coordinates take 12 and normals 10, as in Draco's own
-        encoder, whose highest level of compression is used.
+    tree
+        .glb, .gltf or .obj.
+    position_bits
+        Bits for each coordinate of a position, of 1 to 30; texture coordinates take 12 and normals 10, as in Draco's own encoder, whose
+        highest level of compression is used.
 
     Raises
     ------
-    MissingFileError, InputError
-        if the file cannot be used or the package DracoPy is missing.
+    MissingFileError or InputError
+        If the file cannot be used or the package DracoPy is missing.
     """
     check_range("position_bits", position_bits, 1, 30)
     try:
@@ -48,7 +50,9 @@ def draco_size(tree: str | Path | TreeFile, *, position_bits: int = 14) -> Draco
     textures: dict[int, int] = {}
     for mesh in TreeFile.open(tree).scene().geometry.values():
         uv = getattr(mesh.visual, "uv", None)
-        normals = mesh.vertex_normals if "vertex_normals" in mesh._cache else None
+        # A PLY of the mesh has normals only if the mesh was loaded with normals.
+        header = mesh.export(file_type="ply", include_attributes=False)[:1000]
+        normals = mesh.vertex_normals if b"property float nx" in header else None
         data = DracoPy.encode(
             np.asarray(mesh.vertices, np.float32),
             np.asarray(mesh.faces, np.uint32),

@@ -1,9 +1,9 @@
-"""A rival to billboards: a closed triangle mesh whose vertices and RGBA texture are learned from the views.
+"""A closed triangle mesh whose vertices and RGBA texture are learned from the views.
 
 In the spirit of "Appearance-Driven Automatic 3D Model Simplification" (Hasselgren et al. 2021, with opacity in the texture, as for its
 foliage) and "Extracting Triangular 3D Models, Materials, and Lighting From Images" (Munkberg et al. 2022), without their
-normal maps, materials and lights: the texture is shown as it is. The start is the visual hull (:mod:`bbfit.rivals.mesh_hull`), not a
-tetrahedral grid, and the renderer a ray caster on the CPU (:mod:`bbfit.rivals.mesh_rays`), not a rasterizer on a GPU.
+normal maps, materials and lights: the texture is shown as it is. The start is the visual hull (``mesh_hull``), not a
+tetrahedral grid, and the renderer a ray caster on the CPU (``mesh_rays``), not a rasterizer on a GPU.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from torch.nn import functional
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.geometry.camera import Camera
 from bbfit.images import bleed_color, to_bytes
-from bbfit.rivals.mesh_charts import unfold
 from bbfit.rivals.mesh_hull import hull_surface
 from bbfit.rivals.mesh_rays import RayCaster, pixel_rays
 from bbfit.rivals.mesh_silhouettes import Surface, boundary_gradient
 from bbfit.views import ViewSet
+from bbfit.xatlas_process import unfolded
 
 DRAW_GRID = 4
 """Samples along a pixel's side when a mesh is drawn: 16 a pixel, at the centers of a regular grid's cells."""
@@ -63,12 +63,13 @@ class LearnedMesh:
 
         Returns
         -------
-        Premultiplied RGBA in [0, 1], float32 [H, W, 4].
+        Tensor
+            Premultiplied RGBA in [0, 1], float32 [H, W, 4].
 
         Raises
         ------
         InputError
-            if the camera is a batch, or Mitsuba or LLVM is missing.
+            If the camera is a batch, or Mitsuba or LLVM is missing.
         """
         if camera.batched:
             fail("camera", "expected one camera, got a batch", "draw its cameras one by one")
@@ -89,19 +90,23 @@ def learn_mesh(
     seed: int = 0,
     on_step: Callable[[int, float], None] | None = None,
 ) -> LearnedMesh:
-    """Learn a mesh and its texture from views of a tree: visual hull, texture coordinates, then :func:`refine_mesh`.
+    """Learn a mesh and its texture from views of a tree: visual hull, texture coordinates, then ``refine_mesh``.
 
     Parameters
     ----------
-    views : training views, from around the tree.
-    vertices : about as many vertices as the mesh is to have, seams counted as a file would; the result has at most as many.
-    texels : width and height of the texture.
-    steps, size, seed, on_step : see :func:`refine_mesh`.
+    views
+        Training views, from around the tree.
+    vertices
+        Upper bound on the vertices of the result, which comes close to it; vertices on seams count once for each side, as in a file.
+    texels
+        Width and height of the texture.
+    steps, size, seed, on_step
+        See ``refine_mesh``.
 
     Raises
     ------
     InputError
-        if an argument is out of range, the views share no common silhouette, or Mitsuba, LLVM or fast-simplification is missing.
+        If an argument is out of range, the views share no common silhouette, or Mitsuba, LLVM or fast-simplification is missing.
     """
     check_count("vertices", vertices, 20)
     check_count("texels", texels, 16)
@@ -144,25 +149,31 @@ def refine_mesh(
 ) -> LearnedMesh:
     """Move a mesh's vertices and paint its texture so that it looks like the views; triangles and texture coordinates stay.
 
-    Each step draws one view and descends on the mean squared error of its premultiplied RGBA. Its gradient has two parts: that of what
-    each sample sees, by automatic differentiation, and that of the silhouettes, by sampling points on them (Li et al. 2018, "Differentiable
+    Each step draws one view and descends on the mean squared error of its premultiplied RGBA. Its gradient has two parts: the
+    interior, by automatic differentiation of each sample, and the silhouettes, by sampling points on them (Li et al. 2018, "Differentiable
     Monte Carlo Ray Tracing through Edge Sampling"). Vertices descend along smoothed gradients (Nicolet et al. 2021, "Large Steps in
-    Inverse Rendering of Geometry"), texels by Adam (Kingma and Ba 2015). Threads add up gradients in any order, so that two runs of one
-    seed are alike but not equal.
+    Inverse Rendering of Geometry"), texels by Adam (Kingma and Ba 2015). Threads add up gradients in any order, so that two runs with
+    one seed differ slightly.
 
     Parameters
     ----------
-    start : the mesh to begin with.
-    views : training views.
-    steps : views drawn; the first half of them at half of the size.
-    size : larger side of the pictures drawn, in pixels; the views' own at most.
-    seed : chooses the order of the views and the places of the samples.
-    on_step : called after each step with the number of steps done and the step's loss.
+    start
+        The mesh to begin with.
+    views
+        Training views.
+    steps
+        Views drawn; the first half of them at half of the size.
+    size
+        Larger side of the pictures drawn, in pixels; the views' own at most.
+    seed
+        Chooses the order of the views and the places of the samples.
+    on_step
+        Called after each step with the number of steps done and the step's loss.
 
     Raises
     ------
     InputError
-        if an argument is out of range, or Mitsuba or LLVM is missing.
+        If an argument is out of range, or Mitsuba or LLVM is missing.
     """
     _check_plan(steps, size, seed)
     threads = torch.get_num_threads()
@@ -236,7 +247,7 @@ def _target(views: ViewSet, index: int, size: int) -> tuple[Camera, Tensor]:
 
 
 def _within(points: NDArray[np.float64], triangles: NDArray[np.int64], vertices: int, texels: int) -> LearnedMesh:
-    """The finest simplification (Garland and Heckbert 1997) of a surface that keeps to a number of vertices, found by halving."""
+    """The finest simplification (Garland and Heckbert 1997) of a surface within a number of vertices, by bisection."""
     try:
         import fast_simplification
     except ImportError:
@@ -245,7 +256,7 @@ def _within(points: NDArray[np.float64], triangles: NDArray[np.int64], vertices:
     while low <= high:
         middle = (low + high) // 2
         places, faces = fast_simplification.simplify(points.astype(np.float32), triangles, target_count=middle)
-        source, corners, uvs = unfold(places.astype(np.float64), faces.astype(np.int64), texels)
+        source, corners, uvs = unfolded(places.astype(np.float64), faces.astype(np.int64), texels)
         if len(source) <= vertices:
             low, best = middle + 1, (places[source], corners, uvs)
         else:

@@ -24,16 +24,17 @@ SMALLEST_PART = 0.01
 
 
 def hull_surface(views: ViewSet) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Carve the hull out of two grids, the second around what the first left over.
+    """Carve the hull from two grids, the second around the cells that the first one keeps.
 
     Returns
     -------
-    Vertices in meters [P, 3] and triangles [F, 3] of a closed surface, counter-clockwise from outside (Lorensen and Cline 1987).
+    tuple[NDArray[np.float64], NDArray[np.int64]]
+        Vertices in meters [P, 3] and triangles [F, 3] of a closed surface, counter-clockwise from outside (Lorensen and Cline 1987).
 
     Raises
     ------
     InputError
-        if no point lies inside the silhouettes of all views.
+        If no point lies inside the silhouettes of all views.
     """
     center, half = _reach(views.cameras)
     low, high = center - half, center + half
@@ -56,7 +57,7 @@ def hull_surface(views: ViewSet) -> tuple[NDArray[np.float64], NDArray[np.int64]
 
 
 def _reach(cameras: Camera) -> tuple[NDArray[np.float64], float]:
-    """The middle of what the cameras see, and half a side of a cube that holds all that every one of them sees."""
+    """Center of the cameras' common view, and half the side of a cube that contains what all of them see."""
     center = convergence_point(cameras)
     distance = (cameras.position - center).norm(dim=-1)
     scale = 1 if cameras.orthographic else distance

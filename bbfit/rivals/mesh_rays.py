@@ -1,8 +1,8 @@
 """Casting rays at a textured triangle mesh on the CPU, with gradients, by Mitsuba's ray tracer (Embree) and Dr.Jit (LLVM).
 
-Mitsuba is used for what is general in it: the scene with its search tree, and arrays that are compiled and differentiated. Its integrators
-are not: its emitters know no opacity. Colors are blended along each ray instead, surface by surface, which is the depth peeling of
-Hasselgren et al. 2021 without its sorting by rasterizer passes.
+Mitsuba provides the scene with its acceleration structure, and arrays that are compiled and differentiated. Its integrators are not used,
+because its emitters have no opacity. Colors are blended along each ray instead, surface by surface, which is the depth peeling of
+Hasselgren et al. 2021 without rasterizer passes.
 """
 
 from __future__ import annotations
@@ -21,27 +21,29 @@ from bbfit.geometry.camera import Camera
 
 VARIANT = "llvm_ad_rgb"
 LAYERS = 8
-"""Surfaces blended along a ray; those behind them are not seen."""
+"""Largest number of surfaces blended along a ray; surfaces behind them are ignored."""
 FAINT = 1 / 512
-"""A ray that lets less through than this goes no further."""
+"""Transmittance below which a ray ends."""
 STEP_ON = 1e-5
 """How far behind a surface a ray goes on, as a part of the mesh's longest side."""
 
 
 def pixel_rays(camera: Camera, places: Tensor, grid: int) -> tuple[Tensor, Tensor]:
-    """Rays through every pixel's cells, in the world that the mesh lives in: the one place where a camera meets the ray caster.
-
-    The ray caster knows no camera, only rays, so there is no other convention to convert to.
+    """Rays through the cells of every pixel, in world space.
 
     Parameters
     ----------
-    camera : one camera.
-    places : where in its cell each ray passes, in [0, 1], [H·W·grid², 2] (right, down): pixel by pixel, in it row by row.
-    grid : cells along a pixel's side.
+    camera
+        One camera.
+    places
+        Where in its cell each ray passes, in [0, 1], [H·W·grid², 2] (right, down): pixel by pixel, in it row by row.
+    grid
+        Cells along a pixel's side.
 
     Returns
     -------
-    Origins in meters and unit directions, float32 [H·W·grid², 3] each.
+    tuple[Tensor, Tensor]
+        Origins in meters and unit directions, float32 [H·W·grid², 3] each.
     """
     rows, columns = torch.arange(camera.height * grid), torch.arange(camera.width * grid)
     y, x = torch.meshgrid(rows, columns, indexing="ij")
@@ -80,7 +82,7 @@ class RayCaster:
     """A mesh of fixed triangles and texture coordinates whose vertices can move."""
 
     def __init__(self, faces: Tensor, uvs: Tensor) -> None:
-        """Take triangles, int64 [F, 3], and texture coordinates, [P, 2]; :meth:`move` gives it vertices."""
+        """Take triangles, int64 [F, 3], and texture coordinates, [P, 2]; ``move`` gives it vertices."""
         mi, _ = _libraries()
         mesh = mi.Mesh("mesh", len(uvs), len(faces))
         self._faces, self._uvs = mi.UInt32(_flat(faces, np.uint32)), mi.Float(_flat(uvs))
@@ -104,8 +106,10 @@ class RayCaster:
 
         Parameters
         ----------
-        origins, directions : [S, 3], directions of unit length.
-        texture : straight RGBA in [0, 1], [h, w, 4].
+        origins, directions
+            [S, 3], directions of unit length.
+        texture
+            Straight RGBA in [0, 1], [h, w, 4].
         """
         mi, dr = _libraries()
         seen = self._trace(_points(origins), _points(directions), self._vertices, mi.TensorXf(_array(texture)), attached=False)
@@ -119,13 +123,16 @@ class RayCaster:
 
         Parameters
         ----------
-        origins, directions, texture : as :meth:`colors`, S = pixels · ``samples``.
-        loss : from the pixels, [S / ``samples``, 4], to its derivative by them.
+        origins, directions, texture
+            As ``colors``, S = pixels · ``samples``.
+        loss
+            From the pixels, [S / ``samples``, 4], to its derivative by them.
 
         Returns
         -------
-        The derivative by the pixels, [S / ``samples``, 4], by the vertices, [P, 3], as if the silhouettes stood still, and by the texture,
-        [h, w, 4].
+        tuple[Tensor, Tensor, Tensor]
+            The derivative by the pixels, [S / ``samples``, 4], by the vertices, [P, 3], with fixed silhouettes, and by the texture, [h, w,
+            4].
         """
         mi, dr = _libraries()
         vertices, texels = mi.Float(self._vertices), mi.TensorXf(_array(texture))

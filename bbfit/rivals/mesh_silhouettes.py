@@ -1,4 +1,4 @@
-"""Where a mesh ends as a camera sees it, and how a loss changes as those edges move."""
+"""Silhouette edges of a mesh, and the gradient of a loss as they move."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Surface:
         owner = torch.arange(len(self.faces)).repeat(3)
         self.edges, edge, shared = pairs.sort(-1).values.unique(dim=0, return_inverse=True, return_counts=True)
         """Pairs of points, [E, 2]."""
-        # A border has one side. Where more than two triangles meet, any two of them stand for all.
+        # A border has one side. Where more than two triangles meet, two of them represent all.
         first = torch.full((len(self.edges),), -1).scatter_reduce(0, edge, owner, "amax")
         last = torch.full((len(self.edges),), len(owner)).scatter_reduce(0, edge, owner, "amin")
         self.sides, self.border = torch.stack([first, last], -1), shared != 2
@@ -72,21 +72,35 @@ class Surface:
 
 
 def boundary_gradient(
-    surface: Surface, points: Tensor, camera: Camera, slope: Tensor, colors: Callable[[Tensor, Tensor], Tensor], random: torch.Generator
+    surface: Surface,
+    points: Tensor,
+    camera: Camera,
+    slope: Tensor,
+    colors: Callable[[Tensor, Tensor], Tensor],
+    random: torch.Generator,
+    density: float = BOUNDARY_SAMPLES,
 ) -> Tensor:
-    """Gradient of a loss by what silhouettes cover and uncover as they move: an integral along them, by sampling.
+    """Gradient of a loss through the motion of silhouettes: an integral along them, estimated by sampling.
 
     Parameters
     ----------
-    surface, points : the mesh and its points, [points, 3].
-    camera : one camera.
-    slope : derivative of the loss by the premultiplied RGBA of each pixel, [H·W, 4].
-    colors : what rays of given origins and directions see, premultiplied RGBA: :meth:`bbfit.rivals.mesh_rays.RayCaster.colors`.
-    random : chooses the samples.
+    surface, points
+        The mesh and its points, [points, 3].
+    camera
+        One camera.
+    slope
+        Derivative of the loss by the premultiplied RGBA of each pixel, [H·W, 4].
+    colors
+        What rays of given origins and directions see, premultiplied RGBA: ``colors``.
+    random
+        Chooses the samples.
+    density
+        Samples per pixel of the view.
 
     Returns
     -------
-    The gradient by the points, [points, 3].
+    Tensor
+        The gradient by the points, [points, 3].
     """
     points = points.detach().requires_grad_()
     ends = camera.project(points.double())[surface.silhouette(points.detach(), camera)]  # [K, 2, 2]
@@ -94,7 +108,7 @@ def boundary_gradient(
     lengths = along.norm(dim=-1).nan_to_num(0)
     if float(lengths.sum()) == 0:
         return torch.zeros_like(points)
-    count = max(1, round(BOUNDARY_SAMPLES * camera.width * camera.height))
+    count = max(1, round(density * camera.width * camera.height))
     chosen = torch.multinomial(lengths, count, replacement=True, generator=random)
     part = torch.rand(count, 1, generator=random, dtype=torch.float64)
     places = ends[chosen, 0] * (1 - part) + ends[chosen, 1] * part

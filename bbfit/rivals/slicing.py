@@ -1,13 +1,13 @@
 """Slicing and blending (Jakulin 2000, "Interactive Vegetation Rendering with Slicing and Blending", Eurographics short presentations).
 
-From the paper's abstract, all of it that was at hand: a slice is a planar layer with an alpha texture, a set of parallel slices is a
+Implemented from the paper's abstract: a slice is a planar layer with an alpha texture, a set of parallel slices is a
 slicing; a view from anywhere on a circle around the tree is drawn by blending between the nearest two slicings; six slicings of five
 slices each are enough.
 
-Ours: slices show the same texture from both sides, so that a direction and its opposite share a slicing and the six stand 30 degrees
-apart; slabs of equal thickness partition the tree, each slice lying in the middle of its slab; the two slicings are drawn on their own
-and the pictures mixed, with weights linear in the angle. The paper keeps trunk and limbs as a mesh and slices twigs and leaves only; here
-all of the tree is sliced, so that nothing but planes is left, and a stem that a slab cuts shows its inside.
+Choices of this module: slices show the same texture from both sides, so opposite directions share a slicing and the six are 30 degrees
+apart. Slabs of equal thickness partition the tree, with each slice in the middle of its slab. The two slicings are drawn separately and
+their pictures mixed with weights that are linear in the angle. The paper keeps trunk and limbs as a mesh and slices only twigs and leaves;
+this module slices the whole tree, so a stem that a slab cuts shows its inside.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from bbfit.tree_files.tree_file import TreeFile
 
 @dataclass(frozen=True)
 class Slicings:
-    """D stacks of parallel slices, of which a view shows two at most."""
+    """D stacks of parallel slices; a view shows at most two."""
 
     clouds: tuple[BillboardCloud, ...]
     """The slices of each direction, D clouds."""
@@ -53,9 +53,9 @@ class Slicings:
         return sum(cloud.vertex_count for cloud in self.clouds)
 
     def weights(self, camera: Camera) -> list[tuple[int, float]]:
-        """The two slicings nearest to a single camera's direction, seen from above, and how much each counts; weights add up to 1.
+        """The two slicings nearest to a camera's azimuth and their weights, which sum to 1.
 
-        A parallel camera's direction is its own, a pinhole's that of its center. Of one straight above it is azimuth 0.
+        A parallel camera's direction is its own, a pinhole's that of its center. A camera straight above has azimuth 0.
         """
         towards = -camera.forward if camera.orthographic else camera.position - self.axis.to(camera.position)
         azimuth = float(torch.atan2(towards[0], towards[2])) * 180 / np.pi if float(towards[::2].norm()) > 1e-9 else 0.0
@@ -69,7 +69,8 @@ class Slicings:
 
         Returns
         -------
-        Premultiplied RGBA, [V, H, W, 4] ([H, W, 4] for a single camera).
+        Tensor
+            Premultiplied RGBA, [V, H, W, 4] ([H, W, 4] for a single camera).
         """
         if camera.batched:
             return torch.stack([self.draw(camera[index]) for index in range(len(camera))])
@@ -88,13 +89,15 @@ def slicing(
 ) -> Slicings:
     """Slice a tree along evenly spaced directions.
 
-    Slices that show nothing are left out. With ``config.two_sided`` they have a texture of their own from behind, which is ours. What is
-    not said here is as for :func:`~bbfit.rivals.baking.bake`.
+    Empty slices are left out. With ``config.two_sided`` slices have back textures, unlike in the paper. For everything else see
+    ``bake``.
 
     Parameters
     ----------
-    directions : slicings, at least 1, 180 degrees over so many apart.
-    slices : slices of each, at least 1.
+    directions
+        Number of slicings, at least 1, at equal angles over 180 degrees.
+    slices
+        Slices per slicing, at least 1.
     """
     check_count("directions", directions)
     check_count("slices", slices)
@@ -107,7 +110,7 @@ def slicing(
 
 
 def _by_direction(cloud: BillboardCloud, azimuths: list[float]) -> tuple[BillboardCloud, ...]:
-    """The slices of each direction, told by their normals."""
+    """The slices of each direction, distinguished by their normals."""
     angle = torch.tensor(azimuths, dtype=cloud.centers.dtype).deg2rad()
     normals = torch.stack([angle.sin(), torch.zeros_like(angle), angle.cos()], -1)
     nearest = (cloud.normals @ normals.mT).argmax(-1)

@@ -1,1 +1,1 @@
-"""The stages that runs, levels of detail, sweeps and comparisons consist of, and the record of what was done."""
+"""The stages of runs, levels of detail, sweeps and comparisons, and the record of finished stages."""

@@ -1,4 +1,4 @@
-"""The stages from views to fitted billboards: the choice within a budget, and the fit."""
+"""The stages from views to fitted billboards: the choice of a configuration for a budget, and the fit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
 
-from bbfit.budget.choice import Trial, choose, within_bytes
+from bbfit.budget.choice import Trial, choose, lookup, within_bytes
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
@@ -24,7 +24,10 @@ from bbfit.views import ViewDataset
 def budget_stage(
     folder: Path, views: ViewDataset, tree: TreeFile | None, fit_config: FitConfig, budget: BudgetConfig, export: ExportConfig
 ) -> Stage:
-    """Choose a configuration for a budget. ``pareto.json`` keeps every finished trial, so that none is done twice."""
+    """Choose a configuration for a budget, and write ``pareto.json`` and ``pareto.png``.
+
+    ``pareto.json`` is written after every trial, so that an interrupted choice repeats none.
+    """
     path = folder / "pareto.json"
     inputs = (*fit_inputs(views, fit_config, tree), budget, export)
 
@@ -36,7 +39,7 @@ def budget_stage(
 
         on_progress("budget", 0, 1)
         known = _known_trials(path, stage.key)
-        choice = choose(views, fit_config, budget, tree=tree, export=export, known=known, on_trial=on_trial)
+        choice = choose(views, fit_config, budget, tree=tree, export=export, known=lookup(known), on_trial=on_trial)
         limits = {name: value for name, value in asdict(budget).items() if value}
         write_json(path, {"inputs": stage.key, "budget": limits, "config": asdict(choice.config), **choice.to_json()})
         cost: Cost = "bytes" if budget.bytes else "texels" if budget.texels else "vertices"
@@ -47,7 +50,7 @@ def budget_stage(
 
 
 def read_choice(folder: Path) -> tuple[FitConfig, bool]:
-    """The configuration that a finished budget stage chose, and whether it met the target PSNR, if there was one."""
+    """The configuration that a finished budget stage chose, and whether it reached the target PSNR (true without a target)."""
     content = read_json("budget", folder / "pareto.json")
     return FitConfig(**content["config"]), content["met"]
 
@@ -64,8 +67,16 @@ def fit_stage(
 
     Parameters
     ----------
+    folder
+        The run's folder.
+    views
+        The views, of which the training views are used.
+    tree
+        The mesh that places the billboards. ``None`` places them by the views alone.
+    config
+        The options of the fit.
     limit
-        The largest size of the model in bytes, and how it will be exported.
+        The maximum size of the model in bytes and its export options. ``None`` is no limit.
     on_step
         Called after every step of the fit.
     """
@@ -92,12 +103,12 @@ def fit_stage(
 
 
 def remove_checkpoint(folder: Path) -> None:
-    """Remove the checkpoint of a fit whose result is recorded."""
+    """Remove the checkpoint of a fit after its result was recorded."""
     (folder / "fit.checkpoint").unlink(missing_ok=True)
 
 
 def _known_trials(path: Path, key: str) -> list[Trial]:
-    """The trials of an interrupted choice with the same key. A damaged file costs only its trials."""
+    """The trials of an interrupted choice with the same key, or none if the file is missing or damaged."""
     try:
         content = read_json("budget", path) if path.is_file() else {}
         names = [entry.name for entry in fields(Trial)]

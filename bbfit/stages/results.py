@@ -1,4 +1,4 @@
-"""The stages from fitted billboards to what people take away: the models, the score, and the report."""
+"""The stages after the fit: export, evaluation, and report."""
 
 from __future__ import annotations
 
@@ -36,7 +36,21 @@ def export_stage(folder: Path, model: ShippedModel) -> Stage:
 
 
 def evaluate_stage(folder: Path, model: ShippedModel, views: ViewDataset, tree: TreeFile | None, seconds: Mapping[str, float]) -> Stage:
-    """Score what was exported on the held-out views: ``metrics.json`` and ``comparison.png``. ``seconds`` are those of earlier stages."""
+    """Score the exported model on the held-out views, and write ``metrics.json`` and ``comparison.png``.
+
+    Parameters
+    ----------
+    folder
+        The run's folder. It contains the outputs of the fit and of the export.
+    model
+        The exported model.
+    views
+        The views, of which the held-out ones are used.
+    tree
+        The original tree, or ``None`` if it is not known.
+    seconds
+        The seconds of the earlier stages, which the report contains.
+    """
 
     def work(on_progress: OnProgress) -> None:
         report = evaluate_model(model, views.test, original=original_tree(views, tree), on_progress=partial(on_progress, "evaluate"))
@@ -55,15 +69,29 @@ def report_stage(
     views: ViewDataset,
     facts: Mapping[str, Any],
 ) -> Stage:
-    """Write ``report.html``. ``facts`` are the fields of :class:`~bbfit.reporting.html.RunFacts` that the record of the run holds."""
-    pareto = folder / "pareto.png" if any(facts["asked"].get("budget", {}).values()) else None
+    """Write ``report.html``.
+
+    Parameters
+    ----------
+    folder
+        The run's folder. It contains the outputs of the fit and of the evaluation.
+    report
+        The score of ``model``.
+    model
+        The exported model.
+    views
+        The views, of which the held-out ones are shown.
+    facts
+        The fields of :class:`~bbfit.reporting.html.RunFacts` that come from the record of the run.
+    """
+    pareto = folder / "pareto.png" if any(facts["options"].get("budget", {}).values()) else None
 
     def work(on_progress: OnProgress) -> None:
         on_progress("report", 0, 1)
         losses = [float(row["loss"]) for row in csv.DictReader((folder / "loss.csv").read_text().splitlines())]
         picture = pareto.read_bytes() if pareto else None
-        readable = replace(model.config, textures="webp", fallback=False, mip_files=False)  # by browsers
-        known = RunFacts(**facts, losses=losses, pareto=picture, cut_up=bool(model.config.split))
+        readable = replace(model.config, textures="webp", fallback=False, mip_files=False)  # browsers read WebP
+        known = RunFacts(**facts, losses=losses, pareto=picture)
         page = report_page(report, model, views.test, known, glb_bytes(model.cards, readable))
         write_bytes(folder / "report.html", page.encode())
         on_progress("report", 1, 1)
@@ -75,7 +103,7 @@ def report_stage(
 
 
 def original_tree(views: ViewDataset, tree: TreeFile | None = None) -> OriginalTree:
-    """Vertices and bytes of the tree that views were rendered from: as their request records them, else those of the mesh."""
+    """Vertices and bytes of the tree in the views: as recorded in their request, or else those of the mesh ``tree``."""
     known = views.request.tree if views.request else None
     if known and (known.vertices or known.bytes):
         return OriginalTree(known.vertices, known.bytes)
@@ -83,6 +111,6 @@ def original_tree(views: ViewDataset, tree: TreeFile | None = None) -> OriginalT
 
 
 def export_config(views: ViewDataset, config: ExportConfig) -> ExportConfig:
-    """``config`` with the up axis of the file that the views were rendered from, where that is left open and known."""
+    """``config`` with the up axis of the tree's file instead of ``"auto"``, if the views record it."""
     z_up = config.up == "auto" and views.request is not None and views.request.tree.up_axis == "z"
     return replace(config, up="z") if z_up else config

@@ -1,4 +1,4 @@
-"""A stage of long work as a value, and the record of a folder, which skips a stage whose results are current."""
+"""A stage of a long computation as a value, and the record of a folder, which skips stages whose results are current."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headles
 
 
 class OnProgress(Protocol):
-    """A callback for the progress of long work."""
+    """A callback for the progress of a long computation."""
 
     def __call__(self, stage: str, done: int, total: int, note: str = "", /) -> None:
-        """``done`` of ``total`` units of ``stage`` are finished; ``note`` is a short text such as the loss."""
+        """Report that ``done`` of ``total`` units of ``stage`` are finished. ``note`` is a short text such as the loss."""
 
 
 def silent(stage: str, done: int, total: int, note: str = "") -> None:
@@ -34,36 +34,36 @@ def silent(stage: str, done: int, total: int, note: str = "") -> None:
 
 @dataclass(frozen=True)
 class Stage:
-    """A piece of work with a name, all inputs that its results depend on, and the files that it writes into its folder."""
+    """A computation with a name, all inputs that its results depend on, and the files that it writes to its folder."""
 
     name: str
-    """Unique in its folder."""
+    """The name, unique in the folder."""
     inputs: tuple[Any, ...]
-    """Whatever the results depend on: configurations, digests, and other values that have an :func:`~bbfit.provenance.identity`."""
+    """Everything that the results depend on: configurations, digests, and other values with an :func:`~bbfit.provenance.identity`."""
     outputs: tuple[str, ...]
-    """Files that the work writes, relative to the folder. ``*`` stands for any characters where their number is not known before."""
+    """The files that ``work`` writes, relative to the folder. ``*`` matches any characters, for files whose number is not known."""
     work: Callable[[OnProgress], float | None]
-    """Writes the outputs. Returns the seconds that it took, if earlier attempts count too."""
+    """Writes the outputs. May return the seconds of all attempts. Otherwise the record measures this one."""
     algorithm: str | None = None
-    """The entry of :data:`~bbfit.provenance.VERSIONS` that the results depend on. ``None``: the entry called like the stage."""
+    """The name in :data:`~bbfit.provenance.VERSIONS` of the algorithm. ``None`` is the name of the stage."""
 
     @property
     def key(self) -> str:
-        """The identity of the results."""
+        """The cache key of the results. Raises the errors of :func:`~bbfit.provenance.identity`."""
         return cache_key(self.algorithm or self.name, *self.inputs)
 
 
 class Record:
-    """The stages that were done in a folder: with which inputs, which files they wrote, and how long they took. Kept in ``run.json``."""
+    """The finished stages of a folder, with their inputs, outputs and seconds. They are stored in ``run.json``."""
 
     def __init__(self, folder: Path, head: Mapping[str, Any] | None = None) -> None:
-        """Read the record of ``folder``, if there is one. ``head`` holds what is recorded besides the stages (:func:`record_head`)."""
+        """Read the record of ``folder``, if it exists. ``head`` contains the other fields of the record (:func:`record_head`)."""
         self.folder, self.head, self.skipped = folder, dict(head or {}), list[str]()
         path = folder / RECORD_FILE
         try:
             earlier = read_json("run", path) if path.is_file() else {}
         except InputError:
-            earlier = {}  # a damaged record costs only the skipping
+            earlier = {}  # without a record, the stages are repeated
         stages = earlier.get("stages") if isinstance(earlier, dict) else None
         self.stages = {name: stage for name, stage in stages.items() if _is_entry(stage)} if isinstance(stages, dict) else {}
 
@@ -73,31 +73,44 @@ class Record:
         return {name: entry["seconds"] for name, entry in self.stages.items()}
 
     def is_current(self, stage: Stage) -> bool:
-        """Whether the stage was done with the same inputs and nobody has changed the files that it wrote since."""
-        entry = self.stages.get(stage.name)
-        if entry is None or entry["inputs"] != stage.key:
+        """Whether the stage was finished with the same inputs, and its output files have not changed since."""
+        return self._is_current(stage.name, stage.key)
+
+    def _is_current(self, name: str, key: str) -> bool:
+        entry = self.stages.get(name)
+        if entry is None or entry["inputs"] != key:
             return False
-        files = {name: self.folder / name for name in entry["outputs"]}
-        return all(file.is_file() and digest_file(file) == entry["outputs"][name] for name, file in files.items())
+        return all((file := self.folder / path).is_file() and digest_file(file) == digest for path, digest in entry["outputs"].items())
 
     def run(self, stage: Stage, on_progress: OnProgress = silent) -> bool:
-        """Do the work of a stage and record it, unless its results are current. Returns whether the work was done."""
-        if self.is_current(stage):
+        """Run a stage and record it, or skip it if its results are current.
+
+        Returns
+        -------
+        bool
+            Whether the stage was run.
+
+        Raises
+        ------
+        InputError, OSError
+            If the work raises it. The record then stays as it was.
+        """
+        key = stage.key  # before the work, during which an input file may change
+        if self._is_current(stage.name, key):
             self.skipped.append(stage.name)
             return False
-        begun = time.perf_counter()
+        started = time.perf_counter()
         seconds = stage.work(on_progress)
-        matches = {name: sorted(self.folder.glob(name)) if "*" in name else [self.folder / name] for name in stage.outputs}
-        paths = list(chain.from_iterable(matches.values()))
-        digests = {Path(os.path.relpath(path, self.folder)).as_posix(): digest_file(path) for path in paths}
-        elapsed = time.perf_counter() - begun if seconds is None else seconds
-        self.stages[stage.name] = {"inputs": stage.key, "outputs": digests, "seconds": round(elapsed, 3)}
+        elapsed = time.perf_counter() - started if seconds is None else seconds
+        matches = (sorted(self.folder.glob(name)) if "*" in name else [self.folder / name] for name in stage.outputs)
+        digests = {Path(os.path.relpath(path, self.folder)).as_posix(): digest_file(path) for path in chain.from_iterable(matches)}
+        self.stages[stage.name] = {"inputs": key, "outputs": digests, "seconds": round(elapsed, 3)}
         write_json(self.folder / RECORD_FILE, self.head | {"stages": self.stages})
         return True
 
 
 def record_head(source: str, config: Mapping[str, Any], seeds: Mapping[str, int]) -> dict[str, Any]:
-    """The part of a record besides its stages: source, resolved configuration as JSON, seeds, versions of packages, and the machine."""
+    """The fields of a record besides its stages: source, resolved configuration as JSON, seeds, versions of packages, and the machine."""
     versions = {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
     return {"source": source, "config": dict(config), "seeds": dict(seeds), "versions": versions, "machine": platform.platform()}
 

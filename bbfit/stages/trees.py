@@ -1,4 +1,4 @@
-"""The stages from a species or a file to the views of a tree."""
+"""The stages before the fit: grow a tree, convert it, and render its views."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.growth import grow
 from bbfit.trees.species import Species
-from bbfit.trees.tree_file import write_tree
+from bbfit.trees.tree_writer import write_tree
 
 
 def grow_stage(folder: Path, species: Species, config: GrowConfig) -> Stage:
-    """Grow a tree into ``tree.glb``."""
+    """Grow a tree and write ``tree.glb``."""
 
     def work(on_progress: OnProgress) -> None:
         on_progress("grow", 0, 1)
@@ -30,7 +30,7 @@ def grow_stage(folder: Path, species: Species, config: GrowConfig) -> Stage:
 
 
 def views_stage(folder: Path, tree: TreeFile, config: ViewsConfig) -> Stage:
-    """Render the views of a tree into ``views/``. Its seconds include those of earlier, interrupted attempts."""
+    """Render the views of a tree into ``views/``. The seconds of interrupted attempts count too."""
 
     def work(on_progress: OnProgress) -> float:
         path = render_views(tree, folder / "views", config, on_progress=lambda done, total: on_progress("views", done, total))
@@ -42,7 +42,7 @@ def views_stage(folder: Path, tree: TreeFile, config: ViewsConfig) -> Stage:
 
 
 def convert_stage(folder: Path, tree: TreeFile, name: str, *, triangles: int | None = None) -> Stage:
-    """Convert a tree to the GLB file ``name``, decimated to at most ``triangles`` if given."""
+    """Convert a tree to the GLB file ``name``, decimated to at most ``triangles`` triangles unless that is ``None``."""
 
     def work(on_progress: OnProgress) -> None:
         on_progress("convert", 0, 1)

@@ -1,1 +1,1 @@
-"""Many runs at once: grids of configurations over many trees, on the cores of one machine or on a Ray cluster."""
+"""Sweeps: every configuration of a grid for every tree, on the cores of one machine or on a Ray cluster."""

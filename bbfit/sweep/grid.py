@@ -1,4 +1,4 @@
-"""Grids of configurations: what is varied, in which combinations."""
+"""Grids of configurations: the options that a sweep varies, and their combinations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.sweep.config import SweepConfig
 
 VARIANT = "variant"
-"""The label that tells which of a grid's variants a cell is of."""
+"""The label of a cell that contains the name of its variant."""
 _BUILT_IN = Path(__file__).with_name("grids")
 _FIELDS = {entry.name for entry in fields(FitConfig)}
 
@@ -25,61 +25,66 @@ class Cell:
     """One configuration of a grid."""
 
     labels: Mapping[str, str]
-    """What sets it apart from the others: the variant, if the grid has any, and a value for each axis."""
+    """The variant, if the grid has any, and a value for each axis. No two cells have the same labels."""
     config: FitConfig
-    """Resolved."""
+    """The resolved configuration."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Every variant with every combination of the axes' values."""
+    """Every variant with every combination of the values of the axes."""
 
     fit: Mapping[str, Any] = field(default_factory=dict)
-    """Fields of :class:`~bbfit.fitting.config.FitConfig` that all cells share."""
+    """Values of :class:`~bbfit.fitting.config.FitConfig` fields that all cells share."""
     variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Named settings of several fields at once."""
+    """Named settings of several fields."""
     axes: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
-    """Fields and the values that each takes."""
+    """Fields, each with its values."""
     trees: tuple[str, ...] = ()
-    """Species to grow if no trees are given."""
+    """Species to grow if the sweep names no trees."""
 
     def __post_init__(self) -> None:
         for name, values in self.axes.items():
             if not values:
-                fail("grid", f"axis {name} has no values", "give at least one, or leave it out")
+                fail("grid", f"axis {name} has no values", "give at least one, or remove the axis")
             if len(set(values)) < len(values):
-                fail("grid", f"axis {name} has a value twice", "give each once")
+                fail("grid", f"axis {name} has a value twice", "give each value once")
         for settings in (self.fit, self.axes, *self.variants.values()):
             for name in settings:
                 if name not in _FIELDS:
-                    fail("grid", f"{name!r} is no option of a fit", f"there are {', '.join(sorted(_FIELDS))}")
+                    fail("grid", f"{name!r} is not an option of a fit", f"the options are {', '.join(sorted(_FIELDS))}")
 
     @staticmethod
     def load(name: str) -> Grid:
-        """A built-in grid by its name, or one from a YAML file with the keys ``fit``, ``variants``, ``axes`` and ``trees``, each optional.
+        """Load a built-in grid, or a YAML file with the optional keys ``fit``, ``variants``, ``axes`` and ``trees``.
+
+        Parameters
+        ----------
+        name
+            The name of a built-in grid, or the path of a .yaml or .yml file.
 
         Raises
         ------
         MissingFileError, InputError
-            if there is no such grid, or the file is no grid.
+            If the grid does not exist, or the file does not describe a grid.
         """
-        known = sorted(path.stem for path in _BUILT_IN.glob("*.yaml"))
-        if name not in known and not name.endswith((".yaml", ".yml")):
-            fail("grid", f"{name!r} is neither built in nor a .yaml file", f"built in are {', '.join(known)}")
-        path = _BUILT_IN / f"{name}.yaml" if name in known else check_file("grid", name)
+        built_in = sorted(path.stem for path in _BUILT_IN.glob("*.yaml"))
+        if name not in built_in and not name.endswith((".yaml", ".yml")):
+            fail("grid", f"{name!r} is neither built in nor a .yaml file", f"the built-in grids are {', '.join(built_in)}")
+        path = _BUILT_IN / f"{name}.yaml" if name in built_in else check_file("grid", name)
         try:
             content = yaml.safe_load(path.read_text(encoding="utf-8"))
         except (yaml.YAMLError, ValueError, RecursionError) as error:
-            fail("grid", f"{path} is not valid YAML ({' '.join(str(error).split())})", "see bbfit/sweep/grids/thesis.yaml for one that is")
+            fail("grid", f"{path} is not valid YAML ({' '.join(str(error).split())})", "see bbfit/sweep/grids/thesis.yaml for an example")
         return _grid(content, path)
 
     def narrowed(self, config: SweepConfig) -> Grid:
-        """The same grid with the axes and variants that a sweep was asked for.
+        """The grid with the variants and the axis values that the options of a sweep select.
 
         Raises
         ------
         InputError
-            if a variant is asked for that there is not.
+            If the grid does not have a selected variant.
         """
         axes = dict(self.axes)
         for name in ("loss", "billboards"):
@@ -87,28 +92,31 @@ class Grid:
                 axes[name] = tuple(values)
         for name in config.variants:
             if name not in self.variants:
-                fail("variants", f"there is no {name!r} in this grid", f"there are {', '.join(self.variants) or 'none'}")
+                fail("variants", f"this grid has no variant {name!r}", f"its variants are {', '.join(self.variants) or 'none'}")
         variants = {name: self.variants[name] for name in config.variants} or self.variants
         return replace(self, axes=axes, variants=variants)
 
     def cells(self, base: FitConfig | None = None) -> list[Cell]:
-        """All cells, the last axis varying fastest.
+        """All cells. The last axis varies fastest.
 
-        What ``base`` sets differently from the default counts for all cells, unless it is varied.
+        Parameters
+        ----------
+        base
+            Fields that differ from their defaults apply to all cells, unless the grid varies them.
 
         Raises
         ------
         InputError
-            if a value is bad or values do not go together.
+            If a value is invalid, or values contradict each other.
         """
-        asked = {name: value for name in _FIELDS if (value := getattr(base or FitConfig(), name)) != getattr(FitConfig(), name)}
+        shared = {name: value for name in _FIELDS if (value := getattr(base or FitConfig(), name)) != getattr(FitConfig(), name)}
         cells = []
         for variant, settings in (self.variants or {"": {}}).items():
             for values in itertools.product(*self.axes.values()):
                 chosen = dict(zip(self.axes, values, strict=True))
                 labels = ({VARIANT: variant} if variant else {}) | {name: str(value) for name, value in chosen.items()}
                 try:
-                    config = FitConfig(**{**self.fit, **asked, **settings, **chosen}).resolve()
+                    config = FitConfig(**{**self.fit, **shared, **settings, **chosen}).resolve()
                 except InputError as error:
                     fail("grid", f"{' '.join(labels.values()) or 'its one cell'}: {error}")
                 cells.append(Cell(labels, config))
@@ -116,22 +124,22 @@ class Grid:
 
 
 def _grid(content: Any, path: Path) -> Grid:
-    """A grid from what a YAML file holds."""
+    """The grid that the content of a YAML file describes."""
     content = {} if content is None else content
     shapes = {"fit": dict, "variants": dict, "axes": dict, "trees": list}
     if not isinstance(content, dict):
-        fail("grid", f"{path} holds no mapping", f"expected some of the keys {', '.join(shapes)}")
+        fail("grid", f"{path} is not a mapping", f"expected some of the keys {', '.join(shapes)}")
     for name, value in content.items():
         if name not in shapes:
             fail("grid", f"{path} has the key {name!r}", f"expected some of {', '.join(shapes)}")
         if not isinstance(value, shapes[name]):
-            fail("grid", f"{name} in {path} is no {'list' if shapes[name] is list else 'mapping'}")
+            fail("grid", f"{name} in {path} is not a {'list' if shapes[name] is list else 'mapping'}")
     for name, value in content.get("axes", {}).items():
         if not isinstance(value, list):
-            fail("grid", f"axis {name} in {path} is no list", "write the values in brackets, as in [2, 3, 4]")
+            fail("grid", f"axis {name} in {path} is not a list", "write the values in brackets, as in [2, 3, 4]")
     for name, value in content.get("variants", {}).items():
         if not isinstance(value, dict):
-            fail("grid", f"variant {name} in {path} is no mapping", "write options in braces, as in {sides: two}")
+            fail("grid", f"variant {name} in {path} is not a mapping", "write options in braces, as in {sides: two}")
     axes = {name: tuple(map(_hashable, value)) for name, value in content.get("axes", {}).items()}
     trees = tuple(map(str, content.get("trees", [])))
     return Grid(content.get("fit", {}), {str(name): value for name, value in content.get("variants", {}).items()}, axes, trees)
@@ -139,5 +147,5 @@ def _grid(content: Any, path: Path) -> Grid:
 
 def _hashable(value: Any) -> Any:
     if isinstance(value, dict | list):
-        fail("grid", f"{value!r} is no value of an option", "use variants for several options at once")
+        fail("grid", f"{value!r} is not the value of an option", "use variants to set several options together")
     return value

@@ -1,4 +1,4 @@
-"""Tasks on processes of this machine, which may die without taking the rest along."""
+"""Run tasks in processes on this machine. A process that dies affects only its own task."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import os
 import platform
 import signal
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -26,40 +26,35 @@ class _Worker:
     task: Task | None = None
 
 
-@dataclass(frozen=True)
-class _Waiting:
-    tasks: collections.deque[Task] = field(default_factory=collections.deque)
-    deaths: collections.Counter[str] = field(default_factory=collections.Counter)
-
-
 class LocalWorkers:
-    """Up to ``count`` processes, by default one for each core, that share the cores; a task that is to run alone has them all.
+    """Up to ``count`` processes (by default one for each core) that share the cores. A task that runs alone gets all cores.
 
-    A process that dies is replaced, and its task tried again up to ``retries`` times.
+    A process that dies is replaced. Its task is repeated up to ``retries`` times.
     """
 
     def __init__(self, count: int | None = None, retries: int = 2) -> None:
         self._count, self._retries = count or os.cpu_count() or 1, retries
         self._workers: list[_Worker] = []
-        self._waiting = _Waiting()
+        self._waiting = collections.deque[Task]()
+        self._crashes = collections.Counter[str]()
 
     def __enter__(self) -> LocalWorkers:
         return self
 
     def __exit__(self, *_: object) -> None:
         for worker in self._workers:
-            _end(worker)
+            _stop(worker)
         self._workers.clear()
 
     def submit(self, task: Task) -> None:
-        """See :class:`~bbfit.sweep.tasks.Workers`."""
-        self._waiting.tasks.append(task)
-        self._hand_out()
+        """Run a task as soon as a process is free."""
+        self._waiting.append(task)
+        self._assign()
 
     def next(self) -> tuple[Task, Outcome]:
-        """See :class:`~bbfit.sweep.tasks.Workers`."""
+        """Wait until a task ends. At least one submitted task must be unfinished."""
         while True:
-            self._hand_out()
+            self._assign()
             busy = {worker.pipe: worker for worker in self._workers if worker.task is not None}
             assert busy, "no task was submitted"
             for pipe in wait(list(busy)):
@@ -70,45 +65,45 @@ class LocalWorkers:
                     return task, worker.pipe.recv()
                 except (EOFError, OSError):
                     self._workers.remove(worker)
-                    ending = _end(worker)
-                    self._waiting.deaths[task.name] += 1
-                    if self._waiting.deaths[task.name] <= self._retries:
-                        self._waiting.tasks.appendleft(task)
+                    cause = _stop(worker)
+                    self._crashes[task.name] += 1
+                    if self._crashes[task.name] <= self._retries:
+                        self._waiting.appendleft(task)
                         break
-                    reason = f"its process died {self._waiting.deaths[task.name]} times, last by {ending}"
+                    reason = f"its process died {self._crashes[task.name]} times, last by {cause}"
                     return task, Outcome(None, reason, platform.node())
 
-    def _hand_out(self) -> None:
-        """Give tasks to whoever has none, in their order."""
-        while self._waiting.tasks:
+    def _assign(self) -> None:
+        """Assign waiting tasks to idle processes, in their order."""
+        while self._waiting:
             busy = [worker.task for worker in self._workers if worker.task is not None]
-            task = self._waiting.tasks[0]
+            task = self._waiting[0]
             if len(busy) >= (1 if task.alone or any(other.alone for other in busy) else self._count):
                 return
             idle = next((worker for worker in self._workers if worker.task is None), None)
             if idle is None:
                 idle = _start()
                 self._workers.append(idle)
-            idle.task = self._waiting.tasks.popleft()
+            idle.task = self._waiting.popleft()
             cores = os.cpu_count() or 1
             try:
                 idle.pipe.send((idle.task, cores if task.alone else max(1, cores // self._count)))
-            except OSError:  # it has died, which the next look at its pipe will tell
+            except OSError:  # the process has died, and ``next`` will notice it
                 pass
 
 
 def _start() -> _Worker:
     ours, theirs = _SPAWN.Pipe()
     held, watched = _SPAWN.Pipe()
-    process = _SPAWN.Process(target=_serve, args=(theirs, watched), daemon=True)
+    process = _SPAWN.Process(target=_run_tasks, args=(theirs, watched), daemon=True)
     process.start()
     theirs.close()
     watched.close()
     return _Worker(process, ours, held)
 
 
-def _end(worker: _Worker) -> str:
-    """End a process if it has not ended; how it did."""
+def _stop(worker: _Worker) -> str:
+    """Stop a process if it still runs. Return how it ended."""
     worker.lifeline.close()
     worker.process.join(1)
     if worker.process.is_alive():
@@ -119,12 +114,12 @@ def _end(worker: _Worker) -> str:
     return f"{signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 
-def _serve(pipe: Connection, lifeline: Connection) -> None:
-    """What a process does: one task after the other, until its parent hangs up or dies."""
+def _run_tasks(pipe: Connection, lifeline: Connection) -> None:
+    """The main function of a process: run tasks until the parent closes the pipe or dies."""
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt from the keyboard is the parent's to handle
-    threading.Thread(target=_watch, args=(lifeline,), daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles keyboard interrupts
+    threading.Thread(target=_exit_with_parent, args=(lifeline,), daemon=True).start()
     while True:
         try:
             task, cores = pipe.recv()
@@ -135,8 +130,8 @@ def _serve(pipe: Connection, lifeline: Connection) -> None:
         pipe.send(attempt(partial(task.work, inputs, task.folder, *task.arguments), platform.node()))
 
 
-def _watch(lifeline: Connection) -> None:
-    """End this process at once when the parent is gone, in the middle of a task if need be."""
+def _exit_with_parent(lifeline: Connection) -> None:
+    """Exit at once when the parent ends, even in the middle of a task."""
     try:
         lifeline.recv()
     except (EOFError, OSError):

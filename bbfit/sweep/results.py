@@ -1,4 +1,4 @@
-"""What a sweep has computed, one small file a result, named by the hash of all that it depends on."""
+"""The results of a sweep: one small JSON file for each, named by its cache key."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Results:
     """A folder of results."""
 
     def __init__(self, folder: Path) -> None:
-        """Make the folder if need be."""
+        """Create the folder if it does not exist."""
         self._folder = output_folder("out", folder)
 
     def get(self, key: str) -> Outcome | None:
-        """What an earlier start found; a damaged file counts as none."""
+        """The stored outcome with a key. ``None`` if its file is missing or damaged."""
         path = self._path(key)
         if not path.is_file():
             return None
@@ -30,7 +30,7 @@ class Results:
             return None
 
     def put(self, key: str, outcome: Outcome, request: dict[str, Any]) -> None:
-        """Keep a result beside what was asked for, completely or not at all."""
+        """Store an outcome atomically, with a description of its inputs for the reader."""
         write_json(self._path(key), {"request": request, "outcome": asdict(outcome)})
 
     def _path(self, key: str) -> Path:

@@ -1,4 +1,4 @@
-"""Sweeps: every configuration of a grid for every tree, each computed once however often the sweep is killed."""
+"""Sweeps: run every configuration of a grid for every tree. A killed sweep continues and repeats no finished run."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.species import load_species
 from bbfit.views import ViewDataset
 
-# Characters of a hash that name results and folders: two of a million would be alike once in 10^12 sweeps.
+# Digits of a key in the names of results and folders. Among a million keys, two agree in one of 10^12 sweeps.
 _DIGITS = 20
-# Seconds from one writing of the table to the next while runs are made.
-_EVERY = 10.0
+# Seconds between two writes of the table during a sweep.
+_TABLE_INTERVAL = 10.0
 
 
 @dataclass(frozen=True)
@@ -40,25 +40,25 @@ class Source:
     """A tree of a sweep."""
 
     name: str
-    """Of its folder and its rows."""
+    """The name of its folder and of its rows."""
     species: str | None = None
-    """What to grow."""
+    """The species to grow."""
     tree: Path | None = None
-    """The tree's file, to be rendered."""
+    """The file of a tree to render."""
     views: Path | None = None
-    """Folder of its views."""
+    """The folder of existing views."""
 
 
 @dataclass(frozen=True)
 class SweepResult:
-    """What a sweep made."""
+    """The results of a sweep."""
 
     folder: Path
-    """Where everything lies: ``trees``, ``runs``, ``results`` and the tables."""
+    """The sweep's folder, with ``trees``, ``runs``, ``results`` and the tables."""
     rows: tuple[SweepRow, ...]
-    """One for each configuration of each tree, in the order of the trees and of the grid."""
+    """One row for each configuration of each tree, in the order of the trees and of the grid."""
     kept: int
-    """How many of their results stood from an earlier start."""
+    """The number of results that an earlier sweep had computed."""
 
 
 def run_sweep(
@@ -73,107 +73,121 @@ def run_sweep(
 ) -> SweepResult:
     """Fit every configuration of a grid to every tree and compare them, on this machine or on a Ray cluster.
 
-    Writes ``trees/NAME/`` (the grown tree and its views, rendered once), ``runs/KEY/`` (what :func:`bbfit.run` makes of them),
-    ``results/KEY.json``, ``table.csv`` (a row a run, kept up to date), ``table.md`` and ``table.png``. A key is the hash of the resolved
-    configuration, of the views and, where it has a say, of the mesh: a killed sweep goes on where it was, and sweeps of other grids into
-    the same folder share the runs that they have in common. What fails is recorded with its reason, and the rest goes on.
+    Writes ``trees/NAME/`` (the grown tree and its views, rendered once), ``runs/KEY/`` (the outputs of :func:`bbfit.run`),
+    ``results/KEY.json``, ``table.csv`` (a row for each run, updated during the sweep), ``table.md`` and ``table.png``. A key is the hash
+    of the resolved configuration, the views and, if it places the billboards, the mesh. So a killed sweep continues where it stopped, and
+    sweeps of different grids in the same folder share their common runs. A failed run is recorded with its reason, and the others
+    continue.
 
     Parameters
     ----------
-    out : the sweep's folder, made if need be.
-    stages : how trees are grown, rendered and exported, and what of the fit the grid leaves open.
-    species, trees, views : species to grow, tree files, folders of views; with none of them, the species that the grid names.
-    on_progress : told how many trees are ready and how many runs are done.
+    out
+        The sweep's folder. It is created if it does not exist.
+    config
+        The grid, and the processes or machines.
+    stages
+        The options for growing, rendering and exporting trees, and the options of the fit that the grid does not set.
+    species, trees, views
+        Species to grow, files of trees, and folders of views. Without any of them, the species of the grid.
+    on_progress
+        Called with the number of prepared trees and the number of finished runs.
 
     Raises
     ------
     InputError, OSError
-        if the grid is bad, an input does not exist, or the folder cannot be written to. Results so far are kept.
+        If the grid is invalid, an input does not exist, or the folder cannot be written to. Finished results are kept.
     """
     config, stages = config or SweepConfig(), stages or RunConfig()
     if stages.budget.given:
-        fail("budget", "a sweep tries what its grid says", "leave the budget out")
+        fail("budget", "a sweep runs the configurations of its grid", "omit the budget")
     grid = Grid.load(config.grid).narrowed(config)
     cells = grid.cells(stages.fit if config.steps is None else replace(stages.fit, steps=config.steps))
-    found = sources(species if species or trees or views else grid.trees, trees, views, stages.grow.species_file)
-    sweep = _Sweep(output_folder("out", out), found, cells, config, stages)
+    all_sources = sources(species if species or trees or views else grid.trees, trees, views, stages.grow.species_file)
+    sweep = _Sweep(output_folder("out", out), all_sources, cells, config, stages)
     workers: Workers = LocalWorkers(config.workers, config.retries) if config.ray is None else RayWorkers(config)
     with workers:
-        sweep.carry_out(workers, on_progress or silent)
+        sweep.run(workers, on_progress or silent)
     return sweep.result()
 
 
 def sources(
     species: Sequence[str], trees: Sequence[str | Path], views: Sequence[str | Path], species_file: Path | None = None
 ) -> list[Source]:
-    """The trees of a sweep, each with a name of its own: the species, of one's own file if there is one, or that of the file or folder.
+    """The trees of a sweep with unique names: that of the species, the file or the folder, with the parent folder's if they coincide.
+
+    Parameters
+    ----------
+    species, trees, views
+        Species to grow, files of trees, and folders of views.
+    species_file
+        A file with more species.
 
     Raises
     ------
     MissingFileError, InputError
-        if there are none, one does not exist, or two have the same name.
+        If there are no trees, one does not exist, or two have the same name.
     """
-    found = [Source(load_species(name, species_file).name, species=name) for name in species]
-    given = [(path, Source(path.stem, tree=check_file("tree", path))) for path in map(Path, trees)]
+    result = [Source(load_species(name, species_file).name, species=name) for name in species]
+    on_disk = [(path, Source(path.stem, tree=check_file("tree", path))) for path in map(Path, trees)]
     for folder in views:
         path = check_folder("views", folder).resolve()
-        path = path.parent if path.name == "views" else path  # as runs call the folder beside their tree
-        given.append((path, Source(path.name, views=Path(folder))))
-    names = [source.name for source in found] + [source.name for _, source in given]
-    for path, source in given:  # libraries often have a folder for each tree, and the same file name in all
-        found.append(source if names.count(source.name) == 1 else replace(source, name=f"{path.resolve().parent.name}_{source.name}"))
-    if not found:
+        path = path.parent if path.name == "views" else path  # a run calls its folder of views so
+        on_disk.append((path, Source(path.name, views=Path(folder))))
+    names = [source.name for source in result] + [source.name for _, source in on_disk]
+    for path, source in on_disk:  # tree libraries often have a folder for each tree, with the same file name in all folders
+        result.append(source if names.count(source.name) == 1 else replace(source, name=f"{path.resolve().parent.name}_{source.name}"))
+    if not result:
         fail("sweep", "there are no trees", "give species, trees or views")
-    for source in found:
-        if sum(other.name == source.name for other in found) > 1:
-            fail("sweep", f"two trees are called {source.name}", "rename one, or leave one out")
-    return found
+    for source in result:
+        if sum(other.name == source.name for other in result) > 1:
+            fail("sweep", f"two trees are called {source.name}", "rename one, or omit one")
+    return result
 
 
 @dataclass(frozen=True)
-class _Job:
-    """Something that is being made."""
+class _PendingResult:
+    """The key and the description of a result that a task computes."""
 
     key: str
     request: dict[str, Any]
 
 
 @dataclass(frozen=True)
-class _Tree:
-    """A tree that can be fitted to."""
+class _PreparedTree:
+    """A tree whose views are rendered."""
 
     views: ViewDataset
     mesh: TreeFile | None
 
 
 class _Sweep:
-    def __init__(self, folder: Path, found: list[Source], cells: list[Cell], config: SweepConfig, stages: RunConfig) -> None:
-        self._folder, self._sources, self._cells, self._config, self._stages = folder, found, cells, config, stages
+    def __init__(self, folder: Path, sources: list[Source], cells: list[Cell], config: SweepConfig, stages: RunConfig) -> None:
+        self._folder, self._sources, self._cells, self._config, self._stages = folder, sources, cells, config, stages
         self._results = Results(folder / "results")
-        self._jobs = dict[str, _Job]()  # by the name of the task
-        self._wanted_by = defaultdict[str, list[tuple[Source, int]]](list)  # by key: the trees and cells that wait for a run
-        self._outcomes = dict[tuple[Source, int], tuple[str | None, Outcome]]()  # key and what came of it
+        self._pending = dict[str, _PendingResult]()  # by the name of the task
+        self._waiting = defaultdict[str, list[tuple[Source, int]]](list)  # by key: the trees and cells that wait for a run
+        self._outcomes = dict[tuple[Source, int], tuple[str | None, Outcome]]()  # key and outcome
         self._ready = self._kept = 0
         self._written = -math.inf
 
-    def carry_out(self, workers: Workers, on_progress: OnProgress) -> None:
-        """Prepare all trees and make all runs that no result stands for."""
+    def run(self, workers: Workers, on_progress: OnProgress) -> None:
+        """Prepare all trees, and run all configurations that have no result."""
         preparing = {f"views of {source.name}": source for source in self._sources}
         for name, source in preparing.items():
             self._prepare(name, source, workers)
         self._report(on_progress)
-        while self._jobs:
+        while self._pending:
             task, outcome = workers.next()
-            job = self._jobs.pop(task.name)
-            self._results.put(job.key, outcome, job.request)
+            pending = self._pending.pop(task.name)
+            self._results.put(pending.key, outcome, pending.request)
             if task.name in preparing:
-                self._prepared(preparing[task.name], outcome, workers)
-            for source, cell in self._wanted_by.pop(job.key, ()):
-                self._outcomes[source, cell] = job.key, outcome
+                self._submit_runs(preparing[task.name], outcome, workers)
+            for source, cell in self._waiting.pop(pending.key, ()):
+                self._outcomes[source, cell] = pending.key, outcome
             self._report(on_progress, outcome.reason or "")
 
     def result(self) -> SweepResult:
-        """The rows, and the tables of them on disk."""
+        """Write the tables and return the rows."""
         rows = self._rows()
         write_bytes(self._folder / "table.csv", table_csv(rows))
         write_bytes(self._folder / "table.md", table_markdown(rows).encode())
@@ -183,34 +197,34 @@ class _Sweep:
     def _report(self, on_progress: OnProgress, note: str = "") -> None:
         on_progress("trees", self._ready, len(self._sources))
         on_progress("runs", len(self._outcomes), len(self._sources) * len(self._cells), note)
-        if time.monotonic() - self._written >= _EVERY:
+        if time.monotonic() - self._written >= _TABLE_INTERVAL:
             write_bytes(self._folder / "table.csv", table_csv(self._rows()))
             self._written = time.monotonic()
 
     def _prepare(self, name: str, source: Source, workers: Workers) -> None:
-        """See to it that a tree's views are rendered."""
+        """Submit a task that renders the views of a tree, unless they exist."""
         if source.views is not None:
-            self._prepared(source, Outcome({}, None, ""), workers)
+            self._submit_runs(source, Outcome({}, None, ""), workers)
             return
         grow, views = self._stages.grow, self._stages.views
         try:
             tree = None if source.tree is None else TreeFile.open(source.tree)
         except InputError as error:
-            self._prepared(source, Outcome(None, str(error), ""), workers)
+            self._submit_runs(source, Outcome(None, str(error), ""), workers)
             return
-        made_of = tree.digest if tree else cache_key("grow", load_species(source.species, grow.species_file), grow)
-        key = cache_key("views", made_of, views)[:_DIGITS]
+        tree_key = tree.digest if tree else cache_key("grow", load_species(source.species, grow.species_file), grow)
+        key = cache_key("views", tree_key, views)[:_DIGITS]
         earlier = self._results.get(key)
         if earlier and self._is_final(earlier) and (earlier.reason or (self._folder_of(source) / "views" / TEST_FILE).is_file()):
-            self._prepared(source, earlier, workers)
+            self._submit_runs(source, earlier, workers)
             return
-        self._jobs[name] = _Job(key, identity({"tree": source.species or str(source.tree), "views": views}))
-        named = {"tree": tree and tree.files, "species_file": source.species and grow.species_file, "hdri": views.hdri}
-        inputs = {what: paths if isinstance(paths, tuple) else (paths,) for what, paths in named.items() if paths}
+        self._pending[name] = _PendingResult(key, identity({"tree": source.species or str(source.tree), "views": views}))
+        files = {"tree": tree and tree.files, "species_file": source.species and grow.species_file, "hdri": views.hdri}
+        inputs = {kind: paths if isinstance(paths, tuple) else (paths,) for kind, paths in files.items() if paths}
         workers.submit(Task(name, prepare_tree, inputs, self._folder_of(source), (self._stages, source.species), alone=True))
 
-    def _prepared(self, source: Source, outcome: Outcome, workers: Workers) -> None:
-        """Hand in the runs of a tree whose views are there, or note that they are not."""
+    def _submit_runs(self, source: Source, outcome: Outcome, workers: Workers) -> None:
+        """Submit the runs of a tree after its preparation, or record why it failed."""
         self._ready += 1
         folder = source.views or self._folder_of(source) / "views"
         reason = outcome.reason
@@ -226,12 +240,12 @@ class _Sweep:
             self._outcomes |= {(source, cell): (None, failed) for cell in range(len(self._cells))}
             return
         mesh = self._folder_of(source) / "tree.glb" if source.species else source.tree
-        tree = _Tree(views, TreeFile.open(mesh) if mesh and (outcome.facts or {}).get("mesh") else None)
+        tree = _PreparedTree(views, TreeFile.open(mesh) if mesh and (outcome.facts or {}).get("mesh") else None)
         for number in range(len(self._cells)):
-            self._run(source, number, tree, workers)
+            self._submit_run(source, number, tree, workers)
 
-    def _run(self, source: Source, number: int, tree: _Tree, workers: Workers) -> None:
-        """See to it that a run is made, unless its result stands or it is being made already."""
+    def _submit_run(self, source: Source, number: int, tree: _PreparedTree, workers: Workers) -> None:
+        """Submit the run of a cell, unless its result exists or the same run is already submitted."""
         fit, export = self._cells[number].config, self._stages.export
         versions = {name: VERSIONS[name] for name in ("export", "evaluate")}
         request = {"fit": fit_inputs(tree.views, fit, tree.mesh), "export": export, "views": tree.views.fingerprint, "versions": versions}
@@ -241,11 +255,11 @@ class _Sweep:
             self._outcomes[source, number] = key, earlier
             self._kept += 1
             return
-        self._wanted_by[key].append((source, number))
-        if len(self._wanted_by[key]) > 1:
+        self._waiting[key].append((source, number))
+        if len(self._waiting[key]) > 1:
             return
         inputs = {"views": (tree.views.folder,)} | ({"tree": tree.mesh.files} if fit.placement == "clusters" and tree.mesh else {})
-        self._jobs[key] = _Job(key, identity(request))
+        self._pending[key] = _PendingResult(key, identity(request))
         workers.submit(Task(key, fit_tree, inputs, self._folder / "runs" / key, (RunConfig(fit=fit, export=export),)))
 
     def _is_final(self, outcome: Outcome) -> bool:
@@ -267,6 +281,6 @@ class _Sweep:
             )
             for source in self._sources
             for number, cell in enumerate(self._cells)
-            if (known := self._outcomes.get((source, number)))
-            for key, outcome in [known]
+            if (entry := self._outcomes.get((source, number)))
+            for key, outcome in [entry]
         ]

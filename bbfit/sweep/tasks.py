@@ -1,7 +1,6 @@
-"""The two kinds of work that a sweep consists of, as functions that any process on any machine can carry out.
+"""The two kinds of tasks of a sweep, as functions that any process on any machine can run.
 
-A task reads files, writes into one folder, and returns a few facts that JSON can hold. Whoever carries it out sees to it that the files are
-there and what becomes of the folder.
+A task reads files, writes to one folder, and returns a few values as JSON. The workers provide the input files and keep the folder.
 """
 
 from __future__ import annotations
@@ -17,52 +16,52 @@ from bbfit.checks import InputError
 from bbfit.pipeline import RunConfig
 
 Facts = dict[str, Any]
-"""What a task returns, as JSON holds it."""
+"""The result of a task as JSON."""
 
 
 class Work(Protocol):
-    """What a task does."""
+    """The function of a task."""
 
     def __call__(self, inputs: Mapping[str, Path], folder: Path, *arguments: Any) -> Facts:
-        """Read ``inputs``, files or folders, which may lie elsewhere than the task says, and write into ``folder``."""
+        """Read ``inputs``, which are files or folders (perhaps copies on another machine), and write to ``folder``."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A piece of work with all that it needs."""
+    """A function with its inputs, arguments and output folder."""
 
     name: str
-    """Tells it from all others."""
+    """A unique name."""
     work: Work
-    """A function of a module, so that other processes find it."""
+    """A module-level function, so that other processes can import it."""
     inputs: Mapping[str, tuple[Path, ...]]
-    """What it reads: a folder, or files of which the first is named to it and the others lie in the same folder or below."""
+    """Each input is a folder or a tuple of files. The function gets the path of the first file. The others lie in its folder or below."""
     folder: Path
-    """Where it writes; what is there from an earlier start may be gone on with."""
+    """The output folder. It can contain partial results of an earlier attempt, which the function may use."""
     arguments: tuple[Any, ...] = ()
-    """What else the function takes."""
+    """Further arguments of the function."""
     alone: bool = False
-    """Whether it uses all cores of a machine by itself."""
+    """Whether the task uses all cores of a machine."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a task ended."""
+    """The result of a task, or the reason for its failure."""
 
     facts: Facts | None
-    """What it returned, ``None`` if it failed."""
+    """The values that the function returned. ``None`` if it failed."""
     reason: str | None
-    """Why it failed."""
+    """The reason for the failure."""
     where: str
-    """Machine, or Ray's node, that it ran on."""
+    """The machine or the Ray node that ran the task."""
     seconds: float = 0.0
-    """That it took."""
+    """The duration in seconds."""
     trace: str | None = None
-    """Where in the program, if the failure is a fault of it."""
+    """The traceback, if the failure is an error in the program."""
 
 
 class Workers(Protocol):
-    """Processes, here or elsewhere, that carry out tasks. A context manager: leaving it ends them."""
+    """Processes that run tasks, on this machine or others. This is a context manager: leaving it ends the processes."""
 
     def __enter__(self) -> Workers:
         """Start."""
@@ -71,21 +70,21 @@ class Workers(Protocol):
         """End all processes."""
 
     def submit(self, task: Task) -> None:
-        """Carry a task out as soon as there is room."""
+        """Run a task as soon as a process is free."""
 
     def next(self) -> tuple[Task, Outcome]:
-        """Wait for a task to end; there must be one."""
+        """Wait until a task ends. At least one submitted task must be unfinished."""
 
 
 def prepare_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig, species: str | None) -> Facts:
-    """Grow a tree, or take the file ``tree``, and render its views into ``folder``.
+    """Grow a tree, or take the input ``tree``, and render its views into ``folder``.
 
-    ``species_file`` and ``hdri`` are inputs too if the stages name any.
+    The inputs also contain ``species_file`` and ``hdri``, if the options of the stages name such files.
 
     Raises
     ------
     InputError, OSError
-        if that cannot be done.
+        If the tree or an option cannot be used, or a file cannot be written.
     """
     from bbfit.pipeline import prepare
 
@@ -97,12 +96,12 @@ def prepare_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig, sp
 
 
 def fit_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig) -> Facts:
-    """Everything from the fit on: billboards for the folder ``views``, placed by the mesh ``tree`` if there is one.
+    """Run the fit and all later stages for the input ``views``. The input ``tree``, if there is one, is the mesh that places billboards.
 
     Raises
     ------
     InputError, OSError
-        if that cannot be done.
+        If the views, the mesh or an option cannot be used, or a file cannot be written.
     """
     from bbfit.pipeline import run
 
@@ -113,13 +112,13 @@ def fit_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig) -> Fac
 
 
 def attempt(work: Callable[[], Facts], where: str) -> Outcome:
-    """What came of some work. Whatever goes wrong in it is this task's failure: it is recorded, and the other tasks go on."""
-    begun = time.perf_counter()
+    """Run a function and record its result. Any error becomes the failure of this task, and the other tasks continue."""
+    started = time.perf_counter()
     facts, reason, trace = None, None, None
     try:
         facts = work()
     except (InputError, OSError) as error:
         reason = " ".join(str(error).split())
-    except Exception as error:  # a fault of ours, or too little memory
+    except Exception as error:  # an error in the program, or too little memory
         reason, trace = " ".join(f"{type(error).__name__}: {error}".split()), traceback.format_exc()
-    return Outcome(facts, reason, where, round(time.perf_counter() - begun, 3), trace)
+    return Outcome(facts, reason, where, round(time.perf_counter() - started, 3), trace)

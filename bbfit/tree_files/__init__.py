@@ -1,1 +1,1 @@
-"""Files of trees: which formats there are, which files belong to a tree, and what can be read without Blender."""
+"""Files of trees: the formats, the files that belong to a tree, and its triangles without Blender."""

@@ -1,4 +1,4 @@
-"""The files and vertex positions of a glTF, checked before any program loads it."""
+"""The files and vertex positions of a glTF, for checks before a program loads it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FLOAT = 5126
 def read_gltf(path: Path) -> tuple[list[Path], list[NDArray[np.float32]]]:
     """The files that a .gltf or .glb refers to, and the vertex positions of its primitives, [P, 3] each.
 
-    Positions that are packed, sparse or damaged are left out: the program that loads the file decides on those.
+    Packed, sparse and damaged positions are omitted. The program that loads the file checks those.
 
     Raises
     ------
@@ -51,8 +51,8 @@ def read_gltf(path: Path) -> tuple[list[Path], list[NDArray[np.float32]]]:
 
 
 def _entries(content: dict[str, Any], kind: str) -> list[dict[str, Any]]:
-    found = content.get(kind, [])
-    return [entry for entry in found if isinstance(entry, dict)] if isinstance(found, list) else []
+    entries = content.get(kind, [])
+    return [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
 
 
 def _inside_folder(path: Path, uri: str) -> Path:
@@ -72,11 +72,11 @@ def _decode_data_uri(path: Path, uri: str) -> bytes:
     try:
         return base64.b64decode(uri.partition(",")[2])
     except (binascii.Error, ValueError) as error:
-        fail("tree", f"{path} holds a damaged data URI ({error})", "export the tree again")
+        fail("tree", f"{path} contains a damaged data URI ({error})", "export the tree again")
 
 
 def _positions(content: dict[str, Any], primitive: dict[str, Any], buffers: list[bytes]) -> NDArray[np.float32] | None:
-    """POSITION of a primitive, [P, 3]; ``None`` where it is packed, sparse or damaged."""
+    """The POSITION attribute of a primitive, [P, 3]. ``None`` if it is packed, sparse or damaged."""
     try:
         accessor = content["accessors"][primitive["attributes"]["POSITION"]]
         view = content["bufferViews"][accessor["bufferView"]]

@@ -11,9 +11,10 @@ _MAP = re.compile(rb"^\s*(?:map_\w+|bump|disp|decal|norm|refl)\s+(.+?)\s*$", re.
 
 
 def obj_files(path: Path) -> list[Path]:
-    """The material libraries of an OBJ and the textures of those, as far as they exist, in the order in which they are named.
+    """The material libraries of an OBJ and their textures, in the order of their names in the files. Missing files are omitted.
 
-    Programs differ in how they read names with spaces and the options before a texture's name. Each file that any reading gives counts.
+    Programs differ in how they parse names with spaces and the options before a texture's name. This function returns every file that
+    some parser would open: the rest of the line, the rest of the line after any word, and each single word.
     """
     files = list[Path]()
     for library in _existing(path.parent, _LIBRARY.findall(path.read_bytes())):
@@ -25,7 +26,5 @@ def _existing(folder: Path, names: list[bytes]) -> Iterator[Path]:
     for name in names:
         text = name.decode(errors="replace").replace("\\", "/")
         words = text.split()
-        for start in range(len(words)):
-            if "\0" not in text and (file := folder / (" ".join(words[start:]) if start else text)).is_file():
-                yield file
-                break
+        readings = [text, *(" ".join(words[start:]) for start in range(1, len(words))), *words]
+        yield from (folder / reading for reading in readings if "\0" not in reading and (folder / reading).is_file())

@@ -12,11 +12,11 @@ _TYPES = {
 
 
 def ply_positions(data: bytes) -> NDArray[np.floating] | None:
-    """The vertex positions of a PLY from its bytes, [P, 3]; ``None`` where the header or the data are unusual or damaged."""
-    header, found, body = data.partition(b"end_header")
+    """The vertex positions of a PLY from its bytes, [P, 3]. ``None`` if the header or the data are damaged or not supported."""
+    header, end, body = data.partition(b"end_header")
     lines = [line.split() for line in header.decode("latin-1").splitlines() if line.strip()]
     elements = [i for i, line in enumerate(lines) if line[0] == "element"]
-    if not found or not elements or lines[elements[0]][1:2] != ["vertex"] or len(lines[elements[0]]) != 3:
+    if not end or not elements or lines[elements[0]][1:2] != ["vertex"] or len(lines[elements[0]]) != 3:
         return None
     count = lines[elements[0]][2]
     last = elements[1] if len(elements) > 1 else len(lines)

@@ -1,4 +1,4 @@
-"""A tree as a value: all of its files, one digest over them, and its triangles on demand."""
+"""A tree on disk as a value: all of its files, one digest over them, and its triangles on demand."""
 
 from __future__ import annotations
 
@@ -23,38 +23,39 @@ UP_AXES: dict[str, UpAxis] = {
     **dict.fromkeys((".glb", ".gltf", ".obj", ".fbx", ".usd", ".usda", ".usdc", ".usdz"), "y"),
     **dict.fromkeys((".ply", ".stl", ".blend"), "z"),
 }
-"""The formats of trees, and the axis that points up in each. An FBX or a USD can declare another axis, and its importer obeys."""
+"""The formats of trees, and the axis that points up in each. An FBX or a USD file can declare another axis, which its importer uses."""
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 """The formats whose triangles can be read without Blender."""
 
 
 @dataclass(frozen=True)
 class TreeFile:
-    """A tree on disk, opened and checked once by :meth:`open`. Two trees with the same digest have the same contents."""
+    """A tree on disk, opened and checked once by :meth:`open`. Trees with the same digest have the same contents."""
 
     files: tuple[Path, ...]
-    """All files that belong to the tree: the named file first, then those that it refers to (glTF, OBJ)."""
+    """All files of the tree: the main file first, then the files that it refers to (glTF, OBJ)."""
     digest: str
     """SHA-256 over the contents of all files (:func:`bbfit.provenance.digest_files`)."""
     bytes: int
-    """Size of all files."""
+    """Total size of the files."""
 
     @staticmethod
     def open(tree: str | Path | TreeFile) -> TreeFile:
-        """Find the files of a tree, refuse what is known to be unusable, and compute the digest. No geometry is loaded.
+        """Find the files of a tree, check them, and compute the digest. This loads no geometry.
 
         Parameters
         ----------
         tree
-            The path of a .glb, .gltf, .obj, .fbx, .usd, .usda, .usdc, .usdz, .ply, .stl or .blend file. A ``TreeFile`` is returned as it
-            is.
+            The path of a .glb, .gltf, .obj, .fbx, .usd, .usda, .usdc, .usdz, .ply, .stl or .blend file. A ``TreeFile`` is returned
+            unchanged.
 
         Raises
         ------
-        MissingFileError, InputError
-            If the file, or one that a glTF refers to, is missing. If the file is empty, of an unknown format, or a damaged glTF. If a
-            glTF refers to a file outside its folder. If a glTF or PLY has vertices that are NaN or infinite, which Blender's importers
-            of these two silently replace by 0.
+        MissingFileError
+            If the file is missing, or a file that a glTF refers to.
+        InputError
+            If the file is empty, of an unknown format, or a damaged glTF. If a glTF refers to a file outside its folder. If a glTF or PLY
+            has vertices that are NaN or infinite. Blender's importers of these two formats would silently replace them by 0.
         """
         if isinstance(tree, TreeFile):
             return tree
@@ -76,17 +77,17 @@ class TreeFile:
 
     @property
     def path(self) -> Path:
-        """The named file."""
+        """The main file."""
         return self.files[0]
 
     @property
     def suffix(self) -> str:
-        """The ending of the named file, in lower case."""
+        """The suffix of the main file in lower case, such as ``.glb``."""
         return self.path.suffix.lower()
 
     @property
     def up_axis(self) -> UpAxis:
-        """The axis of the file that points up."""
+        """The axis that points up in the file."""
         return UP_AXES[self.suffix]
 
     @property
@@ -96,16 +97,16 @@ class TreeFile:
 
     @cached_property
     def vertices(self) -> int:
-        """Vertices of the mesh, as :meth:`mesh` has them."""
+        """The number of vertices of :meth:`mesh`, whose errors are raised."""
         return len(self.mesh().vertices)
 
     def scene(self) -> trimesh.Scene:
-        """The meshes of the tree with their materials, in the axes and the order of the file, nothing merged.
+        """The meshes of the tree with their materials, in the axes and the order of the file. Vertices are not merged.
 
         Raises
         ------
         InputError
-            If only Blender can read the file, or it cannot be read or has no triangles.
+            If only Blender can read the format, if the file cannot be read, or if it has no triangles.
         """
         import trimesh
 
@@ -122,5 +123,5 @@ class TreeFile:
         return scene
 
     def mesh(self) -> trimesh.Trimesh:
-        """All triangles of the tree as one mesh, placed as in the file. Raises the errors of :meth:`scene`."""
+        """All triangles of the tree as one mesh in the axes of the file. Raises the errors of :meth:`scene`."""
         return self.scene().to_mesh()

@@ -1,4 +1,4 @@
-"""How a tree is grown: which of its kind, how finely."""
+"""Options of growing a tree: the seed and the level of detail."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from bbfit.checks import check_count, check_range
 from bbfit.provenance import EXECUTION
 
 VERTEX_LIMIT = 20_000_000
-"""Most vertices that a tree may have unless asked otherwise; a willow has half as many."""
+"""Default limit on a tree's vertices; a willow has half as many."""
 
 
 @dataclass(frozen=True)
 class GrowConfig:
-    """How a tree is grown."""
+    """Options of growing a tree."""
 
     seed: int = 0
     """Another seed gives another tree of the same species."""
     detail: float = 1.0
-    """How fine the bark is, in [0.1, 10]: factor on the rings along stems and on each ring's corners; vertices go by its square."""
+    """Factor on the rings along stems and on the corners of each ring, in [0.1, 10]. The number of bark vertices grows with its square."""
     leaves: float = 1.0
-    """Share of the leaves that grow, in [0, 1]; fewer are larger, so that their area stays."""
+    """Share of the leaves that grow, in [0, 1]. The remaining leaves are enlarged to keep the total area."""
     max_vertices: int = field(default=VERTEX_LIMIT, metadata=EXECUTION)
-    """Refuse to grow a tree of more vertices than this."""
+    """Largest number of vertices; a larger tree is refused."""
     species_file: Path | None = field(default=None, metadata=EXECUTION)
-    """Species of your own, laid out like those that come with bbfit (`bbfit grow --list` says where they are)."""
+    """Your own species, in the format of the packaged ones (`bbfit grow --list` prints their path)."""
 
     def __post_init__(self) -> None:
         check_count("seed", self.seed, 0)

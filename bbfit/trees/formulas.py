@@ -1,4 +1,4 @@
-"""Formulas of Weber and Penn 1995 that give a number for a place on a tree; sections are the paper's."""
+"""Formulas of Weber and Penn 1995 for lengths, radii and the pruning envelope; section numbers are the paper's."""
 
 from __future__ import annotations
 

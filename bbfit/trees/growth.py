@@ -8,7 +8,7 @@ from bbfit.checks import InputTypeError, fail
 from bbfit.trees.config import VERTEX_LIMIT, GrowConfig
 from bbfit.trees.mesh import count_vertices, leaf_vertices, stem_vertices, tree_parts
 from bbfit.trees.species import Species, load_species
-from bbfit.trees.tree_file import scene_of
+from bbfit.trees.tree_writer import scene_of
 from bbfit.trees.weber_penn import grow_skeleton
 
 if TYPE_CHECKING:
@@ -23,25 +23,31 @@ def grow(
     leaves: float = 1.0,
     max_vertices: int = VERTEX_LIMIT,
 ) -> trimesh.Scene:
-    """Grow a tree after Weber and Penn 1995 (:mod:`bbfit.trees.weber_penn`); the same arguments give the same tree.
+    """Grow a tree after Weber and Penn 1995 (``weber_penn``); the same arguments give the same tree.
 
     Parameters
     ----------
-    species : one of :func:`~bbfit.trees.species.known_species`, or figures from :func:`~bbfit.trees.species.load_species`.
-    seed : at least 0; another seed, another tree of the kind.
-    detail : factor on the rings along stems and on the corners of each ring, in [0.1, 10]; it changes neither the stems nor the leaves.
-    leaves : share of the leaves that grow, in [0, 1]; those are larger, so that the area of all stays.
-    max_vertices : most vertices that the tree may have.
+    species
+        A name from ``known_species``, or the result of ``load_species``.
+    seed
+        At least 0; another seed gives another tree of the same species.
+    detail
+        Factor on the rings along stems and on the corners of each ring, in [0.1, 10]; it changes neither the stems nor the leaves.
+    leaves
+        Share of the leaves that grow, in [0, 1]; they are enlarged to keep the total area.
+    max_vertices
+        Largest number of vertices.
 
     Returns
     -------
-    A mesh for the bark and one for each leaf tone; Y up, meters, the foot of the trunk at the origin, unit normals, texture coordinates,
-    plain materials of which the leaves' are double-sided.
+    trimesh.Scene
+        One mesh for the bark and one for each leaf tone, with unit normals, texture coordinates and plain materials. Y is up, lengths are
+        in meters, and the foot of the trunk is at the origin. Leaf materials are double-sided.
 
     Raises
     ------
     InputError
-        for an unknown species, a value out of range, or a tree of too many vertices.
+        For an unknown species, a value out of range, or a tree of too many vertices.
     """
     config = GrowConfig(seed=seed, detail=detail, leaves=leaves, max_vertices=max_vertices)
     figures = load_species(species) if isinstance(species, str) else species
@@ -50,7 +56,7 @@ def grow(
 
     def count(level: int, number: int) -> None:
         if level < figures.levels:
-            # Clones have fewer, and some stems are cut: a first look that keeps memory within bounds, not the count.
+            # A rough bound that limits memory: clones have fewer vertices, and some stems are pruned.
             vertices, limit = stem_vertices(level, figures.curve_res[level], number, detail), 2 * max_vertices
         else:
             vertices, limit = leaf_vertices(figures, number), max_vertices

@@ -18,22 +18,22 @@ _RINGS = (8, 4, 3, 3)
 _SIDES = (24, 12, 8, 5)
 # Rings of the trunk lie closer where it flares: their shares of its length go by this power.
 _TRUNK_SPACING = 1.5
-# Radii do not fall below this share of the tree's scale, so that no triangle of a fine twig vanishes in single precision.
+# Lower bound on radii as a share of the tree's scale: triangles of fine twigs must not vanish in single precision.
 _LEAST_RADIUS = 2e-5
 
 
 @dataclass(frozen=True)
 class _Lines:
-    """The polylines that the tubes of one level follow: what children sit on."""
+    """The polylines along which the tubes of one level run, and on which their children begin."""
 
     points: Array
-    """All of them one after the other, [P, 3]."""
+    """Points of all polylines, concatenated, [P, 3]."""
     begin: Indices
-    """First point of each stem's, [S]."""
+    """Index of each polyline's first point, [S]."""
     pieces: Indices
-    """Its pieces, [S]; it has a point more."""
+    """Segments of each polyline, [S]; it has one point more."""
     low: Array
-    """Share of the stem's length that it begins at, [S]."""
+    """Share of the stem's length at which the polyline begins, [S]."""
     spacing: Array
     """Power by which shares grow along it, [S]."""
 
@@ -48,7 +48,7 @@ class _Lines:
 
 
 def count_vertices(skeleton: Skeleton, detail: float) -> int:
-    """Vertices of the mesh that :func:`tree_parts` makes."""
+    """Number of vertices that ``tree_parts`` returns."""
     total = leaf_vertices(skeleton.species, len(skeleton.leaves.parent))
     for stems in skeleton.levels:
         for node, alike in enumerate(np.bincount(stems.first).tolist()):
@@ -57,12 +57,12 @@ def count_vertices(skeleton: Skeleton, detail: float) -> int:
 
 
 def stem_vertices(level: int, segments: int, stems: int, detail: float) -> int:
-    """Vertices of so many stems of a level, each of so many segments."""
+    """Vertices of ``stems`` stems of a level with ``segments`` segments each."""
     return stems * (_pieces(level, segments, detail) * (_sides(level, detail) + 1) + 1)
 
 
 def leaf_vertices(species: Species, leaves: int) -> int:
-    """Vertices of so many leaves."""
+    """Vertices of ``leaves`` leaves."""
     return leaves * len(leaf_shape(species.leaf_shape).points)
 
 
@@ -71,8 +71,10 @@ def tree_parts(skeleton: Skeleton, seed: int, *, detail: float) -> list[Part]:
 
     Parameters
     ----------
-    seed : of the tones.
-    detail : factor on the rings of a stem and the corners of a ring, more than 0.
+    seed
+        For the leaf tones.
+    detail
+        Factor on the rings of a stem and the corners of a ring, more than 0.
     """
     lines: list[_Lines] = []
     bark = _Bark()
@@ -83,7 +85,7 @@ def tree_parts(skeleton: Skeleton, seed: int, *, detail: float) -> list[Part]:
 
 
 def y_up(vectors: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Vectors [..., 3] of a z-up world in one that is Y up, as glTF's: (x, y, z) becomes (x, z, -y)."""
+    """Convert vectors [..., 3] from Z up to Y up, as in glTF: (x, y, z) becomes (x, z, -y)."""
     return np.stack([vectors[..., 0], vectors[..., 2], -vectors[..., 1]], -1).astype(np.float32) + np.float32(0)
 
 
@@ -96,7 +98,7 @@ def _sides(level: int, detail: float) -> int:
 
 
 class _Bark:
-    """Tubes as they pile up."""
+    """Collects the tubes of all levels."""
 
     def __init__(self) -> None:
         self.vertices: list[NDArray[np.float32]] = []
@@ -106,7 +108,7 @@ class _Bark:
         self.count = 0
 
     def add(self, vertices: Array, normals: Array, uvs: Array, faces: Indices) -> None:
-        """S alike meshes: [S, n, 3], [S, n, 3], [S, n, 2], and [m, 3] for every one."""
+        """Add S meshes of the same topology: [S, n, 3], [S, n, 3], [S, n, 2], and shared faces [m, 3]."""
         begin = self.count + vertices.shape[1] * np.arange(len(vertices))
         self.vertices.append(y_up(vertices).reshape(-1, 3))
         self.normals.append(y_up(normals).reshape(-1, 3))
@@ -115,13 +117,13 @@ class _Bark:
         self.count += vertices.shape[0] * vertices.shape[1]
 
     def part(self, material: Material) -> Part:
-        """All of it."""
+        """All tubes as one part."""
         arrays = np.concatenate(self.vertices), np.concatenate(self.normals), np.concatenate(self.uvs), np.concatenate(self.faces)
         return Part(material, *arrays)
 
 
 def _add_tubes(bark: _Bark, skeleton: Skeleton, stems: Stems, lines: list[_Lines], detail: float) -> _Lines:
-    """Draw one level's stems, each beginning on the polyline of the one it grows from; returns their polylines."""
+    """Add the tubes of one level, each beginning on its parent's polyline; return their polylines."""
     level, first = stems.level, stems.first
     pieces = np.array([_pieces(level, stems.resolution - node, detail) for node in range(stems.resolution)], np.int64)[first]
     begin = np.cumsum(pieces + 1) - (pieces + 1)
@@ -166,7 +168,7 @@ def _tubes(
     axes = frames[..., 2]
     right = np.empty_like(axes)
     right[:, 0] = frames[:, 0, :, 0]
-    for ring in range(1, len(shares)):  # carried along, so that the tube does not twist
+    for ring in range(1, len(shares)):  # parallel transport, so that the tube does not twist
         right[:, ring] = unit(right[:, ring - 1] - axes[:, ring] * dot(axes[:, ring], right[:, ring - 1]))
     up = cross(axes, right)
 
@@ -178,7 +180,7 @@ def _tubes(
     wave = 1 + depth * np.sin(lobes * angles)
     vertices = points[:, rings, None] + (radius[:, rings, None] * wave)[..., None] * outwards
     if level == 0:
-        vertices[..., 2] = np.maximum(vertices[..., 2], 0)  # the foot stands on the ground, however the trunk leans
+        vertices[..., 2] = np.maximum(vertices[..., 2], 0)  # the foot stays on the ground if the trunk leans
     normals = outwards - slope[:, rings, None, None] * axes[:, rings, None]
     if lobes:
         sideways = across * up[:, rings, None] - along * right[:, rings, None]

@@ -1,4 +1,4 @@
-"""What a grown tree is made of: triangles by material, as plain arrays."""
+"""The triangles of a grown tree by material, as plain arrays."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Material:
     roughness: float
     """Roughness in [0, 1], as glTF's ``roughnessFactor``."""
     double_sided: bool
-    """Whether the back of a triangle is seen, with its normal turned over, as that of a leaf is."""
+    """Whether the back of a triangle is visible, with its normal reversed, as for leaves."""
 
 
 @dataclass(frozen=True)

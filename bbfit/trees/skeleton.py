@@ -1,7 +1,7 @@
-"""A grown tree before it has a surface: stems as curves, leaves as frames.
+"""The skeleton of a grown tree: stems as curves, leaves as frames.
 
-Here z is up and lengths are meters; an array of frames [..., 3, 3] holds local axes in its columns, the third of which runs along the stem
-or leaf. Nothing here knows of triangles: how finely stems are drawn changes nothing about the tree.
+Z is up and lengths are in meters. An array of frames [..., 3, 3] holds local axes in its columns; the third axis runs along the stem or
+leaf. The skeleton does not depend on the detail of the mesh.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Stems:
-    """All stems of one level, S of them, clones after the stems that they split from."""
+    """The S stems of one level; clones follow the stems that they split from."""
 
     level: int
-    """0 is the trunk's."""
+    """0 for the trunk."""
     nodes: Array
-    """Ends of the curve's segments, [S, nCurveRes + 1, 3]; a clone's before its first node are those of the stem it comes from."""
+    """Ends of the curve's segments, [S, nCurveRes + 1, 3]. Before its first node, a clone has those of the stem that it split from."""
     frames: Array
-    """Local axes there, [S, nCurveRes + 1, 3, 3]."""
+    """Local axes at the nodes, [S, nCurveRes + 1, 3, 3]."""
     first: Indices
-    """The node that a stem begins at, [S]; 0 but for clones."""
+    """The node at which a stem begins, [S]; 0 except for clones."""
     length: Array
     """Meters from node 0 to the tip, [S]."""
     radius: Array
     """Radius at node 0 without flare and lobes, meters, [S]."""
     parent: Indices
-    """The stem that it grows from, [S]: one of the level before, or for a clone one of its own level; -1 for the trunk."""
+    """The stem from which it grows, [S]: a stem of the previous level, or of its own level for a clone; -1 for the trunk."""
     offset: Array
-    """Where on that stem, as a share of that stem's length, [S]."""
+    """Position on that stem as a share of its length, [S]."""
     root: Indices
-    """The stem that a clone was split from in the first place, [S]; of any other, itself."""
+    """The stem from which a chain of clones split, [S]; the stem itself if it is not a clone."""
 
     def __len__(self) -> int:
         return len(self.length)
@@ -67,21 +67,21 @@ class Stems:
 
 @dataclass(frozen=True)
 class Leaves:
-    """All leaves, L of them; they sit on the stems of the last level."""
+    """The L leaves, which grow on the stems of the last level."""
 
     parent: Indices
     """The stem, [L]."""
     offset: Array
-    """Where on it, as a share of its length, [L]."""
+    """Position on the stem as a share of its length, [L]."""
     frames: Array
-    """Local axes, [L, 3, 3]: across the blade, its upper side's normal, from the stalk to the tip."""
+    """Local axes, [L, 3, 3]: across the blade, normal of the upper side, from the stalk to the tip."""
     length: float
     """From stalk to tip, meters."""
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A grown tree before it has a surface."""
+    """A grown tree without a surface."""
 
     species: Species
     scale: float

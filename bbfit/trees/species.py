@@ -1,7 +1,7 @@
-"""The figures that make a species: read from JSON, checked, and named after the keys of Weber and Penn.
+"""The parameters of a species, read from JSON and named after the parameters of Weber and Penn.
 
 Names and meanings are those of J. Weber and J. Penn, "Creation and Rendering of Realistic Trees", SIGGRAPH 1995; numbers such as 4.3
-below are the paper's sections. Terms that the paper lacks are those of the Blender add-on tree-gen (github.com/friggog/tree-gen),
+below are the paper's sections. Parameters that the paper lacks come from the Blender add-on tree-gen (github.com/friggog/tree-gen),
 described in its README.
 """
 
@@ -18,7 +18,7 @@ from bbfit.checks import InputError, InputTypeError, check_count, check_file, ch
 from bbfit.files import read_json
 
 LEVELS = 4
-"""Most levels of stems, and the length of every list of figures by level."""
+"""Largest number of levels of stems, and the length of every list by level."""
 
 PerLevel = tuple[float, float, float, float]
 PerLevelWhole = tuple[int, int, int, int]
@@ -28,15 +28,15 @@ Rgb = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Species:
-    """One species' figures. Angles are degrees; a field that ends in ``_v`` is how far the one before it varies at random, up or down.
+    """Parameters of a species. Angles are in degrees; a field that ends in ``_v`` is the greatest random deviation of the field before it.
 
-    A file's key is the field's name in capitalised words, with an ``n`` before it for figures by level (``curve_res`` is ``nCurveRes``,
-    ``leaf_scale_x`` is ``LeafScaleX``). Figures by level are for the trunk, the branches, the twigs and the stems on these.
+    A file's key is the field's name in capitalised words, with an ``n`` before it for lists by level (``curve_res`` is ``nCurveRes``,
+    ``leaf_scale_x`` is ``LeafScaleX``). Lists by level are for trunk, branches, twigs, and stems on twigs.
 
     Raises
     ------
     InputError
-        for a value out of its range, or of the wrong type; the message starts with the file's key.
+        For a value out of its range, or of the wrong type; the message starts with the file's key.
     """
 
     name: str
@@ -46,11 +46,11 @@ class Species:
     """How the branches' length changes up the tree, 0 to 8 (4.3): 0 conical, 1 spherical, 2 hemispherical, 3 cylindrical, 4 tapered
     cylindrical, 5 flame, 6 inverse conical, 7 tend flame, 8 as the pruning envelope."""
     scale: float
-    """Size of the tree in meters, in [0.1, 1000]: a trunk of length 1 is as long (4.3)."""
+    """Size of the tree in meters, in [0.1, 1000]: the length of a trunk of length 1 (4.3)."""
     scale_v: float
     """Meters, in [0, scale)."""
     levels: int
-    """Levels of stems, 1 to 4; leaves sit on the last (section 3)."""
+    """Levels of stems, 1 to 4; leaves grow on the last (section 3)."""
     ratio: float
     """The trunk's radius over its length, in (0, 1] (4.4)."""
     ratio_power: float
@@ -58,25 +58,25 @@ class Species:
     flare: float
     """How far the trunk widens at its foot, in [0, 10]: 1 doubles the radius (4.4)."""
     base_splits: int
-    """Clones into which the trunk splits at the end of its first segment, -10 to 10 (4.2); negative: a random number up to as many."""
+    """Clones into which the trunk splits at the end of its first segment, -10 to 10 (4.2); negative: random, up to the absolute value."""
     lobes: int = 0
     """Bulges around the trunk's cross-section, 0 to 100 (4.4)."""
     lobe_depth: float = 0.0
     """Height of the bulges over the trunk's radius, in [0, 1) (4.4)."""
 
     base_size: PerLevel
-    """Share of a stem, from its foot, that bears nothing, in [0, 1) (4.3; by level as in tree-gen)."""
+    """Share of a stem, from its foot, without children, in [0, 1) (4.3; by level as in tree-gen)."""
     down_angle: PerLevel
-    """Angle between a stem and its parent, in [-180, 180] (4.3). The entry after the last level's is the leaves'; so it is below."""
+    """Angle between a stem and its parent, in [-180, 180] (4.3). The entry after the last level is for leaves, also below."""
     down_angle_v: PerLevel
     """In [-180, 180]; negative: the angle changes evenly along the parent instead of at random (4.3)."""
     rotate: PerLevel
-    """Turn about the parent from one stem to the next, in [-360, 360]; below 0, they stand on its left and right in turn, that
-    far from the side to which a positive ``curve`` bends it (4.3)."""
+    """Turn about the parent from one stem to the next, in [-360, 360]; negative: they alternate between its left and right, at
+    this angle from the side to which a positive ``curve`` bends it (4.3)."""
     rotate_v: PerLevel
     """In [-360, 360]."""
     branches: PerLevelWhole
-    """Most stems of a level that one parent bears, 0 to 10000 (4.3). A tree has one trunk: the first entry is 1, or 0, and not used."""
+    """Largest number of stems of a level on one parent, 0 to 10000 (4.3). The first entry, for the trunk, must be 0 or 1."""
     length: PerLevel
     """Length over that of the parent, for the trunk over the scale, in [0, 100], above 0 in the levels that grow (4.3)."""
     length_v: PerLevel
@@ -96,16 +96,16 @@ class Species:
     curve_back: PerLevel
     """Where not 0, the turn of the stem's upper half, and ``curve`` that of the lower, in [-360, 360] (4.1)."""
     curve_v: PerLevel
-    """In [-720, 720], shared out among the segments; negative: the stem is a helix of this angle (4.1)."""
+    """In [-720, 720], divided among the segments; negative: the stem is a helix of this angle (4.1)."""
     bend_v: PerLevel
-    """Greatest random turn to the side from foot to tip, in [-360, 360], shared out among the segments (tree-gen)."""
+    """Largest random sideways turn from foot to tip, in [-360, 360], divided among the segments (tree-gen)."""
     branch_dist: PerLevel
-    """How stems stand on their parent, in [0, 20]: 0 one by one, 1 in pairs, n in whorls of n + 1 (tree-gen)."""
+    """Arrangement of stems on their parent, in [0, 20]: 0 singly, 1 in pairs, n in whorls of n + 1 (tree-gen)."""
     radius_mod: PerLevel
     """Factor on a level's radii, in (0, 100] (tree-gen)."""
 
     leaves: int
-    """Most leaves that a stem of the last level bears, -10000 to 10000; negative: as many in a fan at its tip (4.5)."""
+    """Largest number of leaves on a stem of the last level, -10000 to 10000; negative: a fan of leaves at its tip (4.5)."""
     leaf_shape: int
     """0 default, 1 ovate, 2 linear, 3 cordate, 4 maple, 5 palmate, 6 spiky oak, 7 rounded oak, 8 elliptic, 9 rectangle, 10 triangle
     (tree-gen)."""
@@ -114,11 +114,11 @@ class Species:
     leaf_scale_x: float
     """Width of a leaf over its length, in [0.05, 10] (4.5)."""
     leaf_bend: float
-    """How far leaves turn to the light, in [0, 1]: up and away from the trunk (4.9)."""
+    """How far leaves turn toward the light, in [0, 1]: up and away from the trunk (4.9)."""
 
     tropism: Vector
-    """Pull on the stems along x, y and z, each in [-20, 20], with z up in the figures; the z part acts from the third level on, and is all
-    that the paper has (4.8)."""
+    """Pull on the stems along x, y and z, each in [-20, 20], with z up in the figures; the z part acts from the third level on; the
+    paper has only this part (4.8)."""
     prune_ratio: float
     """How fully branches are cut to the envelope, in [0, 1] (4.6)."""
     prune_width: float
@@ -205,17 +205,17 @@ _MOST_COLORS = 16
 
 
 def figure_keys() -> dict[str, Field[Any]]:
-    """The keys of a species in a file, in the order of the fields, and the field of :class:`Species` that each is read into."""
-    found = {}
+    """Map each key of a species file to its field of ``Species``, in the order of the fields."""
+    keys = {}
     for field in fields(Species):
         if field.name != "name":
             words = "".join(word.capitalize() for word in field.name.split("_"))
-            found["n" * (field.type in ("PerLevel", "PerLevelWhole")) + words] = field
-    return found
+            keys["n" * (field.type in ("PerLevel", "PerLevelWhole")) + words] = field
+    return keys
 
 
 def _read(key: str, field: Field[Any], value: Any) -> Any:
-    """``value`` as the type of ``field``, every number of it within the field's bounds."""
+    """Convert ``value`` to the type of ``field``; check every number against the field's bounds."""
     if field.type in ("int", "float"):
         return _number(key, field, value)
     if field.name == "leaf_colors":
@@ -252,25 +252,25 @@ def _number(key: str, field: Field[Any], value: Any) -> float:
 
 
 def figures_file() -> Path:
-    """The file with the figures of the known species, as a start for one's own."""
+    """Path of the packaged species file, a template for your own."""
     return Path(str(files("bbfit.trees") / "species.json"))
 
 
 def known_species(path: str | Path | None = None) -> tuple[str, ...]:
-    """Names of the species in the packaged figures, or in the file ``path`` of the same layout."""
+    """Names of the species in the packaged file, or in the file ``path`` of the same format."""
     return tuple(_entries(path)[1])
 
 
 def load_species(name: str | None, path: str | Path | None = None) -> Species:
-    """Load the species ``name`` from the packaged figures, or from a file of the same layout.
+    """Load the species ``name`` from the packaged file, or from a file of the same format.
 
-    ``name`` may be ``None`` where the file holds one species only.
+    ``name`` may be ``None`` if the file holds a single species.
 
     Raises
     ------
     InputError
-        for an unknown name; for a file that is missing, empty, not JSON or of another layout; and for missing, unknown or unusable
-        figures, which it names.
+        If the name is unknown; if the file is missing, empty, not JSON or of another format; if parameters are missing, unknown or invalid,
+        which the message names.
     """
     if name is not None and not isinstance(name, str):
         raise InputTypeError(f"species: expected a name, got {name!r}")
@@ -288,7 +288,7 @@ def load_species(name: str | None, path: str | Path | None = None) -> Species:
 
 
 def _entries(path: str | Path | None) -> tuple[Path, dict[str, dict[str, Any]]]:
-    """The file's place and its species as they stand in it."""
+    """Path of the file, and its species before they are checked."""
     path = check_file("species_file", figures_file() if path is None else path)
     content = read_json("species_file", path)
     layout = 'expected {"name": {"Shape": 7, ...}, ...}'
@@ -309,14 +309,14 @@ def _species(name: str, entry: dict[str, Any]) -> Species:
     suggestions = {key: _suggestion(key, expected) for key in figures if key not in expected}
     unknown = [f"{key} ({suggestion})" if suggestion else key for key, suggestion in suggestions.items()]
     missing = [key for key, field in expected.items() if key not in figures and field.default is MISSING]
-    problems = [f"{what} {', '.join(found)}" for what, found in (("unknown", unknown), ("missing", missing)) if found]
+    problems = [f"{what} {', '.join(keys)}" for what, keys in (("unknown", unknown), ("missing", missing)) if keys]
     if problems:
         fail("keys", "; ".join(problems))
     return Species(name=name, **{expected[key].name: value for key, value in figures.items()})
 
 
 def _suggestion(word: str, known: Iterable[str]) -> str:
-    """``did you mean X?``, or nothing where no known word is close."""
+    """``did you mean X?``, or an empty text if no known word is similar."""
     by_spelling = {"".join(filter(str.isalnum, name.lower())): name for name in known}
     close = get_close_matches("".join(filter(str.isalnum, word.lower())), by_spelling, 1, 0.7)
     return f"did you mean {by_spelling[close[0]]}?" if close else ""

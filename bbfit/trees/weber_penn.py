@@ -1,26 +1,27 @@
-"""The tree model of Weber and Penn ("Creation and Rendering of Realistic Trees", SIGGRAPH 1995), grown by numpy.
+"""The tree model of Weber and Penn ("Creation and Rendering of Realistic Trees", SIGGRAPH 1995), in numpy.
 
-Sections named below are the paper's. Stems of a level are grown together, one curve segment after the other, so that every operation
-works on all stems at once. Angles of the figures are degrees, all others radians.
+Section numbers are the paper's. All stems of a level grow together, one curve segment after the other, in array operations. Angles of a
+species are in degrees, all others in radians.
 
-Where the paper leaves a choice, or the figures go beyond it:
+Choices that the paper leaves open, and additions to it:
 
 - A stem's frame turns from node to node, and the stem is the smooth curve through the nodes with those directions. The turn of a split is
-  part of the segment after it, so that a clone leaves the stem it comes from without a kink.
-- nSegSplits counts the splits that a stem and its clones share, beyond the stem's bare part. In the paper every clone splits at the full
-  rate, with which an acer's 1.5 would multiply its stems by 2.5 in every segment.
-- A trunk's clone bears branches as densely as the trunk; of any other stem, it and its clones share what nBranches gives it.
-- A stem that hangs splits as one that stands: declination is counted from the vertical, up or down.
+  part of the segment after it, so that a clone leaves its stem without a kink.
+- A stem and its clones share the splits that nSegSplits gives; the part of a stem without children has none. In the paper every clone
+  splits at the full rate: an acer's 1.5 would multiply its stems by 2.5 in every segment.
+- A trunk's clone bears branches as densely as the trunk; any other stem and its clones share the branches that nBranches gives.
+- A hanging stem splits like an upright one: declination is counted from the vertical, up or down.
 - A trunk leans at most 75 degrees, and stems stop above the ground as they do at the pruning envelope.
-- Scale ± ScaleV is the height of the tree, to which it is scaled when it has grown. In the paper it is the length of the trunk, and the
-  height then depends on how the trunk bends and how far the topmost branches rise above it.
-- The trunk's clones are spread evenly around it; those of other stems as in section 4.2, by a turn about the vertical.
-- Tropism is section 4.8's AttractionUp as a vector: in a segment, a stem turns towards it by its length times the angle between them over
-  nCurveRes, or, where it points below the horizon, times the angle from its opposite. Its z part acts from the third level on.
-- nRotate below 0 puts children on the left and the right in turn, that far from the side that positive nCurve bends their parent to: from
-  below, for a branch.
-- nBendV turns a stem sideways, about its y axis, by up to nBendV / nCurveRes either way a segment, as nCurveV does about its x axis.
-- LeafBend turns a leaf upwards about its own x axis, as a stalk bends. Section 4.9 turns it about a horizontal axis, which at the figures'
+- Scale ± ScaleV is the height to which the grown tree is scaled. In the paper it is the length of the trunk, so that the height depends on
+  the bend of the trunk and on the topmost branches.
+- The trunk's clones are spread evenly around it; clones of other stems turn about the vertical, as in section 4.2.
+- Tropism is section 4.8's AttractionUp as a vector: in a segment, a stem turns toward the vector by the vector's length times the angle
+  between them over nCurveRes; if the vector points below the horizon, the angle is that from its opposite. Its z part acts
+  from the third level on.
+- A negative nRotate puts children alternately on the left and right, at that angle from the side to which a positive nCurve bends their
+  parent: for a branch, from below.
+- nBendV turns a stem sideways, about its y axis, by up to ± nBendV / nCurveRes per segment, as nCurveV does about its x axis.
+- LeafBend turns a leaf upwards about its own x axis, as a stalk bends. Section 4.9 turns it about a horizontal axis, which at the usual
   0.6 lays all leaves flat.
 - nBranchDist gathers children into whorls of 1 + nBranchDist.
 """
@@ -51,13 +52,13 @@ from bbfit.trees.skeleton import (
 from bbfit.trees.species import Species
 
 Count = Callable[[int, int], None]
-"""Told a level and how many stems it is about to have; the level after the last stands for the leaves. Raises to stop."""
+"""Called with a level and its number of stems before they are made; the level after the last means the leaves. It may raise to stop."""
 
-# Stems shorter than this share of the tree's scale are left out; where the envelope cuts (section 4.6) there are many such stubs.
+# Stems shorter than this share of the tree's scale are left out; the pruning envelope (section 4.6) makes many such stubs.
 _LEAST_LENGTH = 2e-3
-# Lengths that are tried, as shares, for a stem that must be shortened.
+# Shares of its length that are tried for a stem that must be shortened.
 _SHORTENINGS = np.arange(0.95, 0.02, -0.05)
-# How far above the ground stems stop, as a share of the tree's scale.
+# Lowest height of stems above the ground, as a share of the tree's scale.
 _CLEARANCE = 0.03
 # How much of the way towards the tropism a stem turns in one segment at most, so that stems which split stay apart.
 _MOST_PULL = 0.8
@@ -81,9 +82,12 @@ def grow_skeleton(species: Species, seed: int, count: Count, *, leaves: float = 
 
     Parameters
     ----------
-    seed : any whole number of at least 0.
-    count : asked before memory for a level's stems, or for the leaves, is taken.
-    leaves : section 4.5's quality: share of the leaves that grow, 0 to 1; those are larger, so that the area of all stays.
+    seed
+        Any whole number of at least 0.
+    count
+        Called before memory for a level's stems, or for the leaves, is allocated.
+    leaves
+        Section 4.5's quality: share of the leaves that grow, 0 to 1; they are enlarged to keep the total area.
     """
     levels: list[Stems] = []
     for level in range(species.levels):
@@ -108,7 +112,7 @@ def _trunk(species: Species, scale: float, random: np.random.Generator) -> _Buds
 
 
 def _children(species: Species, levels: list[Stems], random: np.random.Generator, count: Count) -> _Buds:
-    """Where the next level's stems grow, and how long they are (section 4.3)."""
+    """Positions, frames and lengths of the next level's stems (section 4.3)."""
     level, stems = len(levels), levels[-1]
     many = species.branches[level] * np.ones(len(stems))
     if level == 2:
@@ -128,7 +132,7 @@ def _children(species: Species, levels: list[Stems], random: np.random.Generator
 
 
 def _leaves(species: Species, levels: list[Stems], share: float, random: np.random.Generator, count: Count) -> Leaves:
-    """Where the leaves are (section 4.5) and how they turn to the light (section 4.9)."""
+    """Positions of the leaves (section 4.5) and their turn toward the light (section 4.9)."""
     stems, level = levels[-1], min(len(levels), 3)
     place = stems.offset[stems.root] if len(levels) > 1 else np.ones(len(stems))
     many = share * abs(species.leaves) * shape_ratio(TAPERED_CYLINDRICAL, place, species) * _shares(species, stems)
@@ -312,8 +316,8 @@ def _chord(begin: Array, end: Array) -> Array:
 def _pruned(species: Species, scale: float, stems: Stems) -> Stems:
     """Stems cut back at the pruning envelope and above the ground; a trunk, whose foot is outside, at the envelope's side and top."""
     if species.prune_ratio > 0:
-        bare = species.base_size[0] * scale if stems.level == 0 else -1.0
-        stems = _shortened(stems, lambda points: in_envelope(species, scale, points) | (points[..., 2] <= bare), species.prune_ratio)
+        bole = species.base_size[0] * scale if stems.level == 0 else -1.0
+        stems = _shortened(stems, lambda points: in_envelope(species, scale, points) | (points[..., 2] <= bole), species.prune_ratio)
     if stems.level > 0:  # those that begin below the clearance may not sink further
         stems = _shortened(stems, lambda points: points[..., 2] > np.minimum(_CLEARANCE * scale, 0.9 * points[:, :1, 2]), 1.0)
     return stems
@@ -341,11 +345,11 @@ def _shortened(stems: Stems, inside: Callable[[Array], NDArray[np.bool_]], ratio
 def _to_height(skeleton: Skeleton) -> Skeleton:
     """The tree scaled until its highest point, leaves of LeafScale included, is as high as its scale says."""
     leaves, last = skeleton.leaves, skeleton.levels[-1]
-    bare = factor = skeleton.scale / max(float(stems.nodes[..., 2].max(initial=0)) for stems in skeleton.levels)
+    without_leaves = factor = skeleton.scale / max(float(stems.nodes[..., 2].max(initial=0)) for stems in skeleton.levels)
     if len(leaves.parent):
         feet, tips = last.at(leaves.parent, leaves.offset)[0][:, 2], skeleton.species.leaf_scale * leaves.frames[:, 2, 2]
-        factor = min(bare, float(((skeleton.scale - tips) / feet).min()))
-    factor = max(factor, bare / 2)  # a tree smaller than its leaves
+        factor = min(without_leaves, float(((skeleton.scale - tips) / feet).min()))
+    factor = max(factor, without_leaves / 2)  # a tree smaller than its leaves
     levels = (
         replace(stems, nodes=factor * stems.nodes, length=factor * stems.length, radius=factor * stems.radius) for stems in skeleton.levels
     )

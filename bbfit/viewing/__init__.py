@@ -1,1 +1,1 @@
-"""Looking at results in the browser: the original and the billboards side by side, levels of detail, and whole fields of them."""
+"""The viewer: a web page that shows the original tree and its billboards side by side, levels of detail, and fields of trees."""

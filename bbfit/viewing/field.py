@@ -1,69 +1,59 @@
-"""A field of trees: where each stands, how it is turned, how large it is."""
+"""A field of trees: where each tree is, how it is turned, how large it is."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.checks import check_count, check_range
 
-MOST = 10_000
-"""Trees in a field at most."""
-# Distance of neighbors as a share of the tree's width; how far a tree may be off its place, as a share of that; the range of sizes.
-_APART, _OFF, _SIZES = 1.05, 0.35, (0.7, 1.3)
+MAX_TREES = 10_000
+"""The most trees that a field has."""
+# Distance of neighbors as a share of the tree's width; largest shift of a tree, as a share of that distance; the range of scales.
+_SPACING, _SHIFT, _SCALES = 1.05, 0.35, (0.7, 1.3)
 
 
-@dataclass(frozen=True)
-class Field:
-    """N trees."""
-
-    positions: NDArray[np.float32]
-    """Where each tree's own origin goes, in meters, [N, 3]; the first tree stands in the middle."""
-    wxyzs: NDArray[np.float32]
-    """Rotations about the vertical as quaternions, [N, 4]."""
-    scales: NDArray[np.float32]
-    """Sizes, 1 as large as the tree itself, [N]."""
-    side: float
-    """Width of the field in meters."""
-
-    def __len__(self) -> int:
-        return len(self.scales)
-
-
-def plant(count: int, bounds: NDArray[np.float64], *, seed: int = 0) -> Field:
-    """Plant trees on the ground, on a grid that is shaken, each turned and scaled at random.
+def plant(count: int, bounds: NDArray[np.float64], *, seed: int = 0) -> NDArray[np.float32]:
+    """Plant trees on the ground, on a jittered grid, each turned and scaled at random.
 
     Parameters
     ----------
-    count : 1 to :data:`MOST`.
-    bounds : the tree's lowest and highest corner in meters, [2, 3]; it stands on its lowest height.
-    seed : of the places, turns and sizes; the same seed gives the same field.
+    count : int
+        Number of trees, 1 to :data:`MAX_TREES`.
+    bounds : array
+        The tree's lowest and highest corner in meters, [2, 3]. The ground is at its lowest height.
+    seed : int
+        Seed of the places, turns and scales. The same seed gives the same field.
+
+    Returns
+    -------
+    The trees, [N, 5]: the position of the tree's origin (x, y, z) in meters, its rotation about +Y in radians, and its scale. The first
+    tree is in the middle and is neither shifted, turned nor scaled.
+
+    Raises
+    ------
+    InputError
+        If the count is out of range.
     """
     check_count("trees", count)
-    check_range("trees", count, 1, MOST)
+    check_range("trees", count, 1, MAX_TREES)
     low, high = bounds
-    foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    width = float(max(high[0] - low[0], high[2] - low[2]))
-    apart, cells = _APART * width, math.ceil(math.sqrt(count))
+    foot_x, foot_z = (low[0] + high[0]) / 2, (low[2] + high[2]) / 2
+    spacing, cells = _SPACING * max(high[0] - low[0], high[2] - low[2]), math.ceil(math.sqrt(count))
     x, z = np.meshgrid(np.arange(cells) - (cells - 1) // 2, np.arange(cells) - (cells - 1) // 2)
     grid = np.stack([x.ravel(), z.ravel()], -1).astype(np.float64)
     grid = grid[np.argsort((grid**2).sum(-1), kind="stable")[:count]]
     random = np.random.default_rng(seed)
-    grid[1:] += random.uniform(-_OFF, _OFF, (count - 1, 2))
-    yaw, scales = random.uniform(0, 2 * np.pi, count), random.uniform(*_SIZES, count)
-    yaw[0], scales[0] = 0.0, 1.0  # the one in the middle is the tree as it is
-    stands = np.stack([foot[0] + apart * grid[:, 0], np.full(count, foot[1]), foot[2] + apart * grid[:, 1]], -1)
+    grid[1:] += random.uniform(-_SHIFT, _SHIFT, (count - 1, 2))
+    yaw, scales = random.uniform(0, 2 * np.pi, count), random.uniform(*_SCALES, count)
+    yaw[0], scales[0] = 0.0, 1.0
     # Trees turn and grow about their foot, models about their origin.
-    turned = np.stack(
-        [foot[0] * np.cos(yaw) + foot[2] * np.sin(yaw), np.full(count, foot[1]), foot[2] * np.cos(yaw) - foot[0] * np.sin(yaw)], -1
-    )
-    zero = np.zeros(count)
-    return Field(
-        positions=(stands - scales[:, None] * turned).astype(np.float32),
-        wxyzs=np.stack([np.cos(yaw / 2), zero, np.sin(yaw / 2), zero], -1).astype(np.float32),
-        scales=scales.astype(np.float32),
-        side=cells * apart,
-    )
+    turned_x, turned_z = foot_x * np.cos(yaw) + foot_z * np.sin(yaw), foot_z * np.cos(yaw) - foot_x * np.sin(yaw)
+    positions = [
+        foot_x + spacing * grid[:, 0] - scales * turned_x,
+        low[1] * (1 - scales),
+        foot_z + spacing * grid[:, 1] - scales * turned_z,
+    ]
+    return np.stack([*positions, yaw, scales], -1).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The models that a page sends to browsers, each made once."""
+"""The GLB files that the viewer sends to browsers."""
 
 from __future__ import annotations
 
@@ -8,64 +8,46 @@ from dataclasses import dataclass, replace
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
 from bbfit.geometry.alpha import AlphaKind
-from bbfit.viewing.levels import Level
+from bbfit.geometry.cloud import BillboardCloud
 
 
 @dataclass(frozen=True)
-class Look:
-    """How billboards are to be exported."""
+class ModelOptions:
+    """How billboards are exported for the viewer."""
 
     alpha: AlphaKind
-    """What their alpha means."""
+    """Alpha mode of the model."""
     split: bool = False
-    """Whether they are cut up so that the page blends them in the right order."""
+    """Whether billboards that cross are cut up, so that they can be sorted."""
+    halvings: int = 0
+    """How many times the sides of the textures are halved."""
 
 
-Key = tuple[int, int, Look]
-"""Billboards, halvings of their textures, and how they are exported."""
+class ModelCache:
+    """The models of some clouds, each made when it is first requested, one at a time; safe to use from several threads."""
 
-
-@dataclass(frozen=True)
-class Model:
-    """A model file of billboards."""
-
-    glb: bytes
-    """The GLB file."""
-    vertices: int
-    """Its vertices."""
-
-
-class Models:
-    """The models of one subject, made when they are first asked for; safe to use from several threads."""
-
-    def __init__(self, export: ExportConfig) -> None:
-        self._export = export
-        self._made: dict[Key, Model] = {}
-        self._locks: dict[Key, threading.Lock] = {}
+    def __init__(self, clouds: tuple[BillboardCloud, ...], export: ExportConfig) -> None:
+        self._clouds, self._export = clouds, export
+        self._models: dict[tuple[int, ModelOptions], bytes] = {}
         self._lock = threading.Lock()
 
-    def made(self, level: Level, look: Look) -> Model | None:
-        """The model if it is there already."""
-        return self._made.get(model_key(level, look))
+    def glb(self, index: int, options: ModelOptions) -> bytes:
+        """A cloud as an export would write it, with PNG textures.
 
-    def make(self, level: Level, look: Look) -> Model:
-        """The model of a level's billboards as an export would write it, with PNG textures."""
-        key = model_key(level, look)
-        with self._lock:
-            lock = self._locks.setdefault(key, threading.Lock())
-        with lock:
-            if key not in self._made:
-                self._made[key] = _model(level, look, self._export)
-            return self._made[key]
+        Raises
+        ------
+        IndexError
+            If there is no such cloud.
+        """
+        key = index, options
+        if key not in self._models:
+            with self._lock:
+                if key not in self._models:
+                    config = replace(self._export, alpha=options.alpha, split=options.split)
+                    self._models[key] = shipped_model(self._clouds[index], config, options.halvings).glb
+        return self._models[key]
 
-
-def model_key(level: Level, look: Look) -> Key:
-    """What tells a model from all others."""
-    return level.mark, level.halvings, look
-
-
-def _model(level: Level, look: Look, export: ExportConfig) -> Model:
-    assert level.cloud is not None, "the original is no model of ours"
-    config = replace(export, alpha=look.alpha, split=look.split)
-    model = shipped_model(level.cloud, config, level.halvings)
-    return Model(model.glb, model.cards.vertex_count)
+    def close(self, seconds: float = 60.0) -> None:
+        """Wait for the model that is being made, at most for some seconds: a process must not exit in the middle of it."""
+        if self._lock.acquire(timeout=seconds):
+            self._lock.release()

@@ -1,10 +1,11 @@
-"""Showing a fit on a page while it goes on, in the background and at most a small share of the time."""
+"""Showing a fit in the viewer while it runs, in the background and for at most a small share of the time."""
 
 from __future__ import annotations
 
+import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -14,88 +15,103 @@ from bbfit.fitting.loop import Step
 from bbfit.geometry.alpha import AlphaKind, AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, unpremultiply
-from bbfit.viewing.background import Background
-from bbfit.viewing.models import Look, Models
-from bbfit.viewing.originals import MOST_BYTES, Original, find_original
-from bbfit.viewing.subject import light_of, live_subject, open_run
+from bbfit.viewing.models import ModelCache, ModelOptions
+from bbfit.viewing.originals import Original, find_original
+from bbfit.viewing.server import Viewer
+from bbfit.viewing.viewed import light_of, live_tree, open_results
 
-if TYPE_CHECKING:
-    from bbfit.viewing.page import Page
 
-# Seconds between two pictures at least, and the share of the time that making them may take.
-_EVERY, _SHARE = 2.0, 0.04
-# Texels from which on a preview has halved textures.
-_TEXELS = 200_000
+@dataclass(frozen=True)
+class WatchedRun:
+    """A run that is watched."""
+
+    out: Path
+    """The run's folder."""
+    source: Path | None
+    """The run's source: a tree, a folder of views, or ``None`` if a tree is grown."""
+    tree: Path | None
+    """The mesh that a folder of views shows, if it is known."""
+    alpha: AlphaKind
+    """The alpha mode of the fit."""
 
 
 class Watch:
-    """Keeps a page up to date with a run; to be told of its steps and stages."""
+    """Keeps a viewer up to date with a run.
 
-    def __init__(self, page: Page, out: str | Path, source: str | Path | None, tree: str | Path | None, alpha: AlphaKind) -> None:
-        """
-        Parameters
-        ----------
-        out : the run's folder.
-        source : what the run is of: a tree, a folder of views, or ``None`` if a tree is grown.
-        tree : the mesh that a folder of views shows, if it is known.
-        alpha : the alpha mode that is fitted for.
-        """
-        self._page, self._out, self._alpha = page, Path(out), alpha
-        folder = source is not None and Path(source).is_dir()
-        self._tree = Path(tree) if tree is not None else None if folder else Path(source) if source is not None else self._out / "tree.glb"
-        self._views = Path(source) if folder and source is not None else self._out / "views"
-        self._found: tuple[Original, ViewsConfig] | None = None
-        self._next, self._busy, self._spent = 0.0, False, 0.0
-        self._background = Background()
+    Parameters
+    ----------
+    viewer : Viewer
+        The viewer, which stays open when the watch ends.
+    run : WatchedRun
+        The run.
+    interval : float
+        The least number of seconds between two previews.
+    share : float
+        The largest share of the time that previews may take.
+    """
+
+    def __init__(self, viewer: Viewer, run: WatchedRun, *, interval: float = 2.0, share: float = 0.04) -> None:
+        self._viewer, self._run, self._interval, self._share = viewer, run, interval, share
+        self._origin: tuple[Original, ViewsConfig] | None = None
+        self._thread: threading.Thread | None = None
+        self._next, self._spent = 0.0, 0.0
 
     @property
     def spent(self) -> float:
-        """Seconds that the pictures took in all, most of them beside the fit."""
+        """Seconds that previews have taken, most of them in parallel with the fit."""
         return self._spent
 
     def on_progress(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Say how far a stage is (:class:`bbfit.pipeline.Progress`)."""
-        if stage != "fit":  # whose steps are told with the picture
-            self._page.say(f"{stage} {done}/{total} {note}".rstrip())
+        """Show how far a stage is (:class:`bbfit.stages.stage.OnProgress`)."""
+        if stage != "fit":  # each preview reports the step of the fit
+            self._viewer.show_status(f"{stage} {done}/{total} {note}".rstrip())
 
     def on_step(self, step: Step) -> None:
-        """Show the billboards as they are after a step, unless the last picture is too recent or still being made."""
-        if self._busy or (time.monotonic() < self._next and step.index < step.total):
+        """Show the billboards after a step of the fit, unless the last preview is too recent or not finished yet."""
+        is_busy = self._thread is not None and self._thread.is_alive()
+        if is_busy or (time.monotonic() < self._next and step.index < step.total):
             return
-        self._busy = True
-        begun = time.monotonic()
-        cloud = step.snapshot()
-        self._background.start(lambda: self._show(cloud, step.index, step.total, step.loss, begun))
+        self._thread = threading.Thread(target=self._show, args=(step.snapshot(), step, time.monotonic()), daemon=True)
+        self._thread.start()
 
     def finish(self) -> None:
-        """Show the finished run, with all that a page has."""
+        """Show the finished run."""
         self.close()
-        self._page.say("")
-        self._page.show(open_run(self._out))
+        self._viewer.show_status("")
+        self._viewer.show(open_results(self._run.out))
 
     def close(self) -> None:
-        """Make no more pictures, and wait for the one that is being made."""
-        self._background.close()
+        """Wait for the preview that is being made."""
+        if self._thread is not None:
+            self._thread.join()
 
-    def _show(self, cloud: BillboardCloud, index: int, total: int, loss: float, begun: float) -> None:
-        try:
-            if self._found is None:
-                self._found = find_original([self._tree], MOST_BYTES), light_of(self._views)
-            subject = live_subject(preview(cloud, self._alpha), self._out.resolve().name, *self._found)
-            models = Models(ExportConfig())
-            models.make(subject.clouds[0], Look(self._alpha))
-            self._page.say(f"fitting: step {index:,} of {total:,}, loss {loss:.5f}")
-            self._page.show(subject, models)
-        finally:
-            took = time.monotonic() - begun
-            self._spent += took
-            self._next, self._busy = time.monotonic() + max(_EVERY, took / _SHARE), False
+    def _show(self, cloud: BillboardCloud, step: Step, begun: float) -> None:
+        if self._origin is None:
+            self._origin = _origin(self._run)
+        tree = live_tree(preview(cloud, self._run.alpha), self._run.out.resolve().name, *self._origin)
+        models = ModelCache(tree.clouds, ExportConfig())
+        models.glb(0, ModelOptions(self._run.alpha))
+        self._viewer.show_status(f"fitting: step {step.index:,} of {step.total:,}, loss {step.loss:.5f}")
+        self._viewer.show(tree, models)
+        took = time.monotonic() - begun
+        self._spent += took
+        self._next = time.monotonic() + max(self._interval, took / self._share)
 
 
-def preview(cloud: BillboardCloud, alpha: AlphaKind) -> BillboardCloud:
-    """A cloud with an alpha mode, and with textures that are quick to pack: halved, by the mean of four texels, while there are many."""
+def _origin(run: WatchedRun) -> tuple[Original, ViewsConfig]:
+    """The original of a run, and its light."""
+    if run.source is not None and run.source.is_dir():
+        return find_original([run.tree]), light_of(run.source)
+    return find_original([run.tree or run.source or run.out / "tree.glb"]), light_of(run.out / "views")
+
+
+def preview(cloud: BillboardCloud, alpha: AlphaKind, *, max_texels: int = 200_000) -> BillboardCloud:
+    """A cloud with an alpha mode and with textures that are quick to pack.
+
+    The textures are halved, by the mean of four texels, until there are at most ``max_texels``.
+    """
     textures = [premultiply(texture.float()) for texture in cloud.textures()]
-    while sum(len(texture.reshape(-1, 4)) for texture in textures) > _TEXELS:
+    while sum(len(texture.reshape(-1, 4)) for texture in textures) > max_texels:
         textures = [
             torch.nn.functional.avg_pool2d(texture.permute(0, 3, 1, 2), 2, ceil_mode=True).permute(0, 2, 3, 1) for texture in textures
         ]

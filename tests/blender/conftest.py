@@ -119,3 +119,11 @@ SMALL = {"count": 4, "size": 32, "samples": 4, "denoise": False}
 def unbroken(thing_glb: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four views of ``thing``, rendered at one go; not to be written to."""
     return render_views(thing_glb, tmp_path_factory.mktemp("unbroken") / "views", ViewsConfig(**SMALL))
+
+
+@pytest.fixture
+def broken_blender(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Blender that crashes when its processes import it."""
+    folder = tmp_path_factory.mktemp("broken")
+    (folder / "bpy.py").write_text("import os, sys; sys.stderr.write('Fra: 1\\nout of luck\\n'); sys.stderr.flush(); os.abort()")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH")))))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import struct
-from collections.abc import Callable
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -221,6 +220,14 @@ def test_textures_of_an_obj_are_part_of_the_tree(things: Path, tmp_path: Path) -
     assert TreeFile.open(tree).digest != before.digest
 
 
+def test_every_material_library_of_a_line_is_part_of_the_tree(tmp_path: Path) -> None:
+    """The format allows several names after ``mtllib``, and some programs read them all."""
+    (tmp_path / "tree.obj").write_text("mtllib bark.mtl leaf.mtl\n")
+    for name in ("bark.mtl", "leaf.mtl"):
+        (tmp_path / name).write_text("newmtl m\n")
+    assert {path.name for path in TreeFile.open(tmp_path / "tree.obj").files} == {"tree.obj", "bark.mtl", "leaf.mtl"}
+
+
 def test_formats_are_the_tested_ones() -> None:
     assert set(UP_AXES) == set(FORMATS)
 
@@ -231,12 +238,11 @@ def test_unusable_panorama_and_device(thing_glb: Path, tmp_path: Path) -> None:
     tree.write_bytes(thing_glb.read_bytes())
     refused(tree, r"hdri: .*sky\.hdr cannot be read; give an \.hdr or \.exr file", ViewsConfig(**SMALL, hdri=tmp_path / "sky.hdr"))
     refused(tree, "hdri: .*none.hdr does not exist", ViewsConfig(**SMALL, hdri=tmp_path / "none.hdr"))
-    refused(tree, "device: metal is not known to this Blender; choose another one, or cpu", ViewsConfig(**SMALL, device="metal"))
+    refused(tree, "device: this Blender does not support metal; choose another device, or cpu", ViewsConfig(**SMALL, device="metal"))
 
 
 def test_without_blender(thing_glb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    find: Callable[..., Any] = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "bpy" else find(name, *rest))
+    monkeypatch.setitem(sys.modules, "bpy", None)  # by which Python says that a module cannot be imported
     with pytest.raises(
         InputError, match=r'bpy is not installed; install bbfit with its extra, pip install "bbfit\[blender\]".*Python 3\.11'
     ):

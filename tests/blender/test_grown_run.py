@@ -14,7 +14,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.pipeline import RunConfig, run
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.growth import grow
-from bbfit.trees.tree_file import write_tree
+from bbfit.trees.tree_writer import write_tree
 
 CONFIG = RunConfig(
     species="acer",

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import re
+import select
 import shutil
 import signal
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from bbfit.blender import processes
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.views_folder import BlenderError, render_views
 from bbfit.checks import InputError
@@ -31,27 +31,37 @@ _RENDER = """
 import sys
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.views_folder import render_views
-tree, out, samples, size, limit = sys.argv[1:]
+tree, out, samples, size, limit, workers, hold = sys.argv[1:]
 if int(limit):
     import resource
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), resource.RLIM_INFINITY))
-config = ViewsConfig(count=4, size=int(size), samples=int(samples), denoise=False)
-render_views(tree, out, config, on_progress=lambda done, total: print(done, flush=True))
+def on_progress(done, total):
+    print(done, flush=True)
+    if done == int(hold):
+        sys.stdin.readline()
+config = ViewsConfig(count=4, size=int(size), samples=int(samples), denoise=False, workers=int(workers))
+render_views(tree, out, config, on_progress=on_progress)
 """
 
 
-def start(tree: Path, out: Path, *, samples: int = 4, size: int = 32, limit: int = 0) -> subprocess.Popen[str]:
-    """Render views in a process that may be killed."""
-    arguments = [sys.executable, "-c", _RENDER, str(tree), str(out), str(samples), str(size), str(limit)]
-    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def start(
+    tree: Path, out: Path, *, samples: int = 4, size: int = 32, limit: int = 0, workers: int = 1, hold: int = -1
+) -> subprocess.Popen[str]:
+    """Render views in a process that may be killed; after ``hold`` views it hands over no more, and goes on with a line of input."""
+    arguments = [sys.executable, "-c", _RENDER, str(tree), str(out), *map(str, (samples, size, limit, workers, hold))]
+    return subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def alive(pid: int) -> bool:
-    """Whether a process runs; one that only waits to be collected does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
+def blenders(parent: int) -> list[int]:
+    """The Blender processes that a process has started."""
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    return [int(pid) for pid in children if b"worker.py" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+def wait_for_end(process: int) -> None:
+    """Wait for a process, which need not be a child of this one, by a descriptor of it."""
+    select.select([process], [], [])
+    os.close(process)
 
 
 def times(out: Path) -> dict[str, int]:
@@ -71,19 +81,17 @@ def assert_same_pictures(out: Path, expected: Path) -> None:
 
 def test_killed_in_the_middle_and_started_again(thing_glb: Path, tmp_path: Path) -> None:
     """Blender dies with its parent; only what is missing or cut short is rendered again; pixels are those of an unbroken run."""
-    out, config = tmp_path / "views", ViewsConfig(**SMALL | {"samples": 600})
-    parent = start(thing_glb, out, samples=600)
+    out, config = tmp_path / "views", ViewsConfig(**SMALL | {"samples": 200})
+    parent = start(thing_glb, out, samples=200, workers=2, hold=2)
     assert parent.stdout
     for _ in range(3):  # 0, 1, 2 views
         parent.stdout.readline()
-    workers = [int(pid) for pid in Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()]
-    assert workers
+    workers = [os.pidfd_open(pid) for pid in blenders(parent.pid)]
+    assert len(workers) == 2
     parent.kill()
     parent.communicate()
-    deadline = time.monotonic() + 10
-    while any(map(alive, workers)):
-        assert time.monotonic() < deadline, "Blender outlives its parent"
-        time.sleep(0.05)
+    for worker in workers:
+        wait_for_end(worker)
     assert not (out / "transforms_train.json").exists()
     assert read_json("views", out / "views.json")["complete"] is False
 
@@ -102,8 +110,8 @@ def test_killed_in_the_middle_and_started_again(thing_glb: Path, tmp_path: Path)
     assert_same_pictures(out, render_views(thing_glb, tmp_path / "unbroken", config))
 
 
-def test_finished_folder_needs_no_blender(thing_glb: Path, unbroken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(processes, "BlenderPool", None)
+@pytest.mark.usefixtures("broken_blender")
+def test_finished_folder_needs_no_blender(thing_glb: Path, unbroken: Path) -> None:
     before, progress = times(unbroken), []
     render_views(thing_glb, unbroken, CONFIG, on_progress=lambda done, total: progress.append((done, total)))
     assert progress == [(4, 4)] and times(unbroken) == before
@@ -162,36 +170,32 @@ def test_folder_with_other_content_is_refused(thing_glb: Path, unbroken: Path, t
         render_views(thing_glb, views / "views.json", CONFIG)
 
 
-class Fragile(processes.Blender):
-    """A worker that is killed just before it is handed its second frame, for the first ``deaths`` workers."""
+def killing(progress: list[int], last: int) -> Callable[[int, int], None]:
+    """Kill Blender after each of the first ``last`` views, before it is handed another."""
 
-    deaths = 0
+    def on_progress(done: int, total: int) -> None:
+        progress.append(done)
+        if 1 <= done <= last:
+            (pid,) = blenders(os.getpid())
+            process = os.pidfd_open(pid)
+            os.kill(pid, signal.SIGKILL)
+            wait_for_end(process)
 
-    def send(self, request: dict[str, Any]) -> None:
-        self.handed = getattr(self, "handed", -2) + 1  # the job, then frames
-        if self.handed == 1 and Fragile.deaths > 0:
-            Fragile.deaths -= 1
-            os.kill(self.pid, signal.SIGKILL)
-            self._process.wait()  # or it might finish the frame first
-        super().send(request)
+    return on_progress
 
 
-def test_crashed_worker_is_replaced(thing_glb: Path, unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(processes, "Blender", Fragile)
-    monkeypatch.setattr(Fragile, "deaths", 2)
+def test_crashed_worker_is_replaced(thing_glb: Path, unbroken: Path, tmp_path: Path) -> None:
     progress: list[int] = []
-    out = render_views(thing_glb, tmp_path / "views", CONFIG, on_progress=lambda done, total: progress.append(done))
-    assert progress == [0, 1, 2, 3, 4] and Fragile.deaths == 0
+    out = render_views(thing_glb, tmp_path / "views", CONFIG, on_progress=killing(progress, 2))
+    assert progress == [0, 1, 2, 3, 4]
     assert_same_pictures(out, unbroken)
 
 
-def test_blender_that_crashes_again_and_again(thing_glb: Path, unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blender_that_crashes_again_and_again(thing_glb: Path, unbroken: Path, tmp_path: Path) -> None:
     """It is said at which frame and what is kept; and the next start goes on from there."""
-    monkeypatch.setattr(processes, "Blender", Fragile)
-    monkeypatch.setattr(Fragile, "deaths", 3)
     out = tmp_path / "views"
     with pytest.raises(BlenderError, match=r"crashed 3 times, last at 0003\.png \(signal 9.*3 of 4 views are finished and kept"):
-        render_views(thing_glb, out, CONFIG)
+        render_views(thing_glb, out, CONFIG, on_progress=killing([], 3))
     assert len(times(out)) == 3 and not (out / "transforms_train.json").exists()
     progress: list[int] = []
     render_views(thing_glb, out, CONFIG, on_progress=lambda done, total: progress.append(done))
@@ -199,11 +203,9 @@ def test_blender_that_crashes_again_and_again(thing_glb: Path, unbroken: Path, t
     assert_same_pictures(out, unbroken)
 
 
-def test_crash_while_reading(thing_glb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    worker = tmp_path / "worker.py"
-    worker.write_text("import os, sys; sys.stderr.write('Fra: 1\\nout of luck\\n'); sys.stderr.flush(); os.abort()")
-    monkeypatch.setattr(processes, "WORKER", worker)
-    with pytest.raises(BlenderError, match=r"crashed while reading .*thing\.glb \(signal 6; its last words: out of luck\)"):
+@pytest.mark.usefixtures("broken_blender")
+def test_crash_while_reading(thing_glb: Path, tmp_path: Path) -> None:
+    with pytest.raises(BlenderError, match=r"crashed while reading .*thing\.glb \(signal 6; its last output: out of luck\)"):
         render_views(thing_glb, tmp_path / "views", CONFIG)
     assert not (tmp_path / "views").exists()
 

@@ -14,6 +14,7 @@ from billboard_scene import crossing_billboards, write_views
 from bbfit.checks import InputError
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import OriginalTree, evaluate, held_out, measure, view_angles
+from bbfit.exporting.model import shipped_model
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.geometry.orbit import Orbit
@@ -53,10 +54,10 @@ def test_another_split_and_another_cloud_score_less(views: ViewDataset) -> None:
 
 
 def test_nothing_drawn(views: ViewDataset) -> None:
-    """No billboards are white over white: every measure is finite, and as bad as it should be."""
+    """Transparent billboards are white over white: every measure is finite, and as bad as it should be."""
     cloud = crossing_billboards()
-    parts = {name: getattr(cloud, name)[:0] for name in TENSORS}
-    report = evaluate(BillboardCloud(**parts), views.test)
+    report = evaluate(cloud.with_texels(torch.zeros_like(cloud.texels)), views.test)
+    assert report.overdraw == 1 and {size.coverage for size in report.sizes} == {0}
     assert report.mean.rgba.iou == report.mean.sharpness == report.mean.brightness == 0
     target = over_color(views.test.targets([2], torch.float64)[0]).numpy()
     assert report.views[2].measures.over_white.psnr == pytest.approx(metrics.psnr(target, np.ones_like(target)), abs=1e-9)
@@ -89,18 +90,17 @@ def test_costs_and_stages(views: ViewDataset) -> None:
         cloud,
         views.test,
         original=OriginalTree(vertices=64_000, bytes=8_000),
-        model_bytes=2_000,
-        seconds={"views": 3.0, "fit": 2.5},
-        on_view=lambda done, total: calls.append((done, total)),
+        on_progress=lambda done, total: calls.append((done, total)),
     )
-    assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert calls == [(done, 9) for done in range(1, 10)], "four views, and five sizes of pictures"
+    size = len(shipped_model(cloud).glb)
     content = report.to_json()
     assert content["vertices"] == {"model": 8, "original": 64_000, "ratio": 8 / 64_000}
-    assert content["bytes"] == {"model": 2_000, "original": 8_000, "ratio": 0.25}
-    assert list(content["seconds"]) == ["views", "fit", "evaluate"] and content["seconds"]["evaluate"] > 0
-    bare = evaluate(cloud, views.test).to_json()
-    assert bare["vertices"] == {"model": 8, "original": None, "ratio": None}
-    assert bare["bytes"] == {"model": None, "original": None, "ratio": None}
+    assert content["bytes"] == {"model": size, "original": 8_000, "ratio": size / 8_000}
+    assert list(content["seconds"]) == ["evaluate"] and content["seconds"]["evaluate"] > 0
+    alone = evaluate(cloud, views.test).to_json()
+    assert alone["vertices"] == {"model": 8, "original": None, "ratio": None}
+    assert alone["bytes"] == {"model": size, "original": None, "ratio": None}
 
 
 def test_two_sided_billboards_count_twice(views: ViewDataset) -> None:
@@ -111,15 +111,17 @@ def test_two_sided_billboards_count_twice(views: ViewDataset) -> None:
 
 def test_render_is_clamped_and_not_rounded(views: ViewDataset) -> None:
     cloud = crossing_billboards()
-    _, image = held_out(cloud.with_texels(cloud.texels * 1.5), views.test, 1)
+    _, image = held_out(shipped_model(cloud.with_texels(cloud.texels * 1.5)).draw, views.test, 1)
     assert image.dtype == torch.float64 and image.min() == 0 and image.max() == 1
     assert ((image * 255).round() / 255 - image).abs().max() > 1e-3
 
 
 def test_bad_input(views: ViewDataset, tmp_path: Path) -> None:
     cloud = crossing_billboards()
-    with pytest.raises(InputError, match="cloud: what it draws in view 0000 holds numbers that are not finite"):
+    with pytest.raises(InputError, match="cloud: its render of view 0000 has values that are not finite"):
         evaluate(cloud.with_texels(torch.full_like(cloud.texels, torch.nan)), views.test)
+    with pytest.raises(InputError, match="no billboards"):
+        evaluate(BillboardCloud(**{name: getattr(cloud, name)[:0] for name in TENSORS}), views.test)
     with pytest.raises(InputError, match="no held-out view"):
         evaluate(cloud, replace(views.test, paths=()))
     with pytest.raises(InputError, match=r"12x10 pixels; give at least 11x11"):

@@ -130,9 +130,9 @@ def test_bad_input(views: ViewSet, tmp_path: Path) -> None:
         score_sizes(lambda camera: render(cloud, camera), replace(views, paths=()))
     with pytest.raises(InputError, match="halvings: expected at least 0"):
         score_sizes(lambda camera: render(cloud, camera), views, -1)
-    with pytest.raises(InputError, match=r"what is drawn of view 0000: expected shape \[1, 70, 98, 4\], got \[70, 98, 4\]"):
+    with pytest.raises(InputError, match=r"the render of view 0000: expected shape \[1, 70, 98, 4\], got \[70, 98, 4\]"):
         score_sizes(lambda camera: render(cloud, camera[0]), views)
-    with pytest.raises(InputError, match="numbers that are not finite for view 0000 at 98 x 70"):
+    with pytest.raises(InputError, match="values that are not finite for view 0000 at 98 x 70"):
         score_sizes(lambda camera: plain(camera, math.nan), views)
     with pytest.raises(InputError, match="width: expected at most the picture's 98, got 99"):
         shrunk(views.targets([0])[0], 99, 5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from PIL import Image
 
 from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import as_shipped, export, shipped_cards
+from bbfit.exporting.model import export, shipped_model
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.glb import joined_glb, split_glb
@@ -42,7 +43,7 @@ def test_a_file_has_the_mode_that_its_cloud_was_fitted_for_unless_another_is_ask
     (path,) = export(cloud, tmp_path / "model.glb", config)
     (material,) = tree_of(path)[0]["materials"]
     assert (material["alphaMode"], material.get("alphaCutoff")) == expected
-    shipped = as_shipped(cloud, config).alpha
+    shipped = shipped_model(cloud, config).cloud.alpha
     assert ("MASK" if shipped.kind == "mask" else "BLEND") == expected[0]
     assert shipped.kind != "mask" or shipped.cutoff == expected[1]
     assert material.get("extras") == ({"alphaMode": "HASH"} if shipped.kind == "hash" else None)
@@ -62,7 +63,7 @@ def test_other_textures_stand_beside_png_or_in_its_place(
     image = tree["images"][texture["extensions"][extension]["source"]]
     data = views[image["bufferView"]]
     assert image["mimeType"] == f"image/{textures}" and len(tree["images"]) == 1 + fallback
-    atlas = shipped_cards(crossed, config).atlas.image
+    atlas = shipped_model(crossed, config).cards.atlas.image
     if textures == "webp":
         np.testing.assert_array_equal(np.array(Image.open(io.BytesIO(data))), atlas)  # colors of transparent texels as well
     else:
@@ -80,7 +81,7 @@ def test_split_nodes_stand_at_their_origins_and_their_bounds_are_centerd_there(c
     config = ExportConfig(alpha="blend", split=True)
     (path,) = export(crossed, tmp_path / "model.glb", config)
     tree, _ = tree_of(path)
-    cards = shipped_cards(crossed, config)
+    cards = shipped_model(crossed, config).cards
     placed = [node for node in tree["nodes"] if "mesh" in node]
     assert len(placed) == len(cards.cards) > len(crossed)
     vertices = 0
@@ -97,7 +98,7 @@ def test_split_nodes_stand_at_their_origins_and_their_bounds_are_centerd_there(c
 
 def test_only_blend_is_split_and_only_where_nodes_are_sorted(crossed: BillboardCloud) -> None:
     def pieces(alpha: str, **options: Any) -> int:
-        return len(shipped_cards(crossed, ExportConfig(alpha=alpha, **options)).cards)  # type: ignore[arg-type]
+        return len(shipped_model(crossed, ExportConfig(alpha=alpha, **options)).cards.cards)  # type: ignore[arg-type]
 
     assert pieces("mask", split=True) == pieces("hash", split=True) == pieces("blend") == pieces("blend", profile="blender") == 2
     assert pieces("blend", profile="blender", split=True) == pieces("blend", profile="three") > 2
@@ -106,7 +107,7 @@ def test_only_blend_is_split_and_only_where_nodes_are_sorted(crossed: BillboardC
 
 def test_a_hull_saves_area_and_keeps_to_its_corners(crossed: BillboardCloud, tmp_path: Path) -> None:
     for corners in (4, 6, 8):
-        cards = shipped_cards(crossed, ExportConfig(alpha="mask", hull=corners)).cards
+        cards = shipped_model(crossed, ExportConfig(alpha="mask", hull=corners)).cards.cards
         assert all(len(card.corners) <= corners for card in cards)
     (path,) = export(crossed, tmp_path / "model.glb", ExportConfig(alpha="mask", hull=8))
     assert not messages(path)
@@ -132,7 +133,7 @@ def test_the_materials_light_is_as_asked(crossed: BillboardCloud, tmp_path: Path
 
 
 def test_a_missing_encoder_is_named(crossed: BillboardCloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "alktx2", None)
     with pytest.raises(InputError, match=r"bbfit\[ktx2\]"):
         export(crossed, tmp_path / "model.glb", ExportConfig(textures="ktx2"))
     assert not list(tmp_path.iterdir())
@@ -144,7 +145,7 @@ def test_ktx2_is_shipped_where_it_can_be(crossed: BillboardCloud, tmp_path: Path
     (path,) = export(crossed, tmp_path / "model.glb", config)
     assert "KHR_texture_basisu" in tree_of(path)[0]["extensionsUsed"] and config.missed is None
     (png,) = export(crossed, tmp_path / "png.glb", replace(config, textures="png"))
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "alktx2", None)
     (without,) = export(crossed, tmp_path / "without.glb", config)
     assert without.read_bytes() == png.read_bytes()
     assert config.missed is not None and "bbfit[ktx2]" in config.missed

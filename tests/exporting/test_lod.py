@@ -17,7 +17,7 @@ from PIL import Image
 from test_formats import tree_of
 
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.lod import LodLevel, glb_counts, lod_glb, stands_alone
+from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.model import export
 from bbfit.geometry.cloud import BillboardCloud
 
@@ -164,4 +164,4 @@ def test_only_whole_files_stand_alone(tree: bytes, tmp_path: Path) -> None:
     }
     for number, (data, expected) in enumerate(cases.items()):
         (path := tmp_path / f"{number}.glb").write_bytes(data)
-        assert stands_alone(path) is expected, number
+        assert is_self_contained(path) is expected, number

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bbfit.checks import InputError
 from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.node_order import Misordered, misordered
-from bbfit.exporting.splitting import centerd, split
+from bbfit.exporting.splitting import centered, split
 from bbfit.geometry.camera import Camera, look_at
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.cloud import BillboardCloud, even_upright
@@ -275,9 +275,9 @@ def test_the_wrong_share_tells_right_from_wrong() -> None:
 
 
 @pytest.mark.parametrize("name", ["four about an axis", "leaning"])
-def test_bounds_are_centerd_on_the_origin_without_other_triangles(name: str) -> None:
+def test_bounds_are_centered_on_the_origin_without_other_triangles(name: str) -> None:
     for piece in scene(name)[1].cards:
-        points = centerd(piece)
+        points = centered(piece)
         np.testing.assert_array_equal(points[: len(piece.corners)], piece.corners)
         assert len(points) == len(piece.corners) + 2
         low, high = points.min(0), points.max(0)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bbfit.fitting.bounds import facing, facing_view_bounds, opaque_bounds, smallest_rectangle, trimmed
+from bbfit.fitting.bounds import facing_cosines, facing_view_bounds, opaque_bounds, smallest_rectangle, trimmed
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
 from bbfit.geometry.camera import Camera, convergence_point
@@ -37,7 +37,7 @@ def test_thesis_bounds_are_the_alpha_box_of_the_facing_view(views: ViewDataset) 
     planes = unit_planes(views, 2)
     bounds = facing_view_bounds(planes, views.train, pairs=False)
     for n in range(2):
-        view = int(facing(views.train.cameras, planes.normals, planes.centers[0])[:, n].argmax())
+        view = int(facing_cosines(views.train.cameras, planes.normals, planes.centers[0])[:, n].argmax())
         rows, columns = torch.nonzero(views.train.image(view)[..., 3] > 0).double().unbind(-1)
         left, right, bottom, top = bounds[n]
         corners = torch.stack([planes.centers[n] + x * planes.rights[n] + y * planes.ups[n] for x in (left, right) for y in (bottom, top)])
@@ -45,7 +45,7 @@ def test_thesis_bounds_are_the_alpha_box_of_the_facing_view(views: ViewDataset) 
         # The plane's box, seen from that view, holds the pixel box; a view that is not quite perpendicular sees it as a trapezoid.
         assert pixels[:, 0].amin() <= columns.min() - 0.5 + 1e-5 and pixels[:, 0].amax() >= columns.max() + 0.5 - 1e-5
         assert pixels[:, 1].amin() <= rows.min() - 0.5 + 1e-5 and pixels[:, 1].amax() >= rows.max() + 0.5 - 1e-5
-        if facing(views.train.cameras, planes.normals, planes.centers[0])[view, n] > 1 - 1e-12:  # perpendicular: exactly the box
+        if facing_cosines(views.train.cameras, planes.normals, planes.centers[0])[view, n] > 1 - 1e-12:  # perpendicular: exactly the box
             expected = torch.stack([columns.min() - 0.5, columns.max() + 0.5, rows.min() - 0.5, rows.max() + 0.5]).double()
             found = torch.stack([pixels[:, 0].amin(), pixels[:, 0].amax(), pixels[:, 1].amin(), pixels[:, 1].amax()])
             torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
@@ -57,7 +57,7 @@ def test_silhouette_bounds_cut_nothing_off(views: ViewDataset, count: int, sides
     """Every opaque pixel of every training view within 60 degrees of a billboard's normal lies on that billboard."""
     cloud = start_cloud(views.train, FitConfig(billboards=count, placement="even", sides=sides, bounds="silhouette", texel_density=1))
     camera = views.train.cameras.to(torch.float32)
-    cosines = facing(camera, cloud.normals, convergence_point(views.train.cameras).float()).abs()
+    cosines = facing_cosines(camera, cloud.normals, convergence_point(views.train.cameras).float()).abs()
     matrices = torch.linalg.inv(texel_to_pixel(cloud, camera))
     checked = 0
     for view in range(len(views.train)):
@@ -78,7 +78,7 @@ def test_silhouette_bounds_are_tight(views: ViewDataset) -> None:
     """Each of a billboard's four edges is touched, to a texel, by the silhouette of some view that the billboard faces best."""
     cloud = start_cloud(views.train, FitConfig(billboards=2, bounds="silhouette", texel_density=1))
     camera = views.train.cameras.to(torch.float32)
-    cosines = facing(camera, cloud.normals, convergence_point(views.train.cameras).float()).abs()
+    cosines = facing_cosines(camera, cloud.normals, convergence_point(views.train.cameras).float()).abs()
     matrices = torch.linalg.inv(texel_to_pixel(cloud, camera))
     for n in range(2):
         reached = []
@@ -108,7 +108,7 @@ def test_unbounded_billboards_fill_the_viewport_of_a_facing_camera(views: ViewDa
     camera = views.train.cameras.to(torch.float32)
     size = torch.tensor([camera.width, camera.height])
     assert cloud.texture_sizes.tolist() == [[camera.height, camera.width]] * 4
-    cosines = facing(camera, cloud.normals, convergence_point(views.train.cameras).float())
+    cosines = facing_cosines(camera, cloud.normals, convergence_point(views.train.cameras).float())
     view, n = divmod(int(cosines.argmax()), 4)
     assert cosines[view, n] > 1 - 1e-6
     corners = torch.tensor([[-0.5, -0.5, 1], [size[0] - 0.5, size[1] - 0.5, 1]])

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, seen_across, splatted, split_planes
+from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, splatted, split_planes, view_projection
 from bbfit.fitting.initialize import sized
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.cloud import BillboardCloud
@@ -72,21 +72,21 @@ def cost_of(planes: Planes, points: Tensor, camera: Camera) -> float:
 
 
 def test_a_ring_sees_all_of_what_goes_up_and_half_of_what_goes_sideways(ring: Camera) -> None:
-    torch.testing.assert_close(seen_across(ring), torch.diag(torch.tensor([0.5, 1.0, 0.5], dtype=torch.float64)), atol=1e-12, rtol=0)
+    torch.testing.assert_close(view_projection(ring), torch.diag(torch.tensor([0.5, 1.0, 0.5], dtype=torch.float64)), atol=1e-12, rtol=0)
 
 
 def test_a_view_from_above_sees_nothing_of_what_goes_up() -> None:
     pose = look_at(torch.tensor([[0.0, 5.0, 0.0]]).double(), torch.zeros(3).double())
     above = Camera(pose, pinhole_intrinsics(40, 8, 8)[None], 8, 8)
     expected = torch.diag(torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64))
-    torch.testing.assert_close(seen_across(above), expected, atol=1e-12, rtol=0)
-    torch.testing.assert_close(seen_across(above[0]), expected, atol=1e-12, rtol=0)
+    torch.testing.assert_close(view_projection(above), expected, atol=1e-12, rtol=0)
+    torch.testing.assert_close(view_projection(above[0]), expected, atol=1e-12, rtol=0)
 
 
 def test_what_is_seen_is_the_mean_over_views() -> None:
     camera = cameras(9, 20.0, -50.0)
     ways = random_points(20)
-    seen = torch.einsum("pi,ij,pj->p", ways, seen_across(camera), ways)
+    seen = torch.einsum("pi,ij,pj->p", ways, view_projection(camera), ways)
     expected = torch.stack([torch.linalg.cross(ways, forward.expand_as(ways)).square().sum(-1) for forward in camera.forward]).mean(0)
     torch.testing.assert_close(seen, expected)
 
@@ -101,7 +101,7 @@ def test_planted_planes_are_found_exactly(ring: Camera, count: int, upright: boo
     points, normals, offsets = planted(count, 6, upright=upright)
     found = 0
     for seed in range(8):
-        planes = cluster_planes(points, count, seen_across(ring), upright=upright, generator=generator(seed))
+        planes = cluster_planes(points, count, view_projection(ring), upright=upright, generator=generator(seed))
         alike = (planes.normals @ normals.mT).abs()
         match = alike.argmax(0)  # a plane found for each that was planted
         signs = (planes.normals[match] * normals).sum(-1).sign()
@@ -121,7 +121,7 @@ def test_planted_planes_are_found_exactly(ring: Camera, count: int, upright: boo
 def test_planes_cost_no_more_than_random_ones(ring: Camera, count: int, upright: bool) -> None:
     """Than the best of thirty arrangements, and less than half of what these cost on average."""
     points = random_points(800) * torch.tensor([1.0, 2.0, 0.7], dtype=torch.float64)
-    planes = cluster_planes(points, count, seen_across(ring), upright=upright, generator=generator())
+    planes = cluster_planes(points, count, view_projection(ring), upright=upright, generator=generator())
     random = [displacements(points, *random_planes(count, seed, upright=upright), ring).amin(-1).mean() for seed in range(30)]
     assert cost_of(planes, points, ring) < min(*random, 0.5 * sum(random) / 30)
 
@@ -131,7 +131,7 @@ def test_labels_are_of_the_cheapest_plane(upright: bool) -> None:
     """As cameras on two rings see it, from whose height the choice of a plane is another than by plain distance."""
     camera = cameras(9, 70.0, 85.0)
     points = random_points(500)
-    planes = cluster_planes(points, 7, seen_across(camera), upright=upright, generator=generator(3))
+    planes = cluster_planes(points, 7, view_projection(camera), upright=upright, generator=generator(3))
     labels = displacements(points, planes.normals, planes.offsets, camera).argmin(-1)
     assert planes.labels.dtype == torch.int64 and torch.equal(planes.labels, labels)
     nearest = (points @ planes.normals.mT - planes.offsets).abs().argmin(-1)
@@ -140,14 +140,14 @@ def test_labels_are_of_the_cheapest_plane(upright: bool) -> None:
 
 @pytest.mark.parametrize("upright", [True, False])
 def test_normals_have_unit_length_and_of_upright_planes_no_height(ring: Camera, upright: bool) -> None:
-    planes = cluster_planes(random_points(300), 6, seen_across(ring), upright=upright, generator=generator())
+    planes = cluster_planes(random_points(300), 6, view_projection(ring), upright=upright, generator=generator())
     assert planes.normals.dtype == planes.offsets.dtype == torch.float64
     torch.testing.assert_close(planes.normals.norm(dim=-1), torch.ones(6, dtype=torch.float64))
     assert (planes.normals[:, 1] == 0).all() if upright else (planes.normals[:, 1] != 0).all()
 
 
 def test_planes_are_seeded(ring: Camera) -> None:
-    points, seen = random_points(300), seen_across(ring)
+    points, seen = random_points(300), view_projection(ring)
     first, again, other = (cluster_planes(points, 5, seen, upright=False, generator=generator(seed)) for seed in (0, 0, 1))
     assert torch.equal(first.normals, again.normals) and torch.equal(first.labels, again.labels)
     assert not torch.equal(first.normals, other.normals)
@@ -157,7 +157,7 @@ def test_planes_are_seeded(ring: Camera) -> None:
 def test_no_plane_is_left_with_next_to_nothing(ring: Camera, upright: bool) -> None:
     """Twenty planes for 200 points: without a new beginning where points are far, one start in two leaves a plane with fewer than three."""
     for seed in range(20):
-        planes = cluster_planes(random_points(200, seed), 20, seen_across(ring), upright=upright, generator=generator(seed))
+        planes = cluster_planes(random_points(200, seed), 20, view_projection(ring), upright=upright, generator=generator(seed))
         assert torch.bincount(planes.labels, minlength=20).min() >= 3
 
 
@@ -166,7 +166,7 @@ def test_more_planes_than_there_are_to_be_found(ring: Camera, upright: bool) -> 
     points, _, _ = planted(2, 3, upright=upright)
     costs = []
     for seed in range(6):
-        planes = cluster_planes(points, 6, seen_across(ring), upright=upright, generator=generator(seed))
+        planes = cluster_planes(points, 6, view_projection(ring), upright=upright, generator=generator(seed))
         assert planes.normals.shape == (6, 3) and planes.normals.isfinite().all() and planes.offsets.isfinite().all()
         costs.append(cost_of(planes, points, ring))
     assert sorted(costs)[3] < 1e-18  # half of the starts at least
@@ -176,7 +176,7 @@ def test_more_planes_than_there_are_to_be_found(ring: Camera, upright: bool) -> 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
 def test_very_few_points(ring: Camera, count: int, upright: bool) -> None:
     points = random_points(count)
-    planes = cluster_planes(points, 5, seen_across(ring), upright=upright, generator=generator())
+    planes = cluster_planes(points, 5, view_projection(ring), upright=upright, generator=generator())
     assert planes.labels.shape == (count,) and (planes.labels >= 0).all() and (planes.labels < 5).all()
     torch.testing.assert_close(planes.normals.norm(dim=-1), torch.ones(5, dtype=torch.float64))
     assert planes.offsets.isfinite().all() and (not upright or (planes.normals[:, 1] == 0).all())
@@ -188,7 +188,7 @@ def test_very_few_points(ring: Camera, count: int, upright: bool) -> None:
 
 def test_points_that_all_lie_in_one_place(ring: Camera) -> None:
     points = torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64).repeat(50, 1)
-    planes = cluster_planes(points, 4, seen_across(ring), upright=False, generator=generator())
+    planes = cluster_planes(points, 4, view_projection(ring), upright=False, generator=generator())
     assert cost_of(planes, points, ring) < 1e-18 and planes.normals.isfinite().all()
     cloud = rectangles(points, planes, DENSITY, MARGIN, two_sided=False)
     torch.testing.assert_close((cloud.centers - points[:1]).norm(dim=-1)[planes.labels], torch.zeros(50, dtype=torch.float64))
@@ -231,7 +231,7 @@ def test_rectangles_lie_in_their_plane_with_axes_at_right_angles(normal: tuple[f
 @pytest.mark.parametrize("upright", [True, False])
 def test_rectangles_hold_their_points_and_the_margin_and_little_more(ring: Camera, upright: bool) -> None:
     points = random_points(600) * torch.tensor([1.0, 2.0, 0.3], dtype=torch.float64)
-    planes = cluster_planes(points, 7, seen_across(ring), upright=upright, generator=generator())
+    planes = cluster_planes(points, 7, view_projection(ring), upright=upright, generator=generator())
     cloud = rectangles(points, planes, DENSITY, MARGIN, two_sided=False)
     for n in range(7):
         reach = on_rectangle(cloud, n, points[planes.labels == n])
@@ -418,13 +418,13 @@ def test_split_planes_find_two_sheets(ring: Camera, upright: bool, across: int) 
     """Parallel ones, a pace apart, seen through noise; and a bent sheet."""
     points = random_points(400)
     points[:, across] = 0.02 * points[:, across] + torch.where(torch.arange(400) % 2 == 0, 0.5, -0.5)
-    planes = split_planes(points, torch.eye(3), seen_across(ring), upright=upright)
+    planes = split_planes(points, torch.eye(3), view_projection(ring), upright=upright)
     assert planes.normals[:, across].abs().min() > 0.99 and planes.offsets.abs().sub(0.5).abs().max() < 0.05
     assert planes.labels.bincount().tolist() == [200, 200] and len(planes.labels[::2].unique()) == len(planes.labels[1::2].unique()) == 1
 
 
 def test_split_planes_are_upright_where_they_have_to_be(ring: Camera) -> None:
-    points, seen = random_points(300), seen_across(ring)
+    points, seen = random_points(300), view_projection(ring)
     upright, free = (split_planes(points, torch.eye(3), seen, upright=must) for must in (True, False))
     assert (upright.normals[:, 1] == 0).all()
 
@@ -437,5 +437,5 @@ def test_split_planes_are_upright_where_they_have_to_be(ring: Camera) -> None:
 
 def test_few_points_split_as_well(ring: Camera) -> None:
     for count in (1, 2, 3, 5):
-        planes = split_planes(random_points(count), torch.eye(3), seen_across(ring), upright=False)
+        planes = split_planes(random_points(count), torch.eye(3), view_projection(ring), upright=False)
         assert planes.normals.isfinite().all() and planes.offsets.isfinite().all() and len(planes.labels) == count

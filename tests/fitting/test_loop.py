@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from bbfit.checks import InputError
+from bbfit.checks import InputError, MissingFileError
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
 from bbfit.fitting.levels import LEAST_SIDE
-from bbfit.fitting.loop import FitResult, ResolutionLevel, Step, drawn_as, fit, learning_rate, levels_of, sample_views
+from bbfit.fitting.loop import FitResult, ResolutionLevel, Step, fit, learning_rate, resolution_levels, sample_views, step_alpha
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
@@ -117,12 +117,12 @@ def test_the_fused_fit_is_the_reference_fit(views: ViewDataset, config: FitConfi
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 4, 11, 300])
 def test_levels_share_the_steps(views: ViewDataset, steps: int) -> None:
-    levels = levels_of(FitConfig(steps=steps).resolve(), views.train.cameras)
+    levels = resolution_levels(FitConfig(steps=steps).resolve(), views.train.cameras)
     assert levels[0].begin == 0 and levels[-1].end == steps and levels[-1].halvings == 0
     assert all(a.end == b.begin and a.halvings == b.halvings + 1 for a, b in pairwise(levels))
     assert max(level.end - level.begin for level in levels) - min(level.end - level.begin for level in levels) <= 1
     assert min(views.train.cameras.width, views.train.cameras.height) >> levels[0].halvings >= LEAST_SIDE
-    assert len(levels_of(FitConfig(preset="thesis").resolve(), views.train.cameras)) == 1
+    assert len(resolution_levels(FitConfig(preset="thesis").resolve(), views.train.cameras)) == 1
 
 
 def test_same_seed_same_result_other_seed_another(views: ViewDataset) -> None:
@@ -155,7 +155,7 @@ def test_a_snapshot_is_a_copy_of_the_cloud_at_its_level(views: ViewDataset) -> N
     config, seen = quick(alpha="blend", billboards=2, placement="even", placement_learning_rate=0, steps=8), []
     result = fit(views, config, on_step=lambda step: seen.append(step.snapshot()))
     sizes = [tuple(cloud.texture_sizes[0].tolist()) for cloud in seen]
-    assert sizes == sorted(sizes) and len(set(sizes)) == len(levels_of(config.resolve(), views.train.cameras)) > 1
+    assert sizes == sorted(sizes) and len(set(sizes)) == len(resolution_levels(config.resolve(), views.train.cameras)) > 1
     assert not torch.equal(seen[-1].texels, seen[-2].texels)
     visible = result.cloud.texels[:, 3] > 0
     assert torch.equal(seen[-1].texels[visible], result.cloud.texels[visible])
@@ -182,10 +182,10 @@ def test_a_checkpoint_that_does_not_fit_is_not_used(views: ViewDataset, tmp_path
 
 def test_held_out_views_are_not_opened(views_folder: Path) -> None:
     views = ViewDataset.load(views_folder)
-    opened = []
-    test = dataclasses.replace(views.test, _cache=type("Watch", (), {"get": lambda self, path: opened.append(path)})())
-    fit(dataclasses.replace(views, test=test), quick(billboards=1, steps=2))
-    assert opened == []
+    missing = dataclasses.replace(views.test, paths=tuple(path.with_name("missing.png") for path in views.test.paths))
+    with pytest.raises(MissingFileError):
+        missing.image(0)
+    fit(dataclasses.replace(views, test=missing), quick(billboards=1, steps=2))
 
 
 def test_batches_deal_every_view_equally_often() -> None:
@@ -252,26 +252,26 @@ def test_unknown_device_is_refused(views: ViewDataset) -> None:
 @pytest.mark.parametrize("cutoff", [0.3, 0.5])
 def test_a_fit_for_mask_is_better_cut_off_than_one_for_blend(data_views: ViewDataset, cutoff: float) -> None:
     """And covers as much of views that it was not fitted to as the tree does; it is drawn with the texels that 8 bits hold."""
-    config = FitConfig(billboards=4, placement="even", placement_learning_rate=0, alpha_cutoff=cutoff)
+    config = FitConfig(billboards=3, placement="even", placement_learning_rate=0, alpha_cutoff=cutoff, steps=100)
     masked, blended = (fit(data_views, dataclasses.replace(config, alpha=alpha)).cloud for alpha in ("mask", "blend"))
     assert masked.alpha == AlphaMode("mask", cutoff) and blended.alpha == AlphaMode("blend", cutoff)
     cut = dataclasses.replace(blended, alpha=masked.alpha)
     test = data_views.test
     gain = over_white(masked, test) - over_white(cut, test)
-    assert gain > 0.5  # measured: 0.86 and 0.82 dB
+    assert gain > 0.5  # measured: 0.57 and 0.58 dB
     covered = render_reference(masked, test.cameras)[..., 3].mean() / test.targets(range(len(test)))[..., 3].mean()
-    assert abs(float(covered) - 1) < 0.04  # measured: 0.01 to 0.02
+    assert abs(float(covered) - 1) < 0.04  # measured: 0.015 and 0.017
     assert torch.equal((masked.texels * 255).round() / 255, masked.texels)
 
 
 def test_a_mask_hardens_at_full_resolution_only() -> None:
     config = FitConfig(steps=80).resolve()
     coarse, fine = ResolutionLevel(1, 40, 60), ResolutionLevel(0, 60, 80)
-    assert all(drawn_as(config, coarse, index) == AlphaMode() for index in range(40, 60))
-    modes = [drawn_as(config, fine, index) for index in range(60, 80)]
+    assert all(step_alpha(config, coarse, index) == AlphaMode() for index in range(40, 60))
+    modes = [step_alpha(config, fine, index) for index in range(60, 80)]
     hardness = [mode.hardness for mode in modes]
     assert hardness[0] == 2 and hardness == sorted(hardness) and math.isinf(hardness[6]) and math.isinf(hardness[-1])
     assert all(mode.kind == "mask" and mode.cutoff == 0.5 for mode in modes)
-    assert drawn_as(FitConfig(alpha_cutoff=0.1).resolve(), ResolutionLevel(0, 0, 8), 0).hardness == 5
+    assert step_alpha(FitConfig(alpha_cutoff=0.1).resolve(), ResolutionLevel(0, 0, 8), 0).hardness == 5
     for alpha in ("blend", "hash"):
-        assert drawn_as(FitConfig(alpha=alpha).resolve(), fine, 79) == AlphaMode()
+        assert step_alpha(FitConfig(alpha=alpha).resolve(), fine, 79) == AlphaMode()

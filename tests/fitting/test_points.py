@@ -18,6 +18,7 @@ from bbfit.checks import InputError, MissingFileError
 from bbfit.fitting.points import hull_points, mesh_points, pixels_of, point_colors
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.orbit import Orbit
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset, ViewSet
 
 PLY_OF_POINTS = """ply
@@ -59,7 +60,7 @@ def tree() -> trimesh.Trimesh:
 
 @pytest.fixture(scope="module")
 def on_mesh(views: ViewSet) -> Tensor:
-    return mesh_points(DATA / "tree.glb", views)
+    return mesh_points(TreeFile.open(DATA / "tree.glb"), views)
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +112,7 @@ def test_every_face_of_a_box_gets_its_share(anywhere: ViewSet, tmp_path: Path) -
     low, high = np.array([-0.1, 0.0, -0.6]), np.array([0.2, 0.5, 0.5])
     box(tuple(low), tuple(high)).export(tmp_path / "box.glb")
     count = 6000
-    points = mesh_points(tmp_path / "box.glb", anywhere, count=count).numpy()
+    points = mesh_points(TreeFile.open(tmp_path / "box.glb"), anywhere, count=count).numpy()
     assert points.shape == (count, 3)
     faces = np.abs(np.concatenate([points - low, points - high], -1)) < 1e-6
     assert (faces.sum(-1) == 1).all() and (points > low - 1e-6).all() and (points < high + 1e-6).all()
@@ -121,8 +122,8 @@ def test_every_face_of_a_box_gets_its_share(anywhere: ViewSet, tmp_path: Path) -
 
 
 def test_points_of_a_mesh_are_seeded(on_mesh: Tensor, views: ViewSet) -> None:
-    assert torch.equal(mesh_points(DATA / "tree.glb", views, seed=0), on_mesh)
-    other = mesh_points(DATA / "tree.glb", views, seed=1)
+    assert torch.equal(mesh_points(TreeFile.open(DATA / "tree.glb"), views, seed=0), on_mesh)
+    other = mesh_points(TreeFile.open(DATA / "tree.glb"), views, seed=1)
     assert not (other[:, None] == on_mesh[None, :100]).all(-1).any()
 
 
@@ -135,7 +136,7 @@ def test_z_up_files_are_turned_and_others_are_not(anywhere: ViewSet, tmp_path: P
             (tmp_path / part.replace("model", "tree")).write_bytes(data)
     else:
         mesh.export(tmp_path / name, file_type=ending)
-    points = mesh_points(tmp_path / name, anywhere, count=500)
+    points = mesh_points(TreeFile.open(tmp_path / name), anywhere, count=500)
     low, high = ((0.0, 0.6, -0.5), (0.1, 0.9, -0.2)) if ending in ("ply", "stl") else ((0.0, 0.2, 0.6), (0.1, 0.5, 0.9))
     torch.testing.assert_close(points.amin(0), torch.tensor(low, dtype=torch.float64), atol=0.01, rtol=0)
     torch.testing.assert_close(points.amax(0), torch.tensor(high, dtype=torch.float64), atol=0.01, rtol=0)
@@ -147,7 +148,7 @@ def test_all_meshes_of_a_scene_count_where_the_scene_puts_them(anywhere: ViewSet
         cube = box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1))
         scene.add_geometry(cube, geom_name=name, transform=trimesh.transformations.translation_matrix(shift))
     scene.export(tmp_path / "tree.glb")
-    points = mesh_points(tmp_path / "tree.glb", anywhere, count=500)
+    points = mesh_points(TreeFile.open(tmp_path / "tree.glb"), anywhere, count=500)
     crown = points[:, 1] > 0
     assert 150 < int(crown.sum()) < 350
     assert ((points[crown] - torch.tensor([0.0, 0.5, 0.25])).abs() < 0.1 + 1e-6).all()
@@ -156,7 +157,7 @@ def test_all_meshes_of_a_scene_count_where_the_scene_puts_them(anywhere: ViewSet
 
 def test_a_missing_mesh_is_said_to_be_missing(views: ViewSet, tmp_path: Path) -> None:
     with pytest.raises(MissingFileError, match=r"^tree: .*tree\.glb does not exist"):
-        mesh_points(tmp_path / "tree.glb", views)
+        mesh_points(TreeFile.open(tmp_path / "tree.glb"), views)
 
 
 @pytest.mark.parametrize("ending", ["fbx", "blend", "usdz"])
@@ -164,7 +165,7 @@ def test_what_only_blender_reads_is_refused(views: ViewSet, tmp_path: Path, endi
     path = tmp_path / f"tree.{ending}"
     path.write_bytes(b"Kaydara FBX Binary")
     with pytest.raises(InputError, match=rf"^tree: .*tree\.{ending} .*only Blender.*\.glb \.gltf \.obj \.ply \.stl"):
-        mesh_points(path, views)
+        mesh_points(TreeFile.open(path), views)
 
 
 @pytest.mark.parametrize("spoil", ["cut short", "no glTF at all", "empty"])
@@ -175,7 +176,7 @@ def test_a_damaged_mesh_is_refused(views: ViewSet, tmp_path: Path, spoil: str) -
         InputError,
         match=r"^tree: .*tree\.glb " + {"cut short": "is cut short", "no glTF at all": "is not a glTF", "empty": "is empty"}[spoil],
     ):
-        mesh_points(path, views)
+        mesh_points(TreeFile.open(path), views)
 
 
 @pytest.mark.parametrize(
@@ -189,7 +190,7 @@ def test_a_damaged_mesh_is_refused(views: ViewSet, tmp_path: Path, spoil: str) -
 def test_a_mesh_without_triangles_is_refused(views: ViewSet, tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text, encoding="ascii")
     with pytest.raises(InputError, match=rf"^tree: .*{name} has no triangles"):
-        mesh_points(tmp_path / name, views)
+        mesh_points(TreeFile.open(tmp_path / name), views)
 
 
 @pytest.mark.parametrize(
@@ -210,14 +211,14 @@ def test_a_mesh_that_the_views_do_not_show_is_refused(
     change(other)
     other.export(tmp_path / "other.glb")
     with pytest.raises(InputError, match=r"^tree: .*other\.glb is not where the views show a tree"):
-        mesh_points(tmp_path / "other.glb", views)
+        mesh_points(TreeFile.open(tmp_path / "other.glb"), views)
 
 
 def test_a_mesh_of_another_tree_is_refused(views: ViewSet, tree: trimesh.Trimesh, tmp_path: Path) -> None:
     """A dense crown of the same width and height, since its outline is fuller than the tree's."""
     box(*(tuple(corner) for corner in tree.bounds)).export(tmp_path / "other.glb")
     with pytest.raises(InputError, match="is not where the views show a tree"):
-        mesh_points(tmp_path / "other.glb", views)
+        mesh_points(TreeFile.open(tmp_path / "other.glb"), views)
 
 
 # Hull
@@ -307,11 +308,10 @@ def test_nothing_is_lost_of_silhouettes_that_are_shrunk() -> None:
     torch.testing.assert_close(whole, expected, atol=1e-9, rtol=0)
 
 
-def test_a_hull_that_few_points_hit_is_found_in_several_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hull_that_few_points_hit_is_found_in_several_rounds() -> None:
     """One in a hundred of the first round lies in this ball; later rounds look around where these were, and as evenly."""
-    monkeypatch.setattr("bbfit.fitting.points._CARVED", 1 << 14)
     radius = 0.3
-    points = hull_points(ball_views(12, 64, 64, radius), count=4000)
+    points = hull_points(ball_views(12, 64, 64, radius), count=4000, batch=1 << 14)
     assert len(points) == 4000
     low, high = points.amin(0), points.amax(0)
     assert (low < -radius + 0.03).all() and (high > radius - 0.03).all()
@@ -328,13 +328,12 @@ def test_seen_from_above_or_below_the_hull_of_a_ball_is_not_much_more_either(ele
     assert radius < points.norm(dim=-1).max() < 1.1 * radius / math.cos(math.radians(elevation))
 
 
-def test_silhouettes_that_contradict_each_other_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silhouettes_that_contradict_each_other_are_refused() -> None:
     """Nothing can be on the left from all sides."""
-    monkeypatch.setattr("bbfit.fitting.points._CARVED", 1 << 14)  # dozens of vain rounds take a while
     pictures = torch.zeros(4, 32, 32, 4, dtype=torch.uint8)
     pictures[:, 8:24, 2:10] = 255
     with pytest.raises(InputError, match=r"^views: .*no point in common"):
-        hull_points(viewset(pictures, ring_around_origin(4, 32, 32)))
+        hull_points(viewset(pictures, ring_around_origin(4, 32, 32)), batch=1 << 14)  # dozens of vain rounds take a while
 
 
 # Colors

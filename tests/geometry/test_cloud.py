@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from full_disk import FULL, full_disk
 from safetensors.torch import save_file
 
 from bbfit.checks import InputError, MissingFileError
@@ -209,16 +210,11 @@ def test_an_empty_cloud_is_saved(tmp_path: Path) -> None:
     assert len(BillboardCloud.load(tmp_path / "cloud.safetensors")) == 0
 
 
-def test_a_failed_save_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_save_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "cloud.safetensors"
     small_cloud().save(path)
     before = path.read_bytes()
-
-    def full_disk(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full_disk)
-    with pytest.raises(InputError, match="No space left"):
+    with full_disk(), pytest.raises(InputError, match=FULL):
         small_cloud(torch.float64).save(path)
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == [path.name]
 

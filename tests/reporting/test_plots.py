@@ -13,6 +13,7 @@ from billboard_scene import crossing_billboards, write_views
 from bbfit.budget.choice import Choice, Trial
 from bbfit.checks import InputError
 from bbfit.evaluation.scoring import held_out
+from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig, Placement, Sides
 from bbfit.images import over_color, to_bytes
 from bbfit.reporting.plots import Cost, comparison_picture, loss_plot, pareto_plot, running_mean, spread_views
@@ -36,11 +37,11 @@ def test_comparison_holds_the_pictures_unchanged(tmp_path: Path, width: int) -> 
     cloud = crossing_billboards()
     views = write_views(tmp_path, cloud, width=width).test
     worse = cloud.with_texels(cloud.texels**2)
-    comparison_picture(worse, views, tmp_path / "out.png", count=3, title="two crossing")
+    comparison_picture(shipped_model(worse), views, tmp_path / "out.png", count=3, title="two crossing")
     sheet = read(tmp_path / "out.png")
     places = []
     for index in spread_views(np.array([[0, 0], [90, 0], [180, 0], [270, 0]]), 3):
-        pair = [to_bytes(over_color(picture)) for picture in held_out(worse, views, index)]
+        pair = [to_bytes(over_color(picture)) for picture in held_out(shipped_model(worse).draw, views, index)]
         places.append([find(sheet, picture) for picture in pair])
     assert all(place is not None for row in places for place in row)
     array = np.array(places)  # [view, target or result, row or column]
@@ -52,7 +53,7 @@ def test_comparison_of_equal_pictures_has_a_black_difference(tmp_path: Path) -> 
     """Rounding to bytes stays within a FLIP of 0.03 (measured 0.024): magma's first shades, (0, 0, 4) to (3, 3, 16)."""
     cloud = crossing_billboards()
     views = write_views(tmp_path, cloud, width=240, height=200).test
-    comparison_picture(cloud, views, tmp_path / "out.png", count=1)
+    comparison_picture(shipped_model(cloud), views, tmp_path / "out.png", count=1)
     sheet = read(tmp_path / "out.png").astype(int)
     dark = (sheet <= (3, 3, 16)).all(-1)
     assert dark.sum() >= 240 * 200
@@ -66,10 +67,10 @@ def test_comparison_keeps_the_old_file_when_it_fails(tmp_path: Path) -> None:
     path.write_bytes(b"old")
     views.paths[0].write_bytes(views.paths[0].read_bytes()[:100])
     with pytest.raises(InputError, match="cut short"):
-        comparison_picture(cloud, views, path)
+        comparison_picture(shipped_model(cloud), views, path)
     assert path.read_bytes() == b"old"
     with pytest.raises(InputError, match="count: expected at least 1"):
-        comparison_picture(cloud, views, path, count=0)
+        comparison_picture(shipped_model(cloud), views, path, count=0)
 
 
 def test_spread_views() -> None:

@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import io
 
-import pytest
 from rich.console import Console
 
-from bbfit.reporting import progress
+from bbfit.reporting.progress import progress_bars
 
 
-def told(console: Console) -> None:
-    with progress.progress_bars(console) as tell:
+def report(console: Console, **options: float) -> None:
+    """Report two stages of three and two units."""
+    with progress_bars(console, **options) as on_progress:
         for stage, count in (("views", 3), ("fit", 2)):
             for done in range(count + 1):
-                tell(stage, done, count, f"note {done}")
+                on_progress(stage, done, count, f"note {done}")
 
 
-def test_a_log_gets_a_line_for_each_finished_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_gets_a_line_for_each_finished_stage() -> None:
     text = io.StringIO()
-    told(Console(file=text))
+    report(Console(file=text))
     assert text.getvalue() == "views 3/3 note 3\nfit 2/2 note 2\n"
-    monkeypatch.setattr(progress, "_EVERY", 0.0)
-    told(Console(file=text))
+    report(Console(file=text), log_interval=0.0)
     assert len(text.getvalue().splitlines()) == 2 + 4 + 3
 
 
 def test_a_terminal_gets_a_bar_for_each_stage() -> None:
     text = io.StringIO()
-    told(Console(file=text, force_terminal=True, width=100))
+    report(Console(file=text, force_terminal=True, width=100))
     assert all(word in text.getvalue() for word in ("views", "3/3", "fit", "2/2", "note 2"))

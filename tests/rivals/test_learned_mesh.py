@@ -23,13 +23,12 @@ from bbfit.glb import split_glb
 from bbfit.images import to_bytes, unpremultiply, write_png
 from bbfit.layout import write_transforms
 from bbfit.rendering.dispatch import render
-from bbfit.rivals import mesh_rays, mesh_silhouettes
 from bbfit.rivals.learned_mesh import LearnedMesh, learn_mesh, mesh_glb, refine_mesh
-from bbfit.rivals.mesh_charts import unfold
 from bbfit.rivals.mesh_hull import hull_surface
 from bbfit.rivals.mesh_rays import RayCaster, pixel_rays
 from bbfit.rivals.mesh_silhouettes import Surface, boundary_gradient
 from bbfit.views import ViewDataset
+from bbfit.xatlas_process import unfolded
 
 
 def quad(cloud: BillboardCloud) -> LearnedMesh:
@@ -145,7 +144,7 @@ def painted_ball() -> LearnedMesh:
     """An opaque ball of one meter about (0, 1.5, 0), its colors smooth in the place."""
     ball = trimesh.creation.icosphere(3, 1.0)
     points, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
-    source, corners, uvs = unfold(points, faces, 128)
+    source, corners, uvs = unfolded(points, faces, 128)
     texture = smooth_texture(128, 128, 4)
     texture[..., 3] = 1
     places = torch.from_numpy(points[source] + np.array([0, 1.5, 0])).float()
@@ -175,12 +174,11 @@ def test_a_mesh_is_learned_from_views_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("kind", ["plain", "painted"])
-def test_gradients_of_a_weighted_sum_of_pixels_are_exact(axis: int, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradients_of_a_weighted_sum_of_pixels_are_exact(axis: int, kind: str) -> None:
     """The sum grows, as a ball moves along weights that grow by 1 a pixel, by all that is seen of it times the pixels of a meter.
 
     For one color, all of it comes from the silhouettes. Error measured: 0.8 %, -0.8 %, 2.5 % and 1.0 %, by few and random samples.
     """
-    monkeypatch.setattr(mesh_silhouettes, "BOUNDARY_SAMPLES", 16)
     camera, grid = oblique_camera(True), 4
     ball = trimesh.creation.icosphere(1, 1.0)
     points, faces = torch.tensor(ball.vertices + np.array([0, 1.5, 0])).float(), torch.tensor(ball.faces)
@@ -198,7 +196,7 @@ def test_gradients_of_a_weighted_sum_of_pixels_are_exact(axis: int, kind: str, m
     rays = pixel_rays(camera, torch.rand(32 * 40 * grid**2, 2, generator=random), grid)
     slope, moved, _ = caster.gradients(*rays, texture, grid**2, slope_of_sum)
     ordered = surface.points(surface.latent(points))
-    outer = boundary_gradient(surface, ordered, camera, slope, partial(caster.colors, texture=texture), random)
+    outer = boundary_gradient(surface, ordered, camera, slope, partial(caster.colors, texture=texture), random, 16)
     along = camera.world_to_camera[axis, :3].float()  # the picture's axis in the world
     got = float((moved.sum(0) + outer.sum(0)) @ along)
     expected = float(camera.intrinsics[axis, axis] * seen[0].sum())
@@ -221,7 +219,7 @@ def test_charts_keep_shapes_and_do_not_overlap() -> None:
     """On a knot, where charts must be cut. All triangles have texels in proportion to their seen size, and no two share a texel."""
     shape = trimesh.creation.torus(2.0, 0.7, major_sections=18, minor_sections=9)
     points, faces = np.asarray(shape.vertices), np.asarray(shape.faces)
-    source, corners, uvs = unfold(points, faces, 256)
+    source, corners, uvs = unfolded(points, faces, 256)
     assert np.array_equal(source[corners], faces)
     assert uvs.min() > 0 and uvs.max() < 1
     flat = uvs[corners] * 256
@@ -234,27 +232,29 @@ def test_charts_keep_shapes_and_do_not_overlap() -> None:
         owners[inside] = face
     areas = np.abs(np.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])) / 2
     density = areas / shape.area_faces
-    assert density.min() > 0.149 * density.max()  # seen from no more than FLATNESS aside
+    assert density.min() > 0.4 * density.max()  # measured 0.68; the charts of an earlier method had 0.15
 
 
 def test_a_texture_without_room_is_refused() -> None:
     shape = trimesh.creation.torus(2.0, 0.7, major_sections=18, minor_sections=9)
     with pytest.raises(InputError, match="texels: 8 are too few"):
-        unfold(np.asarray(shape.vertices), np.asarray(shape.faces), 8)
+        unfolded(np.asarray(shape.vertices), np.asarray(shape.faces), 8)
 
 
-def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "mitsuba", None)
-    mesh_rays._libraries.cache_clear()
-    with pytest.raises(InputError, match=r"Mitsuba is not installed; pip install 'bbfit\[rivals\]'"):
-        quad(painted_billboard()).draw(oblique_camera(False))
+CAST = "import torch; from bbfit.rivals.mesh_rays import RayCaster; RayCaster(torch.tensor([[0, 1, 2]]), torch.zeros(3, 2))"
+
+
+def test_a_missing_library_is_named() -> None:
+    """In a process of its own, where nothing has imported it before."""
+    script = f"import sys; sys.modules['mitsuba'] = None; {CAST}"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert "InputError: learned mesh: Mitsuba is not installed; pip install 'bbfit[rivals]'" in done.stderr
 
 
 def test_missing_llvm_is_named() -> None:
     """In a process of its own: Dr.Jit looks for LLVM once."""
-    script = "from bbfit.rivals.mesh_rays import _libraries; _libraries()"
     environment = os.environ | {"DRJIT_LIBLLVM_PATH": os.devnull}
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", CAST], env=environment, capture_output=True, text=True)
     assert "InputError: learned mesh: Mitsuba cannot use LLVM" in done.stderr
     assert "DRJIT_LIBLLVM_PATH" in done.stderr
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bbfit.checks import InputError
-from bbfit.sweep.cluster import RayWorkers, place_files, read_files
+from bbfit.sweep.cluster import RayWorkers, read_files, write_files
 from bbfit.sweep.config import SweepConfig
 
 
@@ -29,5 +29,15 @@ def test_files_are_read_and_placed_as_they_lie(tmp_path: Path) -> None:
     assert read_files(tree) == {"tree.gltf": b"g"}
     assert read_files(tree, part) == {"tree.gltf": b"g", "more/part.bin": b"b"}
     assert read_files(tmp_path / "tree") == {"more/part.bin": b"b", "other.txt": b"o", "tree.gltf": b"g"}
-    place_files(read_files(tmp_path / "tree"), tmp_path / "copy")
+    write_files(read_files(tmp_path / "tree"), tmp_path / "copy")
     assert (tmp_path / "copy" / "more" / "part.bin").read_bytes() == b"b"
+
+
+def test_files_outside_the_folder_of_a_tree_are_refused(tmp_path: Path) -> None:
+    """Their copies would lie outside the folder of the task."""
+    (tmp_path / "tree").mkdir()
+    for name in ("tree/tree.obj", "bark.png"):
+        (tmp_path / name).write_bytes(b"x")
+    for outside in (tmp_path / "bark.png", tmp_path / "tree" / ".." / "bark.png"):
+        with pytest.raises(InputError, match=r"ray: .*bark\.png lies outside .*tree; put all files of a tree into one folder"):
+            read_files(tmp_path / "tree" / "tree.obj", outside)

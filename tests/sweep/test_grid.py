@@ -62,25 +62,25 @@ def test_axes_and_variants_can_be_narrowed() -> None:
         ("double", 6, "l1"),
         ("base", 6, "l1"),
     ]
-    with pytest.raises(InputError, match="variants: there is no 'triple' in this grid; there are base, bounded, double, double bounded"):
+    with pytest.raises(InputError, match="this grid has no variant 'triple'; its variants are base, bounded, double, double bounded"):
         Grid.load("thesis").narrowed(SweepConfig(variants=("triple",)))
 
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("axes: {bilboards: [2]}", "'bilboards' is no option of a fit"),
-        ("fit: {nonsense: 2}", "'nonsense' is no option of a fit"),
-        ("variants: {a: {nonsense: 2}}", "'nonsense' is no option of a fit"),
-        ("axes: {billboards: 2}", "axis billboards in .* is no list"),
+        ("axes: {bilboards: [2]}", "'bilboards' is not an option of a fit"),
+        ("fit: {nonsense: 2}", "'nonsense' is not an option of a fit"),
+        ("variants: {a: {nonsense: 2}}", "'nonsense' is not an option of a fit"),
+        ("axes: {billboards: 2}", "axis billboards in .* is not a list"),
         ("axes: {billboards: []}", "axis billboards has no values"),
         ("axes: {billboards: [2, 2]}", "axis billboards has a value twice"),
-        ("axes: {billboards: [[2]]}", r"\[2\] is no value of an option"),
-        ("axes: [2]", "axes in .* is no mapping"),
-        ("trees: acer", "trees in .* is no list"),
-        ("variants: {a: 3}", "variant a in .* is no mapping"),
+        ("axes: {billboards: [[2]]}", r"\[2\] is not the value of an option"),
+        ("axes: [2]", "axes in .* is not a mapping"),
+        ("trees: acer", "trees in .* is not a list"),
+        ("variants: {a: 3}", "variant a in .* is not a mapping"),
         ("axis: {}", "has the key 'axis'"),
-        ("- 1", "holds no mapping"),
+        ("- 1", "is not a mapping"),
         ("fit: {", "is not valid YAML"),
         ("fit: !!python/object/apply:os.getcwd []", "is not valid YAML"),
         ("axes: {billboards: [2, -1]}", "grid: -1: billboards: expected at least 1, got -1"),
@@ -95,7 +95,7 @@ def test_bad_grids_are_refused(text: str, complaint: str, tmp_path: Path) -> Non
 
 
 def test_unknown_grids_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"'thesiss' is neither built in nor a .yaml file; built in are default, thesis"):
+    with pytest.raises(InputError, match=r"'thesiss' is neither built in nor a .yaml file; the built-in grids are default, thesis"):
         Grid.load("thesiss")
     with pytest.raises(MissingFileError, match="does not exist"):
         Grid.load(str(tmp_path / "none.yaml"))

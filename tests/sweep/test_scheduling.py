@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -118,14 +117,21 @@ def test_what_is_damaged_or_depends_on_something_else_is_made_anew(done: SweepRe
 def test_a_killed_sweep_goes_on_where_it_was(done: SweepResult, two_trees: list[Path], tmp_path: Path) -> None:
     """Killed with all its processes after the third result."""
     folder = tmp_path / "killed"
-    options = ["--steps", "12", "--workers", "2", "--loss", "l1", "l2", "--billboards", "2", "3", "--variants", "base", "double"]
-    command = [sys.executable, "-m", "bbfit.cli", "sweep", "--out", str(folder), "--views", *map(str, two_trees), *options]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while len(list((folder / "results").glob("*.json"))) < 3:
-        assert process.poll() is None
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    script = tmp_path / "sweep.py"
+    script.write_text(f"""
+import os, signal, sys
+from pathlib import Path
+from bbfit.sweep.config import SweepConfig
+from bbfit.sweep.scheduling import run_sweep
+
+def kill(stage, done, total, note=""):
+    if stage == "runs" and done == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+if __name__ == "__main__":
+    run_sweep(Path({str(folder)!r}), {QUICK!r}, views=[Path(name) for name in sys.argv[1:]], on_progress=kill)
+""")
+    assert subprocess.run([sys.executable, str(script), *map(str, two_trees)]).returncode == -signal.SIGKILL
     before = times(folder)
     result = run_sweep(folder, QUICK, views=two_trees)
     assert 3 <= result.kept == len(before) < 16 and {name: times(folder)[name] for name in before} == before
@@ -219,7 +225,7 @@ def test_trees_have_names_of_their_own(tmp_path: Path) -> None:
     trees = [tmp_path / name / "tree.glb" for name in ("oak", "elm")]
     assert [source.name for source in sources(["acer"], trees, [])] == ["acer", "oak_tree", "elm_tree"]
     assert [source.name for source in sources([], trees[:1], [tmp_path / "elm" / "views"])] == ["tree", "elm"]
-    with pytest.raises(InputError, match=r"two trees are called \w+_oak; rename one, or leave one out"):
+    with pytest.raises(InputError, match=r"two trees are called \w+_oak; rename one, or omit one"):
         sources([], [], [tmp_path / "oak" / "views"] * 2)
     with pytest.raises(InputError, match="two trees are called acer"):
         sources(["acer", "acer"], [], [])
@@ -232,6 +238,6 @@ def test_trees_have_names_of_their_own(tmp_path: Path) -> None:
 def test_budgets_are_refused(tmp_path: Path, two_trees: list[Path]) -> None:
     from bbfit.budget.config import BudgetConfig
 
-    with pytest.raises(InputError, match="budget: a sweep tries what its grid says"):
+    with pytest.raises(InputError, match="budget: a sweep runs the configurations of its grid"):
         run_sweep(tmp_path / "out", QUICK, RunConfig(budget=BudgetConfig(vertices=8)), views=two_trees)
     assert not (tmp_path / "out").exists()

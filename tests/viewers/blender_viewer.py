@@ -47,9 +47,7 @@ def render_blender(model: Path, camera: Camera, *, samples: int = 1) -> NDArray[
         }
         # Its own folder for what Blender leaves behind, and no settings or add-ons of the user's.
         environment = os.environ | dict.fromkeys(("TMPDIR", "TEMP", "TMP", "BLENDER_USER_RESOURCES"), folder)
-        done = subprocess.run(
-            [sys.executable, "-P", str(SCRIPT)], input=json.dumps(job), capture_output=True, text=True, env=environment, timeout=300
-        )
+        done = subprocess.run([sys.executable, "-P", str(SCRIPT)], input=json.dumps(job), capture_output=True, text=True, env=environment)
         assert done.returncode == 0, done.stderr
         pictures = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted(Path(folder).glob("*.png"))]
     images = np.stack(pictures)[..., [2, 1, 0, 3]] / 65535.0

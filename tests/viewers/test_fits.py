@@ -15,7 +15,7 @@ from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import evaluate, held_out
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import LodLevel, lod_glb
-from bbfit.exporting.model import as_shipped, export, shipped_cards
+from bbfit.exporting.model import export, shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import fit
 from bbfit.geometry.cloud import BillboardCloud
@@ -37,13 +37,16 @@ def views() -> ViewDataset:
 @pytest.fixture(scope="module")
 def fits(views: ViewDataset) -> dict[str, BillboardCloud]:
     """Four crossing billboards fitted for either mode."""
-    config = FitConfig(billboards=4, placement="even", placement_learning_rate=0, steps=400)
+    config = FitConfig(billboards=4, placement="even", placement_learning_rate=0, steps=150)
     return {alpha: fit(views, replace(config, alpha=alpha)).cloud for alpha in ("mask", "blend")}  # type: ignore[arg-type]
 
 
 def psnrs(pictures: NDArray[np.float64], cloud: BillboardCloud, views: ViewDataset) -> tuple[float, float, float]:
     """Of a viewer's pictures: against bbfit's own renders, against the targets, and of bbfit's renders against the targets."""
-    pairs = [[over_color(picture).numpy() for picture in held_out(cloud, views.test, index)] for index in range(len(views.test))]
+    pairs = [
+        [over_color(picture).numpy() for picture in held_out(shipped_model(cloud).draw, views.test, index)]
+        for index in range(len(views.test))
+    ]
     against_render = metrics.psnr(np.stack([render for _, render in pairs]), pictures)
     against_target = float(np.mean([metrics.psnr(target, picture) for (target, _), picture in zip(pairs, pictures, strict=True)]))
     return against_render, against_target, evaluate(cloud, views.test).mean.over_white.psnr
@@ -60,7 +63,7 @@ def test_three_shows_what_was_scored(
     """
     config = ExportConfig(profile="three")
     (path,) = export(fits[alpha], tmp_path / "model.glb", config)
-    show, shipped = three.show(path, views.test.cameras), as_shipped(fits[alpha], config)
+    show, shipped = three.show(path, views.test.cameras), shipped_model(fits[alpha], config).cloud
     _, score, told = psnrs(show.images, shipped, views)
     assert abs(score - told) <= SCORE
     cameras = views.test.cameras.resized(2 * views.test.cameras.width, 2 * views.test.cameras.height)
@@ -89,7 +92,7 @@ def test_three_shows_mip_levels_as_dense_as_the_views_from_afar(
     """
     config = ExportConfig(profile="three", textures="ktx2", fallback=False)
     (path,) = export(fits["mask"], tmp_path / "model.glb", config)
-    cards = shipped_cards(fits["mask"], config)
+    cards = shipped_model(fits["mask"], config).cards
     wanted = float(views.test.targets(range(len(views.test)))[..., 3].mean())
     width, height = views.test.cameras.width, views.test.cameras.height
     for halving in (1, 2, 3):

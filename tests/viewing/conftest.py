@@ -1,4 +1,4 @@
-"""A small finished run, a browser, and a page on that run."""
+"""A small finished run, a browser, and the viewer of that run."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from page_browser import Tab, open_tabs, wait_for
+from page_browser import Tab, open_tabs
 
+import bbfit
 from bbfit.fitting.config import FitConfig
 from bbfit.pipeline import RunConfig, run
-from bbfit.viewing.page import Page
-from bbfit.viewing.subject import open_run
-from bbfit.viewing.visitor import Visitor
+from bbfit.viewing.server import Viewer
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 FIT = FitConfig(billboards=4, placement="even", steps=120)
@@ -32,12 +31,9 @@ def browse() -> Iterator[Callable[[str], Tab]]:
 
 
 @pytest.fixture(scope="module")
-def seen(small_run: Path, browse: Callable[[str], Tab]) -> Iterator[tuple[Page, Visitor, Tab]]:
-    """A page on the small run, its one visitor, and that visitor's browser."""
-    with Page(port=0) as page:
-        page.show(open_run(small_run))
-        tab = browse(page.url)
-        visitor = wait_for(lambda: next(iter(page.visitors), None))
-        wait_for(lambda: "being measured" not in visitor.panel.readout.content if hasattr(visitor, "panel") else False)
-        wait_for(lambda: "vertices" in tab.text("#bbfit-label-1"))
-        yield page, visitor, tab
+def opened(small_run: Path, browse: Callable[[str], Tab]) -> Iterator[tuple[Viewer, Tab]]:
+    """The viewer of the small run, once its billboards are measured, and a tab on it."""
+    with bbfit.view(small_run, port=0) as viewer:
+        tab = browse(viewer.url)
+        tab.wait_until("bbfit.viewer.state.tree && !bbfit.viewer.state.tree.measuring")
+        yield viewer, tab

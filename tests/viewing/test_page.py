@@ -1,32 +1,36 @@
-"""The page in a real browser."""
+"""The viewer's page in a real browser."""
 
 from __future__ import annotations
 
+import json
+import math
 import re
-import socket
-import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from urllib.parse import urlparse
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from page_browser import Tab, colored, halves, wait_for
+from page_browser import Tab, colored, wait_for
+from playwright.sync_api import Page
 
-from bbfit.viewing.page import Page
-from bbfit.viewing.panel import BILLBOARDS, BOTH, BY_DISTANCE, FIELD, ORIGINAL
-from bbfit.viewing.visitor import Visitor
+from bbfit.exporting.lod import glb_counts
+from bbfit.viewing.server import Viewer
 
-Seen = tuple[Page, Visitor, Tab]
+Opened = tuple[Viewer, Tab]
+DATA = Path(__file__).resolve().parents[2] / "data"
 
 
 @pytest.fixture(autouse=True)
-def at_the_start(seen: Seen) -> Iterator[None]:
-    """Every test begins with both trees side by side, and ends without complaints of the browser."""
-    _, visitor, tab = seen
-    panel = visitor.panel
-    panel.show.value, panel.alpha.value, panel.outlines.value, panel.level.value = BOTH, "mask", False, "4 billboards"
-    visitor.look_at_tree()
+def at_the_start(opened: Opened) -> Iterator[None]:
+    """Every test begins with both trees side by side, and ends without errors in the browser."""
+    _, tab = opened
+    tab.select("show", "both")
+    tab.select("alpha", "mask")
+    tab.select("level", "1")
+    tab.do(lambda page: page.get_by_label("plane outlines").uncheck())
+    tab.evaluate("bbfit.viewer.fitTree()")
     yield
     assert not tab.errors
 
@@ -48,134 +52,218 @@ def foot(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     return np.array([high, np.nonzero(trunk)[1].mean()])
 
 
-def test_both_trees_stand_in_the_same_place_of_their_panes(seen: Seen) -> None:
-    """From one camera: what is seen of them coincides, and they have about the same color."""
-    left, right = halves(seen[2].still())
+def test_both_trees_are_in_the_same_place_of_their_panes(opened: Opened) -> None:
+    """They are seen by one camera: their pictures coincide, and they have about the same color."""
+    left, right = opened[1].picture("left"), opened[1].picture("right")
     ours, theirs = colored(right), colored(left)
     assert theirs.mean() > 0.02
-    # Measured: a pane is 288 pixels wide, the trunks' feet are within a pixel of each other, the silhouettes' IoU is 0.53, the colors
-    # differ by 10. Crowns of four planes do not reach as far as the tree's everywhere.
+    # Crowns of four planes do not reach as far as the tree's everywhere.
     np.testing.assert_allclose(foot(ours), foot(theirs), atol=2)
     assert (ours & theirs).sum() / (ours | theirs).sum() > 0.4
     assert abs(left[theirs].mean(0) - right[ours].mean(0)).max() < 20
 
 
-def test_the_trees_stand_upright_on_the_ground(seen: Seen) -> None:
+def test_the_tree_is_upright_on_the_ground_and_fills_its_pane(opened: Opened) -> None:
     """The trunk is narrow and below, the crown above; the camera looks a little down at the tree's middle."""
-    left, _ = halves(seen[2].still())
+    left = opened[1].picture("left")
     low, high = box(colored(left))[:2]
     widths = colored(left).sum(1)
     assert widths[high - (high - low) // 10 : high].mean() < 0.3 * widths[low : (low + high) // 2].mean()
     assert abs((low + high) / 2 - left.shape[0] / 2) < 0.1 * left.shape[0]
+    assert 0.7 < (high - low) / left.shape[0] < 1
 
 
-def test_nothing_is_asked_of_another_machine(seen: Seen) -> None:
-    hosts = {urlparse(url).netloc for url in seen[2].requests if urlparse(url).scheme not in ("data", "blob")}
-    assert hosts == {urlparse(seen[0].url).netloc}
+def test_nothing_is_requested_from_another_machine(opened: Opened) -> None:
+    hosts = {urlparse(url).netloc for url in opened[1].requests if urlparse(url).scheme not in ("data", "blob")}
+    assert hosts == {urlparse(opened[0].url).netloc}
 
 
-def test_the_page_listens_on_one_address_only(seen: Seen) -> None:
-    port = urlparse(seen[0].url).port
-    with socket.create_connection(("127.0.0.1", port), 5):
-        pass
-    with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.2", port), 5)
+def test_headers_describe_the_models(opened: Opened) -> None:
+    _, tab = opened
+    tab.picture("left")
+    vertices = glb_counts((DATA / "tree.glb").read_bytes())[0]
+    assert tab.text("#left header").startswith(f"original{vertices:,} vertices · ")
+    assert re.fullmatch(r"4 billboards16 vertices · \d+ KiB · mask", tab.text("#right header"))
 
 
-def test_outlines_are_drawn_around_the_billboards_alone_by_a_click(seen: Seen) -> None:
-    _, visitor, tab = seen
-    before = halves(tab.still())
+def test_outlines_are_drawn_around_the_billboards_alone(opened: Opened) -> None:
+    _, tab = opened
+    before = tab.picture("left"), tab.picture("right")
     tab.do(lambda page: page.get_by_label("plane outlines").click())
-    wait_for(lambda: visitor.panel.outlines.value)
-    after = halves(tab.still())
-    np.testing.assert_array_equal(before[0], after[0])
-    assert (colored(after[1]) & ~colored(before[1])).sum() > 300
+    np.testing.assert_array_equal(before[0], tab.picture("left"))
+    changed = abs(before[1] - tab.picture("right")).max(-1) > 16
+    assert changed.sum() > 300
 
 
 @pytest.mark.parametrize("alpha", ["blend", "hash"])
-def test_alpha_modes_change_the_billboards_alone(seen: Seen, alpha: str) -> None:
-    _, visitor, tab = seen
-    before = halves(tab.still())
-    visitor.panel.alpha.value = alpha
-    wait_for(lambda: f" · {alpha}" in tab.text("#bbfit-label-1") and "KiB" in tab.text("#bbfit-label-1"))
-    after = halves(tab.still())
-    np.testing.assert_array_equal(before[0], after[0])
-    assert (abs(before[1] - after[1]).max(-1) > 16).mean() > 0.005
-    assert ("glTF has no hash" in visitor.panel.alpha_note.content) == (alpha == "hash")
+def test_alpha_modes_change_the_billboards_alone(opened: Opened, alpha: str) -> None:
+    _, tab = opened
+    before = tab.picture("left"), tab.picture("right")
+    tab.select("alpha", alpha)
+    np.testing.assert_array_equal(before[0], tab.picture("left"))
+    assert (abs(before[1] - tab.picture("right")).max(-1) > 16).mean() > 0.005
+    assert f" · {alpha}" in tab.text("#right header")
+    assert "fitted for mask" in tab.text("#alpha-note")
+    assert ("glTF has no hash" in tab.text("#alpha-note")) == (alpha == "hash")
 
 
-def test_one_at_a_time_either_fills_the_picture(seen: Seen) -> None:
-    _, visitor, tab = seen
-    visitor.panel.show.value = ORIGINAL
-    original = tab.still()
-    visitor.panel.show.value = BILLBOARDS
-    billboards = tab.still()
+def test_a_model_can_be_cut_up_for_sorting(opened: Opened) -> None:
+    _, tab = opened
+    assert tab.do(lambda page: page.get_by_label("cut up").is_disabled())
+    tab.select("alpha", "blend")
+    tab.picture("right")
+    tab.do(lambda page: page.get_by_label("cut up").check())
+    assert colored(tab.picture("right")).mean() > 0.02
+    assert "blend, cut up" in tab.text("#right header")
+    assert int(re.search(r"([\d,]+) vertices", tab.text("#right header"))[1].replace(",", "")) > 16  # type: ignore[index]
+    tab.do(lambda page: page.get_by_label("cut up").uncheck())
+
+
+def test_either_tree_alone_fills_the_picture(opened: Opened) -> None:
+    _, tab = opened
+    tab.select("show", "original")
+    original = tab.picture("left")
+    tab.select("show", "billboards")
+    billboards = tab.picture("right")
     ours, theirs = colored(billboards), colored(original)
+    assert original.shape[1] > 550
     assert (ours & theirs).sum() / (ours | theirs).sum() > 0.4
-    assert abs(box(theirs)[2:].mean() - original.shape[1] / 2) < 20
-    assert tab.text("#bbfit-label-0").startswith("4 billboards")
+    assert abs(box(theirs)[2:].mean() - original.shape[1] / 2) < 30
+    assert 0.7 < np.diff(box(theirs)[:2])[0] / original.shape[0] < 1
 
 
-def test_the_level_follows_the_distance(seen: Seen) -> None:
-    """Near, the original stands in both panes; from where its error does not show, the billboards do."""
-    _, visitor, tab = seen
-    (distance,) = [level.distance(visitor.picture.pixels_a_meter(1.0)) for level in visitor.subject.clouds]
-    assert distance is not None
-    visitor.panel.level.value = BY_DISTANCE
-    visitor.panel.meters.value = 0.9 * distance
-    wait_for(lambda: tab.text("#bbfit-label-1").startswith("original"))
-    left, right = halves(tab.still())
-    assert abs(left - right).max() <= 24  # measured: 12, where lines of the ground are thinner than a pixel
-    visitor.panel.meters.value = 1.1 * distance
-    wait_for(lambda: tab.text("#bbfit-label-1").startswith("4 billboards"))
-    left, right = halves(tab.still())
-    assert abs(left - right).max() > 24
+def test_the_level_follows_the_distance(opened: Opened) -> None:
+    """Near, the original is in both panes; the billboards are from where their error does not show."""
+    _, tab = opened
+    tab.select("level", "distance")
+    distance = tab.evaluate("bbfit.viewer.focalLength() / bbfit.viewer.state.tree.levels[1].scale")
+
+    def go(meters: float) -> None:
+        tab.do(lambda page: (page.get_by_label("in meters").fill(str(meters)), page.keyboard.press("Enter")))
+
+    go(0.9 * distance)
+    assert abs(tab.picture("left") - tab.picture("right")).max() <= 24  # where lines of the ground are thinner than a pixel
+    assert tab.text("#right header").startswith("original")
+    go(1.1 * distance)
+    assert abs(tab.picture("left") - tab.picture("right")).max() > 24
+    assert tab.text("#right header").startswith("4 billboards")
+    assert tab.text("#levels .now").startswith("4 billboards: from ")
 
 
-def test_slider_and_camera_follow_each_other(seen: Seen) -> None:
-    _, visitor, tab = seen
-    visitor.panel.slider.value = 120
-    assert visitor.distance == pytest.approx(visitor.panel.reach.distance(120), rel=1e-6)
-    assert visitor.panel.meters.value == pytest.approx(visitor.distance, rel=1e-3)
-    far = visitor.panel.meters.value
-    tab.still()  # the browser's camera is there
-
-    def nearer() -> bool:
-        tab.do(lambda page: (page.mouse.move(150, 200), page.mouse.wheel(0, -600)))  # towards the tree
-        time.sleep(0.5)
-        return visitor.panel.meters.value < 0.9 * far
-
-    wait_for(nearer)
-    wait_for(lambda: visitor.panel.slider.value == visitor.panel.reach.step(visitor.distance))
+def test_the_coarsest_level_that_may_be_shown_is_chosen(opened: Opened) -> None:
+    levels = [{"scale": None}, {"scale": 40}, {"scale": 10}, {"scale": None}]
+    chosen = opened[1].evaluate(
+        "levels => [100, 40, 39.9, 10, 9.9].map((scale) => bbfit.viewer.chooseLevel(levels, scale))",
+        levels,
+    )
+    assert chosen == [0, 0, 1, 1, 2]
 
 
-def test_ten_thousand_trees_and_the_time_of_a_frame(seen: Seen) -> None:
-    _, visitor, tab = seen
-    visitor.panel.trees.value = 10_000
-    visitor.panel.level.value = BY_DISTANCE
-    tab.do(lambda page: page.get_by_role("button", name="Plant").click())
-    wait_for(lambda: tab.text("#bbfit-label-0").startswith("10,000 trees"))
-    picture = tab.still()
-    frame = tab.frame()
-    planted = visitor.planted
-    assert planted is not None
-    assert sum(planted.counts) == 10_000
-    assert planted.counts[-1] > planted.counts[0]
-    # Those in front of the camera: 8 triangles each, and the ground.
-    assert 10_000 < frame["triangles"] <= 80_000 + 2
-    assert frame["calls"] <= len(planted.counts) + 2
+def test_a_meter_is_as_large_as_a_pinhole_camera_shows_it(opened: Opened) -> None:
+    """Half of the pane's height is seen under half of the field of view."""
+    _, tab = opened
+    focal, fov, height = tab.evaluate(
+        "[bbfit.viewer.focalLength(), bbfit.viewer.orbit.camera.fov, document.querySelector('#right .area').clientHeight]"
+    )
+    assert focal * math.tan(math.radians(fov / 2)) == pytest.approx(height / 2)
+
+
+def test_steps_of_the_slider_are_equal_factors(opened: Opened) -> None:
+    _, tab = opened
+    distances = tab.evaluate("Array.from({ length: 201 }, (_, step) => bbfit.viewer.distanceOf(step))")
+    np.testing.assert_allclose(np.diff(np.log(distances)), np.log(400) / 200, rtol=1e-9)
+    assert tab.evaluate("distances => distances.map(bbfit.viewer.stepOf)", distances) == list(range(201))
+    assert tab.evaluate("bbfit.viewer.stepOf(0)") == 0
+
+
+def test_slider_and_camera_follow_each_other(opened: Opened) -> None:
+    _, tab = opened
+    slider = "const slider = document.querySelector('[name=slider]');"
+    tab.evaluate(f"() => {{ {slider} slider.value = 120; slider.dispatchEvent(new Event('input')); }}")
+    far = tab.evaluate("bbfit.viewer.orbit.distance")
+    assert far == pytest.approx(tab.evaluate("bbfit.viewer.distanceOf(120)"))
+    tab.wait_until("bbfit.viewer.idle")
+    assert float(tab.evaluate("document.querySelector('[name=meters]').value")) == pytest.approx(far, rel=1e-3)
+    tab.do(lambda page: (page.mouse.move(150, 200), page.mouse.wheel(0, -600)))
+    tab.wait_until(f"bbfit.viewer.orbit.distance < {0.9 * far}")
+    tab.wait_until("document.querySelector('[name=slider]').value == bbfit.viewer.stepOf(bbfit.viewer.orbit.distance)")
+
+
+def test_dragging_turns_the_camera_and_keeps_it_upright(opened: Opened) -> None:
+    _, tab = opened
+    before = tab.picture("left")
+
+    def drag(page: Page) -> None:
+        page.mouse.move(150, 200)
+        page.mouse.down()
+        page.mouse.move(210, 2000, steps=4)
+        page.mouse.up()
+
+    tab.do(drag)
+    tab.wait_until("bbfit.viewer.orbit.elevation > 1.5")
+    assert -0.7 < tab.evaluate("bbfit.viewer.orbit.azimuth") < -0.4
+    right = tab.evaluate("[...bbfit.viewer.orbit.camera.matrixWorld.elements].slice(0, 3)")
+    assert abs(right[1]) < 1e-6
+    assert (tab.picture("left") != before).any()
+
+
+def test_ten_thousand_trees_and_the_time_of_a_frame(opened: Opened) -> None:
+    _, tab = opened
+    tab.select("level", "distance")
+    tab.do(lambda page: (page.get_by_label("trees").fill("10000"), page.get_by_role("button", name="Plant").click()))
+    tab.wait_until("bbfit.viewer.field?.places.length === 10000 && bbfit.viewer.idle")
+    picture = tab.picture("right")
+    frame, counts = tab.evaluate("[bbfit.viewer.frame, bbfit.viewer.field.counts]")
+    assert tab.text("#right header").startswith("10,000 trees")
+    assert sum(counts) == 10_000
+    assert counts[-1] > counts[0]
+    assert frame["triangles"] == 80_000  # 8 for each tree
+    assert frame["calls"] <= len(counts) + 1
     assert colored(picture)[picture.shape[0] // 2 :].mean() > 0.3
-    assert re.search(r"\d ms a frame \(\d+ a second\) · drawing takes \d", tab.text("#bbfit-frame"))
-    # Frames that are drawn one after the other come no faster than they are drawn.
-    assert len(frame["intervals"]) > 0
+    assert re.search(r"\d ms per frame \(\d+ per second\) · \d+\.\d ms to draw", tab.text("#frame"))
     assert np.median(frame["intervals"]) > 0.5 * np.median(frame["durations"]) > 0
+    tab.select("show", "both")
+    assert colored(tab.picture("left")).mean() > 0.02
 
 
-def test_a_second_visitor_has_controls_of_its_own(seen: Seen, browse: Callable[[str], Tab]) -> None:
-    page, visitor, _ = seen
-    tab = browse(page.url)
-    other = wait_for(lambda: next((each for each in page.visitors if each is not visitor and hasattr(each, "panel")), None))
-    other.panel.show.value = FIELD
-    assert visitor.panel.show.value == BOTH
+def test_every_tab_has_controls_of_its_own(opened: Opened, browse: Callable[[str], Tab]) -> None:
+    viewer, tab = opened
+    other = browse(viewer.url)
+    other.picture("left")
+    other.select("show", "original")
+    assert tab.evaluate("document.querySelector('[name=show]').value") == "both"
+    other.do(lambda page: page.close())
+    assert colored(tab.picture("left")).mean() > 0.02
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (700, 500), (1280, 800)])
+def test_nothing_is_covered_or_cut_off(opened: Opened, browse: Callable[[str], Tab], width: int, height: int) -> None:
+    """Panes, headers and the panel's controls do not overlap on phones or screens, and the page is no wider than the window."""
+    other = browse(opened[0].url)
+    other.do(lambda page: page.set_viewport_size({"width": width, "height": height}))
+    for pane in ("left", "right"):
+        mask = colored(other.picture(pane))
+        edges = box(mask)
+        assert edges[0] > 0 and edges[1] < mask.shape[0] - 1 and edges[2] > 0 and edges[3] < mask.shape[1] - 1
+        assert max(np.diff(edges[:2])[0] / mask.shape[0], np.diff(edges[2:])[0] / mask.shape[1]) > 0.6
+    assert other.evaluate("document.documentElement.scrollWidth") == width
+    boxes = json.loads(
+        other.evaluate("JSON.stringify([...document.querySelectorAll('header, .area, aside')].map((e) => e.getBoundingClientRect()))")
+    )
+    assert len(boxes) == 5
+    for index, one in enumerate(boxes):
+        for two in boxes[:index]:
+            across = min(one["right"], two["right"]) - max(one["left"], two["left"])
+            down = min(one["bottom"], two["bottom"]) - max(one["top"], two["top"])
+            assert min(across, down) < 0.5
+    other.do(lambda page: page.close())
+
+
+def test_the_page_reports_that_the_viewer_has_ended(small_run: Path, browse: Callable[[str], Tab]) -> None:
+    import bbfit
+
+    with bbfit.view(small_run, port=0) as viewer:
+        tab = browse(viewer.url)
+        tab.picture("left")
+    wait_for(lambda: "has ended" in tab.text("#status"))
     tab.do(lambda page: page.close())
-    wait_for(lambda: page.visitors == [visitor])

@@ -1,6 +1,6 @@
 "use strict";
 {
-  const { views, marks } = JSON.parse(document.getElementById("data").textContent);
+  const { views, marks, bounds, layered, glb } = JSON.parse(document.getElementById("data").textContent);
   const slider = document.getElementById("view");
   const images = [...document.querySelectorAll(".strip img")];
   const eye = document.getElementById("plan-eye");
@@ -38,7 +38,33 @@
   });
   show(Number(slider.value));
 
-  // The wheel and a finger scroll the page until the model is asked for, and again once it is out of sight.
+  async function drawModel() {
+    const THREE = await bbfit.library(document.getElementById("library"));
+    const renderer = bbfit.createRenderer(THREE, document.querySelector(".stage canvas")), canvas = renderer.domElement;
+    const scene = new THREE.Scene(), dark = matchMedia("(prefers-color-scheme: dark)");
+    const sun = new THREE.DirectionalLight(0xffffff, 1.75 * Math.PI); // at the camera, for models whose materials are lit
+    const orbit = bbfit.createOrbit(THREE, canvas, () => requestAnimationFrame(draw));
+    scene.add(sun, await bbfit.loadModel(THREE, Uint8Array.from(atob(glb), (byte) => byte.charCodeAt(0)).buffer, layered));
+    const draw = () => {
+      sun.position.copy(orbit.camera.position);
+      scene.background = new THREE.Color(dark.matches ? 0x1d2126 : 0xffffff);
+      renderer.render(scene, orbit.camera);
+    };
+    const resize = () => {
+      renderer.setPixelRatio(devicePixelRatio);
+      renderer.setSize(canvas.clientWidth, canvas.clientHeight, false);
+      orbit.camera.aspect = canvas.clientWidth / canvas.clientHeight;
+      orbit.update();
+    };
+    orbit.fit(...bounds, canvas.clientWidth / canvas.clientHeight);
+    resize();
+    addEventListener("resize", resize);
+    dark.addEventListener("change", draw);
+    bbfit.model = { canvas, camera: orbit.camera, draw };
+  }
+  drawModel();
+
+  // The wheel and a finger scroll the page until the reader clicks the model, and again once it is out of sight.
   const turn = document.getElementById("turn");
   turn.addEventListener("click", () => { turn.hidden = true; });
   new IntersectionObserver((seen) => { if (!seen[0].isIntersecting) turn.hidden = false; }).observe(turn.parentElement);

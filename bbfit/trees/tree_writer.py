@@ -1,4 +1,4 @@
-"""A grown tree as a trimesh scene, and such a scene as a file that other programs open."""
+"""A grown tree as a trimesh scene, written as GLB or OBJ."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     import trimesh
 
 _COLOR = "base_color"
-"""Key of a geometry's metadata for its linear color, of which trimesh's material keeps 8 bits."""
+"""Key of the unrounded linear color in a geometry's metadata; trimesh's material keeps 8 bits."""
 _GLB_LIMIT = 2**32 - 2**20
-"""Bytes of vertices and triangles in a GLB, whose header counts all bytes in 32 bits (glTF 2.0 specification, section 4.4)."""
+"""Limit on bytes of vertices and triangles in a GLB, whose header has a 32-bit length (glTF 2.0 specification, section 4.4)."""
 _VERTEX_BYTES, _TRIANGLE_BYTES = 32, 12
 _ROWS = 1 << 16
-"""Lines of an OBJ that are made at a time."""
+"""Lines of an OBJ that are formatted at a time."""
 
 
 def scene_of(parts: Sequence[Part], *, name: str) -> trimesh.Scene:
-    """The tree as one geometry for each part that has triangles, called as its material is; ``name`` is that of the whole.
+    """One geometry, named after its material, for each part that has triangles; ``name`` is the name of the scene.
 
-    Vertices, triangles and their order stay as they are; trimesh holds them in 64 bits. A material's color stands in full in the
-    geometry's ``metadata["base_color"]``, beside the 8 bits that trimesh's material has for it.
+    Vertices, triangles and their order are unchanged; trimesh stores them in 64 bits. trimesh's material keeps 8 bits of the color, the
+    geometry's ``metadata["base_color"]`` all of it.
     """
     import trimesh
 
@@ -62,23 +62,24 @@ def scene_of(parts: Sequence[Part], *, name: str) -> trimesh.Scene:
 def write_tree(scene: trimesh.Scene, path: str | Path) -> list[Path]:
     """Write a tree as GLB (one file) or as OBJ with an MTL of the same stem, by the ending of ``path``; Y up, meters.
 
-    A GLB holds the numbers of the parts bit for bit, but v, which glTF counts downwards and which is rounded to float32 as 1 - v. An
-    OBJ has nine digits, which give every float32 back. The same scene gives the same bytes.
+    A GLB stores the arrays bit for bit, except v: glTF counts it downwards, and 1 - v is rounded to float32. An OBJ has nine digits, enough
+    to restore every float32. The same scene gives the same bytes.
 
-    An MTL holds the linear color as Kd: neither Wavefront's description nor Blender converts it. Its other figures are those for which
-    Blender's importer sets up the very surface that it makes of the GLB.
+    An MTL holds the linear color as Kd: neither Wavefront's description nor Blender converts it. Its other values make Blender's
+    importer create the same surface as from the GLB.
 
     Returns
     -------
-    The files written, the model first.
+    list[Path]
+        The files written, the model first.
 
     Raises
     ------
     InputError
-        for another ending; for a scene without triangles, with a geometry that has no texture coordinates or no PBR material, or
-        too large for a GLB; if the disk is full or the folder cannot be written to, and then no file is left half written.
+        If the path has another ending; if the scene has no triangles, a geometry without texture coordinates or PBR material, or is too
+        large for a GLB; if the disk is full or the folder cannot be written to. No partial file is left.
     MissingFileError
-        if the folder does not exist.
+        If the folder does not exist.
     """
     path = check_model_path("tree", path)
     _check(scene)
@@ -104,7 +105,7 @@ def _check(scene: trimesh.Scene) -> None:
 
 
 def _base_color(mesh: Any) -> list[float]:
-    """Linear RGBA: in full where the material still has the color that the tree was grown with, otherwise the material's."""
+    """Linear RGBA: unrounded if the material still has the color that the tree was grown with, otherwise the material's."""
     factor = mesh.visual.material.baseColorFactor
     shown = [1.0] * 4 if factor is None else (np.asarray(factor) / 255).tolist()
     full = mesh.metadata.get(_COLOR, shown[:3])
@@ -113,7 +114,7 @@ def _base_color(mesh: Any) -> list[float]:
 
 
 def _complete(tree: dict[str, Any], scene: trimesh.Scene) -> None:
-    """Give the glTF the scene's name and its colors in full."""
+    """Add the scene's name and the unrounded colors to the glTF."""
     (stage,) = tree["scenes"]
     extras = stage.pop("extras", {})
     if "name" in extras:
@@ -125,10 +126,10 @@ def _complete(tree: dict[str, Any], scene: trimesh.Scene) -> None:
 
 
 def _mtl(scene: trimesh.Scene) -> str:
-    """One material for each geometry, called as that is.
+    """One material for each geometry, with the geometry's name.
 
-    Blender takes Pr for the roughness; programs without that extension have the Ns of the same roughness in Blender's mapping. Ks of 0.5
-    is in Blender the 4% of a dielectric with Ni 1.5.
+    Blender reads the roughness from Pr; for other programs, Ns is the same roughness in Blender's mapping. In Blender, a Ks of 0.5 is
+    the 4% reflectance of a dielectric with Ni 1.5.
     """
     lines = [f"# {generator()}"]
     for name, mesh in scene.geometry.items():

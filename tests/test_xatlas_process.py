@@ -1,15 +1,14 @@
-"""Packing by xatlas in a process of its own; that nothing overlaps is shown on the atlases in test_atlas.py."""
+"""xatlas in a process of its own; test_atlas.py and test_learned_mesh.py show that nothing overlaps."""
 
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bbfit.exporting.packing import packed
+from bbfit.xatlas_process import packed
 
 CELLS = np.array([[3, 3], [4, 5], [2, 9], [40, 2]])
 
@@ -23,7 +22,7 @@ def test_the_same_every_time_from_the_origin_on() -> None:
 def test_modules_are_found_wherever_this_process_finds_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a notebook, say, that has put the project's folder on its path by hand."""
     (tmp_path / "xatlas.py").write_text("import os; os.write(1, b'[[0, 0, 5, 7]]'); os._exit(0)")
-    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
     assert packed(np.array([[5, 7]])).tolist() == [[0, 0]]
 
@@ -31,14 +30,14 @@ def test_modules_are_found_wherever_this_process_finds_them(tmp_path: Path, monk
 @pytest.mark.parametrize("answer", ["[]", "[[0, 0, 5, 6]]", "[[0, 0, 5, 7], [5, 0, 10, 7]]"])
 def test_a_wrong_answer_is_refused(answer: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "xatlas.py").write_text(f"import os; os.write(1, b'{answer}'); os._exit(0)")
-    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(AssertionError, match="xatlas"):
         packed(np.array([[5, 7]]))
 
 
 def test_a_process_that_fails_is_not_taken_for_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "xatlas.py").write_text("raise ImportError('broken')")
-    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(subprocess.CalledProcessError):
         packed(CELLS)
 
@@ -57,5 +56,5 @@ class Atlas:
     def __del__(self): open({str(trace)!r}, "w").close()
 """
     (tmp_path / "xatlas.py").write_text(stand_in)
-    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.syspath_prepend(tmp_path)
     assert packed(np.array([[5, 7]])).tolist() == [[0, 0]] and not trace.exists()

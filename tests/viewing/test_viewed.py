@@ -14,10 +14,9 @@ import trimesh
 
 from bbfit.checks import InputError, MissingFileError
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.geometry.extent import corners
 from bbfit.glb import joined_glb, split_glb
 from bbfit.viewing.originals import find_original
-from bbfit.viewing.subject import open_run, outlines
+from bbfit.viewing.viewed import open_results
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 
@@ -29,17 +28,16 @@ def copied(small_run: Path, tmp_path: Path) -> Path:
 
 
 def test_a_run_has_its_tree_and_its_billboards(small_run: Path) -> None:
-    subject = open_run(small_run)
-    assert subject.original.glb == (DATA / "tree.glb").read_bytes()
-    assert subject.original.vertices == 17699
-    assert [level.name for level in subject.levels] == ["original", "4 billboards"]
-    assert [level.scale for level in subject.levels] == [math.inf, None]
-    assert subject.views == (DATA / "views").resolve()
-    assert subject.export.textures == "png"
+    tree = open_results(small_run)
+    assert tree.original.glb == (DATA / "tree.glb").read_bytes()
+    assert [level.name for level in tree.levels] == ["original", "4 billboards"]
+    assert [level.scale for level in tree.levels] == [math.inf, None]
+    assert tree.views == (DATA / "views").resolve()
+    assert tree.export.textures == "png"
     # What the billboards show is where the tree is.
     known = np.array(json.loads((DATA / "views" / "views.json").read_text())["tree"]["bounds"])
-    np.testing.assert_allclose(subject.bounds[:, 1], known[:, 1], atol=0.1)
-    np.testing.assert_allclose(subject.bounds, known, atol=0.6)
+    np.testing.assert_allclose(tree.bounds[:, 1], known[:, 1], atol=0.1)
+    np.testing.assert_allclose(tree.bounds, known, atol=0.6)
 
 
 def edited(folder: Path, change: dict[str, Any]) -> Path:
@@ -51,47 +49,47 @@ def edited(folder: Path, change: dict[str, Any]) -> Path:
 
 
 def test_a_run_of_views_alone_shows_no_tree_and_says_so(copied: Path) -> None:
-    subject = open_run(edited(copied, {"config": {"tree": None}}))
-    assert [level.name for level in subject.levels] == ["4 billboards"]
-    assert "views alone" in subject.original.note
+    tree = open_results(edited(copied, {"config": {"tree": None}}))
+    assert [level.name for level in tree.levels] == ["4 billboards"]
+    assert "views alone" in tree.original.note
 
 
-@pytest.mark.parametrize(("source", "told"), [("gone.glb", "not there any more"), ("tree.fbx", "only Blender reads tree.fbx")])
-def test_a_tree_that_is_gone_or_takes_blender_is_a_note(copied: Path, tmp_path: Path, source: str, told: str) -> None:
+@pytest.mark.parametrize(("source", "message"), [("gone.glb", "no longer exists"), ("tree.fbx", "only Blender reads tree.fbx")])
+def test_a_tree_that_is_gone_or_takes_blender_is_a_note(copied: Path, tmp_path: Path, source: str, message: str) -> None:
     (tmp_path / "tree.fbx").write_bytes(b"fbx")
-    subject = open_run(edited(copied, {"source": str(tmp_path / source)}))
-    assert subject.original.glb is None
-    assert told in subject.original.note
-    assert len(subject.levels) == 1
+    tree = open_results(edited(copied, {"source": str(tmp_path / source)}))
+    assert tree.original.glb is None
+    assert message in tree.original.note
+    assert len(tree.levels) == 1
 
 
 def test_a_run_without_its_record_is_shown_alone(copied: Path) -> None:
     (copied / "run.json").unlink()
-    subject = open_run(copied)
-    assert len(subject.levels) == 1
-    assert "no run.json" in subject.notes[0]
+    tree = open_results(copied)
+    assert len(tree.levels) == 1
+    assert "no run.json" in tree.notes[0]
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"source": 1, "config": {}}'])
 def test_a_damaged_record_is_an_error(copied: Path, text: str) -> None:
     (copied / "run.json").write_text(text)
     with pytest.raises(InputError, match=r"run\.json"):
-        open_run(copied)
+        open_results(copied)
 
 
 def test_a_damaged_cloud_is_an_error(copied: Path) -> None:
     (copied / "cloud.safetensors").write_bytes(b"no tensors")
     with pytest.raises(InputError, match="damaged"):
-        open_run(copied)
+        open_results(copied)
 
 
 def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MissingFileError, match="does not exist"):
-        open_run(tmp_path / "nothing")
+        open_results(tmp_path / "nothing")
     with pytest.raises(InputError, match="not a folder"):
-        open_run(DATA / "tree.glb")
+        open_results(DATA / "tree.glb")
     with pytest.raises(InputError, match=r"holds no cloud\.safetensors; give the folder that"):
-        open_run(DATA / "views")
+        open_results(DATA / "views")
 
 
 def lod_folder(folder: Path, cloud: BillboardCloud, *, original: bool = True) -> Path:
@@ -109,16 +107,16 @@ def lod_folder(folder: Path, cloud: BillboardCloud, *, original: bool = True) ->
 
 
 def test_levels_of_detail_come_from_their_folder(tmp_path: Path, known_cloud: BillboardCloud) -> None:
-    subject = open_run(lod_folder(tmp_path / "lod", known_cloud))
-    assert [level.name for level in subject.levels] == ["original", "2 billboards", "1 billboard"]
-    assert [level.scale for level in subject.levels] == [math.inf, pytest.approx(100.0), pytest.approx(25.0)]
-    assert subject.export.profile == "three"
+    tree = open_results(lod_folder(tmp_path / "lod", known_cloud))
+    assert [level.name for level in tree.levels] == ["original", "2 billboards", "1 billboard"]
+    assert [level.scale for level in tree.levels] == [math.inf, pytest.approx(100.0), pytest.approx(25.0)]
+    assert tree.export.profile == "three"
 
 
 def test_levels_of_detail_without_the_tree_begin_with_billboards(tmp_path: Path, known_cloud: BillboardCloud) -> None:
-    subject = open_run(lod_folder(tmp_path / "lod", known_cloud, original=False))
-    assert [(level.name, level.scale) for level in subject.levels] == [("2 billboards", math.inf), ("1 billboard", pytest.approx(25.0))]
-    assert subject.original.glb is not None  # to compare with
+    tree = open_results(lod_folder(tmp_path / "lod", known_cloud, original=False))
+    assert [(level.name, level.scale) for level in tree.levels] == [("2 billboards", math.inf), ("1 billboard", pytest.approx(25.0))]
+    assert tree.original.glb is not None  # to compare with
 
 
 @pytest.mark.parametrize("text", ["{", "{}", '{"config": {"screen_height": 1, "screen_fov_degrees": 50}, "levels": []}'])
@@ -126,16 +124,7 @@ def test_damaged_levels_of_detail_are_an_error(tmp_path: Path, known_cloud: Bill
     folder = lod_folder(tmp_path / "lod", known_cloud)
     (folder / "lod.json").write_text(text)
     with pytest.raises(InputError, match=r"lod\.json"):
-        open_run(folder)
-
-
-def test_outlines_go_around_every_billboard(known_cloud: BillboardCloud) -> None:
-    segments = outlines(known_cloud)
-    assert segments.shape == (8, 2, 3)
-    around = corners(known_cloud).numpy()
-    np.testing.assert_allclose(segments[:4, 0], around[0], rtol=1e-6)
-    np.testing.assert_array_equal(segments[[0, 1, 2, 3], 1], segments[[1, 2, 3, 0], 0])
-    np.testing.assert_allclose(around.mean(1), known_cloud.centers.numpy(), atol=1e-6)
+        open_results(folder)
 
 
 def test_a_glb_is_sent_as_it_is_up_to_a_size() -> None:

@@ -1,0 +1,179 @@
+"""Which cards rays from all around meet, in which order.
+
+For an order of drawing, only the layers that overlap on the screen matter; the samples list them pair by pair.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bbfit.exporting.hulls import bilinear, rimmed_alpha, texel_corners
+from bbfit.geometry.cards import Card, Cards
+from bbfit.geometry.polygons import sides
+from bbfit.operators.drawing.compositing import TIE
+
+# Pairs of layers with a smaller weight are left out.
+_LEAST_WEIGHT = 1e-4
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The positions and viewing directions of V cameras around the cards."""
+
+    eyes: NDArray[np.float64]
+    """Positions in meters, [V, 3]."""
+    forwards: NDArray[np.float64]
+    """Unit viewing directions, [V, 3]."""
+
+
+@dataclass(frozen=True)
+class VisibilitySamples:
+    """The H hits of rays on sheets of cards, and the N pairs of hits that lie on one ray."""
+
+    cameras: Rig
+    """The cameras that the rays start from."""
+    rectangle: NDArray[np.int64]
+    """The texture of each hit, [H]."""
+    points: NDArray[np.float64]
+    """The place of each hit on its texture in texels, [H, 2]."""
+    camera: NDArray[np.int64]
+    """The camera of each pair, [N]."""
+    front: NDArray[np.int64]
+    """The nearer hit of each pair, [N]."""
+    back: NDArray[np.int64]
+    """The farther hit of each pair, [N]."""
+    weight: NDArray[np.float64]
+    """Share of the visible picture in which these two are the first two opaque layers, if alpha is the probability of being opaque, [N].
+    This share is wrong if the two are drawn in the other order; all weights together are at most 1."""
+
+
+def bounding_sphere(cards: Cards) -> tuple[NDArray[np.float64], float]:
+    """The center of the cards' bounding box, [3], and the distance of the farthest corner from it, in meters."""
+    corners = np.concatenate([card.corners for card in cards.cards])
+    center = (corners.min(0) + corners.max(0)) / 2
+    return center, float(np.linalg.norm(corners - center, axis=-1).max())
+
+
+def fit_rig(cards: Cards, count: int = 420) -> Rig:
+    """The cameras that origins are fitted to: from 22 degrees below the horizon to straight above, at 1.5, 2.5 and 6 radii in turn.
+
+    The directions form a spiral that turns by the golden angle, so no two have the same elevation or azimuth. An order that was fitted to
+    regular rings is wrong more often between the rings.
+    """
+    center, radius = bounding_sphere(cards)
+    index = np.arange(count) + 0.5
+    height = np.sin(np.radians(-22)) + (1 - np.sin(np.radians(-22))) * index / count
+    azimuth = index * np.pi * (3 - np.sqrt(5))
+    across = np.sqrt(1 - height**2)
+    towards = np.stack([across * np.sin(azimuth), height, across * np.cos(azimuth)], -1)
+    distance = np.resize([1.5, 2.5, 6.0], count) * radius
+    return Rig(center + distance[:, None] * towards, -towards)
+
+
+def check_rig(cards: Cards) -> Rig:
+    """The cameras that orders are measured with: 13 on each of five rings at 1.8 and 4 radii, none of them one of :func:`fit_rig`."""
+    center, radius = bounding_sphere(cards)
+    azimuths, distances, towards = 13, (1.8, 4.0), []
+    for number, (_, elevation) in enumerate(itertools.product(distances, (-12.0, 8.0, 31.0, 58.0, 82.0))):
+        azimuth = (np.arange(azimuths) + 0.21 + 0.37 * number) * (2 * np.pi / azimuths)
+        across, height = np.cos(np.radians(elevation)), np.sin(np.radians(elevation))
+        towards.append(np.stack([across * np.sin(azimuth), np.full(azimuths, height), across * np.cos(azimuth)], -1))
+    directions = np.concatenate(towards)
+    return Rig(center + np.repeat(distances, len(directions) // len(distances))[:, None] * radius * directions, -directions)
+
+
+def sample_visibility(cards: Cards, cameras: Rig, across: int = 32) -> VisibilitySamples:
+    """Trace a grid of ``across`` x ``across`` rays from every camera over the cards.
+
+    Cards of one texture are parts of one sheet, which a ray meets once. Layers whose depths differ by less than a relative
+    :data:`~bbfit.operators.drawing.compositing.TIE` have no order.
+    """
+    eyes = cameras.eyes
+    rays, cell = _rays(np.concatenate([card.corners for card in cards.cards]), cameras, across)
+    largest: dict[int, Card] = {}
+    for card in sorted(cards.cards, key=_extent):
+        largest[card.rectangle] = card
+    depth, alpha, points = [], [], []
+    for card in largest.values():
+        middle, at = card.corners.mean(0), texel_corners(cards, card)
+        to_texel = np.linalg.pinv(card.corners - middle) @ (at - at.mean(0))
+        normal, facing = card.normal, (eyes - middle) @ card.normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = -facing[:, None] / (rays @ normal)
+            places = (((eyes - middle) @ to_texel)[:, None] + t[..., None] * (rays @ to_texel)) + at.mean(0)
+        shown = (t > 0) & np.isfinite(t) & (facing > 0 if card.culled else facing != 0)[:, None]
+        opacity = np.where(shown, bilinear(rimmed_alpha(cards, card.rectangle), places), 0.0)
+        depth.append(np.where(opacity > 0, t, np.inf).astype(np.float32))
+        alpha.append(opacity.astype(np.float32))
+        points.append(np.where((opacity > 0)[..., None], places, 0.0).astype(np.float32))
+    rectangle = np.array(list(largest))
+    return _paired(cameras, cell, rectangle, np.stack(depth), np.stack(alpha), np.stack(points))
+
+
+def _extent(card: Card) -> float:
+    return float(np.linalg.norm(np.cross(*(card.corners[1:] - card.corners[0])[[0, -1]])))
+
+
+def _rays(points: NDArray, cameras: Rig, across: int) -> tuple[NDArray, NDArray]:
+    """Ray directions of unit depth through the cells of a grid over the points' picture, [V, R, 3], and the area of a cell, [V]."""
+    eyes, forwards = cameras.eyes, cameras.forwards
+    reference = np.where(abs(forwards[:, 1:2]) < 0.99, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    right = np.cross(forwards, reference)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    up = np.cross(right, forwards)
+    relative = points - eyes[:, None]
+    depth = np.einsum("vpi,vi->vp", relative, forwards)
+    depth = np.maximum(depth, 1e-2 * np.linalg.norm(relative, axis=-1))
+    grid, cell = [], np.ones(len(eyes))
+    steps = (np.arange(across) + 0.5) / across
+    for axis in (right, up):
+        place = np.einsum("vpi,vi->vp", relative, axis) / depth
+        low, high = place.min(1), place.max(1)
+        grid.append(low[:, None] + (high - low)[:, None] * steps)
+        cell *= (high - low) / across
+    cell *= (np.linalg.norm(eyes - points.mean(0), axis=-1)) ** 2  # each camera has the same weight at any distance
+    rays = forwards[:, None, None] + grid[0][:, None, :, None] * right[:, None, None] + grid[1][:, :, None, None] * up[:, None, None]
+    return rays.reshape(len(eyes), -1, 3), cell
+
+
+def _paired(cameras: Rig, cell: NDArray, rectangle: NDArray, depth: NDArray, alpha: NDArray, points: NDArray) -> VisibilitySamples:
+    """Sort the layers of each ray, [S, V, R] (and [S, V, R, 2]) for S sheets and R rays of V cameras, and list the pairs."""
+    camera, ray = np.nonzero((alpha > 0).any(0))
+    depth, alpha, points, cell = depth[:, camera, ray], alpha[:, camera, ray], points[:, camera, ray], cell[camera]
+    order = np.argsort(depth, 0, kind="stable")
+    depth, alpha = np.take_along_axis(depth, order, 0), np.take_along_axis(alpha, order, 0)
+    through = np.cumprod(1.0 - alpha, 0)
+    visible = max(float(((1 - through[-1]) * cell).sum()), 1e-300)
+    before = np.concatenate([np.ones_like(through[:1]), through[:-1]])
+    pairs = []
+    for i in range(len(depth)):
+        light = before[i] * alpha[i]
+        for j in range(i + 1, len(depth)):
+            weight = light * alpha[j]
+            kept = np.flatnonzero((weight > _LEAST_WEIGHT) & (depth[j] > depth[i] * (1 + TIE)))
+            pairs.append((np.full(len(kept), i), np.full(len(kept), j), kept, weight[kept] * cell[kept] / visible))
+            light = light * (1 - alpha[j])
+    empty = (np.zeros(0, np.int64),) * 3 + (np.zeros(0),)
+    front, back, ray, weight = (np.concatenate(parts) for parts in zip(empty, *pairs, strict=True))
+    used, index = np.unique(np.stack([front, back]) * len(camera) + ray, return_inverse=True)
+    index = index.reshape(2, -1)
+    layer, at = np.divmod(used, max(len(camera), 1))
+    sheet = order[layer, at]
+    return VisibilitySamples(cameras, rectangle[sheet], points[sheet, at], camera[ray], index[0], index[1], weight)
+
+
+def visible_cards(cards: Cards, samples: VisibilitySamples) -> NDArray[np.int64]:
+    """The index of the card that each hit lies on, [H]; -1 for none. Accurate to a thousandth of a texel, as hits are float32."""
+    owners = np.full(len(samples.points), -1)
+    for rectangle in {card.rectangle for card in cards.cards}:
+        at = np.flatnonzero(samples.rectangle == rectangle)
+        points = samples.points[at]
+        for index, card in enumerate(cards.cards):
+            if card.rectangle == rectangle:
+                normals, offsets = sides(texel_corners(cards, card))
+                owners[at[(points @ normals.T <= offsets + 1e-3).all(-1)]] = index
+    return owners

@@ -1,0 +1,106 @@
+"use strict";
+// What the report and the viewer share: models drawn by three.js in the colors of their textures, and a camera that orbits an upright tree.
+window.bbfit = (() => {
+  const STEEPEST = Math.PI / 2 - 0.05;
+
+  // The namespace of three.js, which the page in a hidden frame defines.
+  const library = (frame) => new Promise((resolve) => {
+    const check = () => { if (frame.contentWindow.THREE) resolve(frame.contentWindow.THREE); };
+    frame.addEventListener("load", check);
+    check();
+  });
+
+  // A renderer that writes sRGB and lights surfaces in physical units. Its canvas, which three.js has to make itself, replaces an element.
+  function createRenderer(THREE, element) {
+    const renderer = new THREE.WebGLRenderer({ antialias: true });
+    Object.assign(renderer, { outputEncoding: THREE.sRGBEncoding, physicallyCorrectLights: true });
+    for (const { name, value } of element.attributes) renderer.domElement.setAttribute(name, value);
+    element.replaceWith(renderer.domElement);
+    return renderer;
+  }
+
+  // The scene in the bytes of a GLB file. In a layered one, texels that are at least half opaque are drawn first and hide what is behind
+  // them. The rest is blended over them in any order.
+  async function loadModel(THREE, buffer, layered) {
+    const { scene } = await new THREE.GLTFLoader().parseAsync(buffer, "");
+    const blended = [];
+    scene.traverse((item) => { if (layered && item.isMesh && item.material.transparent) blended.push(item); });
+    for (const mesh of blended) {
+      const core = mesh.clone();
+      core.material = Object.assign(mesh.material.clone(), { transparent: false, alphaTest: 0.5, depthWrite: true });
+      mesh.material.depthWrite = false;
+      mesh.parent.add(core);
+    }
+    scene.updateMatrixWorld(true);
+    return scene;
+  }
+
+  // A camera that orbits a target: `azimuth` 0 is at +Z, `elevation` is the angle above the horizon in radians, `distance` is in meters.
+  // `extent` is how far the scene reaches from the target.
+  function createOrbit(THREE, canvas, onChange) {
+    const camera = new THREE.PerspectiveCamera(35, 1), target = new THREE.Vector3();
+    const orbit = { camera, target, azimuth: 0, elevation: 0.12, distance: 1, extent: 1, update, fit, pan };
+
+    function update() {
+      orbit.elevation = Math.min(Math.max(orbit.elevation, -STEEPEST), STEEPEST);
+      const { azimuth, elevation, distance, extent } = orbit;
+      camera.position.setFromSphericalCoords(distance, Math.PI / 2 - elevation, azimuth).add(target);
+      camera.lookAt(target);
+      Object.assign(camera, { near: distance / 100, far: 10 * distance + 2 * extent });
+      camera.updateProjectionMatrix();
+      onChange();
+    }
+
+    // Fill a picture of some aspect ratio with a box, seen from a little above.
+    function fit(low, high, aspect) {
+      const size = high.map((value, axis) => value - low[axis]), radius = Math.max(size[0], size[2]) / 2;
+      target.fromArray(low.map((value, axis) => (value + high[axis]) / 2));
+      const distance = (1.1 * Math.max(size[1] / 2, radius / aspect)) / Math.tan((camera.fov * Math.PI) / 360) + radius / 2;
+      Object.assign(orbit, { azimuth: 0, elevation: 0.12, distance, extent: Math.hypot(...size) });
+      camera.aspect = aspect;
+      update();
+    }
+
+    // Move the target by some pixels of the canvas.
+    function pan(right, down) {
+      const meters = (2 * orbit.distance * Math.tan((camera.fov * Math.PI) / 360)) / canvas.clientHeight;
+      target.add(new THREE.Vector3(-right * meters, down * meters, 0).applyQuaternion(camera.quaternion));
+    }
+
+    const pointers = new Map();
+    const release = (event) => pointers.delete(event.pointerId);
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      pointers.set(event.pointerId, event);
+    });
+    canvas.addEventListener("pointerup", release);
+    canvas.addEventListener("pointercancel", release);
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("pointermove", (event) => {
+      const before = pointers.get(event.pointerId);
+      if (!before) return;
+      const right = event.clientX - before.clientX, down = event.clientY - before.clientY;
+      const other = [...pointers.values()].find((pointer) => pointer.pointerId !== event.pointerId);
+      pointers.set(event.pointerId, event);
+      if (other) { // two fingers zoom and pan
+        const span = ({ clientX, clientY }) => Math.max(Math.hypot(clientX - other.clientX, clientY - other.clientY), 1);
+        orbit.distance *= span(before) / span(event);
+        pan(right / 2, down / 2);
+      } else if (event.buttons === 2 || event.shiftKey) {
+        pan(right, down);
+      } else {
+        orbit.azimuth -= (Math.PI * right) / canvas.clientHeight;
+        orbit.elevation += (Math.PI * down) / canvas.clientHeight;
+      }
+      update();
+    });
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      orbit.distance *= Math.exp(event.deltaY * (event.deltaMode ? 0.03 : 0.001));
+      update();
+    }, { passive: false });
+    return orbit;
+  }
+
+  return { library, createRenderer, loadModel, createOrbit };
+})();

@@ -1,0 +1,24 @@
+"""three.js for the project's pages, and the script with which they draw models."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib.resources import files
+
+
+@lru_cache(maxsize=1)
+def library_page() -> str:
+    """A page that defines three.js (r140), with its GLTF loader, as the global ``THREE``.
+
+    It is the page that trimesh makes of a scene, unchanged. The project's pages load it in a hidden frame and draw with its ``THREE``.
+    """
+    import trimesh
+    from trimesh.viewer import scene_to_html
+
+    page: str = scene_to_html(trimesh.Scene(trimesh.creation.box()))
+    return page
+
+
+def drawing_script() -> str:
+    """The JavaScript that the report and the viewer share: it defines the global ``bbfit``."""
+    return (files("bbfit.reporting") / "page" / "drawing.js").read_text(encoding="utf-8")
