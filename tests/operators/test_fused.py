@@ -58,7 +58,12 @@ def error(ours: Tensor, exact: Tensor) -> float:
 
 def launched(**launch: int) -> Callable[[BillboardCloud, Camera], Tensor]:
     """The fused renderer with another way of launching its kernels, by fields of the projection."""
-    return lambda cloud, camera: render_projection(cloud.texels, replace(project(cloud, camera), **launch))
+
+    def renderer(cloud: BillboardCloud, camera: Camera) -> Tensor:
+        image = render_projection(cloud.texels, replace(project(cloud, camera), **launch))
+        return image if camera.batched else image[0]
+
+    return renderer
 
 
 def errors(cloud: BillboardCloud, camera: Camera, renderer: Callable[[BillboardCloud, Camera], Tensor] = render_fused) -> dict[str, float]:
