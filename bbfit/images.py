@@ -29,19 +29,19 @@ def read_rgba(path: str | Path) -> NDArray[np.uint8]:
     """
     path = Path(path)
     if not path.is_file():
-        raise MissingFileError(f"image: {path} does not exist; check the spelling or render the views anew")
+        raise MissingFileError(f"image: {path} does not exist; check the spelling or render the views again")
     data = path.read_bytes()
     png, webp = data.startswith(b"\x89PNG\r\n\x1a\n"), data[:4] == b"RIFF" and data[8:12] == b"WEBP"
-    if not png and not webp:  # OpenCV would premultiply a TIFF, and hand out an EXR as linear light
-        fail("image", f"{path} is {'neither PNG nor WebP' if data else 'empty'}", "render or copy it anew")
+    if not png and not webp:  # OpenCV would premultiply a TIFF and return an EXR in linear light
+        fail("image", f"{path} is {'neither PNG nor WebP' if data else 'empty'}", "render or copy it again")
     if png and not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
-        fail("image", f"{path} is cut short", "render or copy it anew")
+        fail("image", f"{path} is cut short", "render or copy it again")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:  # a header that promises more pixels than OpenCV takes
+    except cv2.error:  # the header announces more pixels than OpenCV accepts
         image = None
     if image is None:
-        fail("image", f"{path} cannot be decoded", "render or copy it anew")
+        fail("image", f"{path} cannot be decoded", "render or copy it again")
     if image.ndim != 3 or image.shape[2] != 4:
         fail("image", f"{path} has no alpha channel", "give straight-alpha RGBA images")
     if image.dtype == np.uint16:
@@ -73,7 +73,7 @@ def premultiply(straight: Tensor) -> Tensor:
 
 
 def unpremultiply(premultiplied: Tensor) -> Tensor:
-    """Premultiplied to straight alpha, [..., 4]; black where nothing is."""
+    """Premultiplied to straight alpha, [..., 4]; black where alpha is 0."""
     alpha = premultiplied[..., 3:]
     color = torch.where(alpha > 0, premultiplied[..., :3] / alpha.clamp_min(1e-12), 0.0)
     return torch.cat([color.clamp(0, 1), alpha], -1)
@@ -86,12 +86,12 @@ def over_color(premultiplied: Tensor, color: float | Tensor = 1.0) -> Tensor:
 
 
 def bleed_color(texture: Tensor) -> Tensor:
-    """Give every transparent texel the color of the nearest opaque one.
+    """Give each transparent texel the color of the nearest opaque one.
 
-    Filtering straight alpha shows the color of transparent texels: next to visible ones in bilinear filtering, everywhere in mip
-    levels. Transparent is what rounds to alpha 0 in 8 bits, and it becomes exactly 0. As opaque counts at least half of the texture's
-    largest alpha: fainter texels often have a color that no view determined. The nearest is found by the exact Euclidean distance
-    transform (Felzenszwalb and Huttenlocher 2012).
+    Filtering straight alpha mixes in the color of transparent texels: next to visible texels in bilinear filtering, everywhere in mip
+    levels. A texel is transparent if its alpha rounds to 0 in 8 bits; it becomes exactly 0. A texel is opaque if its alpha is at least half
+    of the texture's largest; fainter texels often have a color that no view determined. The nearest texel follows from the exact Euclidean
+    distance transform (Felzenszwalb and Huttenlocher 2012).
 
     Parameters
     ----------

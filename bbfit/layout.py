@@ -21,12 +21,12 @@ from bbfit.geometry.camera import Camera, camera_from_nerf, camera_to_nerf, pinh
 
 TRAIN_FILE, TEST_FILE, SINGLE_FILE = "transforms_train.json", "transforms_test.json", "transforms.json"
 REQUEST_FILE = "views.json"
-"""What ``bbfit views`` notes beside the transforms: what was asked, and what was found of the tree."""
+"""File beside the transforms in which ``bbfit views`` records its options and facts about the tree."""
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "ORTHOGRAPHIC")
 """Values of ``camera_model`` that are read; with OPENCV the distortion coefficients must be zero."""
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 TEST_SHARE = 0.25
-# How far from orthonormal a camera's axes may be: files in the wild carry four decimals.
+# Accepted deviation of a camera's axes from orthonormal; many files have four decimals.
 RIGID_TOLERANCE = 1e-3
 
 

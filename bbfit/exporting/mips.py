@@ -1,7 +1,7 @@
-"""Mip levels of an atlas that is shown with a cutoff: leaves keep their area and their color however far away they are.
+"""Mip levels of an atlas for an alpha test: leaves keep their area and their color at every distance.
 
-Averaged alone, foliage vanishes with distance: the alpha of ever larger texels tends to its mean, which is under the cutoff. See
-Castano, "Computing alpha mipmaps" (2010).
+With plain averages foliage vanishes at a distance, because the alpha of larger and larger texels tends to its mean, which is below the
+cutoff. See Castano, "Computing alpha mipmaps" (2010).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from scipy import optimize, sparse
 from bbfit.checks import check_range
 from bbfit.geometry.cards import Atlas
 
-# Alpha is looked up at so many points along a texel's side. Castano takes four, which give a single opaque texel three quarters of a
-# texel of coverage; it has 0.614, and by eight points 0.625.
+# Number of samples of alpha along a texel's side. Castano uses four, which give a single opaque texel a coverage of 0.75 texels; the true
+# value is 0.614, and eight samples give 0.625.
 _POINTS = 8
 # Relative error of coverage at which a factor is accepted, tolerance of the factor's binary logarithm, and its largest absolute value.
 _TOLERANCE = 0.001
@@ -27,29 +27,31 @@ _WHOLE = np.array([[[0.0, 0.0], [1.0, 1.0]]])
 
 
 def mip_chain(atlas: Atlas, cutoff: float | None) -> list[NDArray[np.uint8]]:
-    """The atlas at half its sides, a quarter and so on, down to 1 x 1 texel.
+    """The mip levels of an atlas, from its own size to 1 x 1 texel.
 
-    Each side is half of the level's before, rounded down, at least 1, as KTX 2.0 and graphics interfaces have it. Every texel is the
-    mean of what it covers of the atlas, by area, also where sides are odd. Colors are averaged in linear light and weighted by alpha;
-    a texel that covers nothing visible gets the plain mean of the colors there, which in an :class:`Atlas` are those of visible
-    neighbors. Alpha is averaged as it is.
+    Each side is half that of the level before, rounded down, at least 1, as in KTX 2.0 and graphics interfaces. Each texel is the mean, by
+    area, of the part of the atlas that it covers. Colors are averaged in linear light with alpha as weight; a texel that covers nothing
+    visible gets the plain mean of the colors there, which in an :class:`Atlas` are those of visible neighbors. Alpha is averaged directly.
 
-    With a cutoff, the alpha of each texture is then multiplied at each level by the factor that gives it the coverage which it has in
-    the atlas (Castano 2010; :func:`coverage`), and clipped at 1. A texel that two textures share is scaled with the one that has more
-    of it; where some texture has no texel of its own there is one factor for the whole picture.
+    With a cutoff, the alpha of each texture is then multiplied at each level by the factor that restores its coverage in the atlas
+    (Castano 2010; :func:`coverage`), and clipped at 1. A texel of two textures belongs to the one that has more of it. If a texture has no
+    texel at a level, there is one factor for the whole picture.
 
-    Measured at levels 1 to 4, relative to level 0, for textures of some 230 x 250 texels that are covered by 0.8, 0.5 and 0.1: leaves
-    with soft rims keep their coverage within 0.1 %, random single opaque texels, which have few values of alpha, within 2.6 %. By finer
-    points than the 8 x 8 it is 2.1 and, at cutoff 0.5, 5.5 %. Fitted trees, 1 to 32 % covered, keep it within 0.2 %.
+    Measured at levels 1 to 4, relative to level 0, for textures of about 230 x 250 texels with coverages of 0.8, 0.5 and 0.1: leaves with
+    soft rims keep their coverage within 0.1 %, random single opaque texels, which have few values of alpha, within 2.6 %. With more than
+    8 x 8 samples these errors are 2.1 % and, at cutoff 0.5, 5.5 %. Fitted trees with coverages of 1 to 32 % keep it within 0.2 %.
 
     Parameters
     ----------
-    atlas : its picture is level 0.
-    cutoff : least alpha that is drawn, in (0, 1]; None if the atlas is blended, and alpha is to stay the mean.
+    atlas : Atlas
+        Its picture is level 0.
+    cutoff : float
+        Least alpha that is drawn, in (0, 1]; None for blending, where alpha stays the mean.
 
     Returns
     -------
-    Straight-alpha display-referred RGBA, uint8 [h, w, 4] each, level 0 first, which is the atlas's own array.
+    list of ndarray
+        Straight-alpha display-referred RGBA, uint8 [h, w, 4] each; level 0 is the atlas's own array.
 
     Raises
     ------
@@ -86,21 +88,24 @@ def mip_chain(atlas: Atlas, cutoff: float | None) -> list[NDArray[np.uint8]]:
 def coverage(alpha: NDArray[np.uint8], cutoff: float, rectangle: NDArray[np.floating]) -> float:
     """Share of a rectangle in which bilinearly filtered alpha reaches a cutoff, in [0, 1].
 
-    It is looked up at 8 x 8 points a texel (Castano 2010: 4 x 4); beyond the picture's rim its outermost texels go on. If no point is
-    in the rectangle, the one after its top-left corner counts.
+    Alpha is sampled at 8 x 8 points per texel (Castano 2010: 4 x 4), clamped to the edge of the picture. If no point lies in the rectangle,
+    the first point after its top-left corner is used.
 
     Parameters
     ----------
-    alpha : [h, w].
-    cutoff : least alpha that counts, in (0, 1].
-    rectangle : [[left, top], [right, bottom]] as shares of the picture's width and height, so the same at every mip level.
+    alpha : ndarray
+        uint8 [h, w].
+    cutoff : float
+        Least alpha that counts, in (0, 1].
+    rectangle : ndarray
+        [[left, top], [right, bottom]] as shares of the picture's width and height, which are the same at all mip levels.
     """
     sides = np.array(alpha.shape[1::-1])
     first, last = np.ceil(rectangle * _POINTS * sides - 0.5).astype(np.int64)
     last = np.maximum(last, first + 1)
     start, end = first // _POINTS, -(-last // _POINTS)
     columns, rows = (np.arange(a - 1, b + 1).clip(0, side - 1) for a, b, side in zip(start, end, sides, strict=True))
-    block = alpha[np.ix_(rows, columns)].astype(np.uint16)  # what follows is whole numbers up to 255 * 16 * 16
+    block = alpha[np.ix_(rows, columns)].astype(np.uint16)  # all values below are integers of at most 255 * 16 * 16
     least = math.ceil(cutoff * 255 * (2 * _POINTS) ** 2 - 1e-6)
     (left, top), (right, bottom) = first - _POINTS * start, last - _POINTS * start
     reached = sum(
@@ -124,16 +129,16 @@ def _rounded(values: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _shrink(picture: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """Mean over what each texel of a smaller picture of ``size`` rows and columns covers, [H, W, C] -> [h, w, C]."""
-    for side in size:  # each time along the first axis, which goes behind the other
+    """Means over the areas of the texels of a smaller picture of ``size`` rows and columns, [H, W, C] -> [h, w, C]."""
+    for side in size:  # each pass along the first axis, then the axes swap
         rows = _overlap(len(picture), side) @ picture.reshape(len(picture), -1)
         picture = np.ascontiguousarray(rows.reshape(side, *picture.shape[1:]).swapaxes(0, 1))
     return picture
 
 
 def _overlap(old: int, new: int) -> sparse.csr_array:
-    """Weight of each of ``old`` texels in a row in the mean of each of ``new`` ones along the same length, [new, old]."""
-    # In units of 1 / (old * new) of the length all edges are whole numbers.
+    """Weights of ``old`` texels in the means of ``new`` texels along the same length, [new, old]."""
+    # In units of 1 / (old * new) of the length, all edges are integers.
     edges = np.union1d(np.arange(old + 1) * new, np.arange(new + 1) * old)
     weights = np.diff(edges) / old
     return sparse.csr_array((weights.astype(np.float32), (edges[:-1] // old, edges[:-1] // new)), shape=(new, old))
@@ -144,7 +149,7 @@ def _coverages(alpha: NDArray[np.uint8], cutoff: float, rectangles: NDArray[np.f
 
 
 def _scale(alpha: NDArray[np.uint8], mean: NDArray[np.float32], cutoff: float, rectangle: NDArray[np.float64], wanted: float) -> None:
-    """Give a rectangle the wanted coverage in place: ``alpha`` there becomes ``mean``, in [0, 255], times a factor; both [h, w]."""
+    """Give a rectangle a coverage in place: ``alpha`` there becomes ``mean``, in [0, 255], times a factor; both [h, w]."""
     own = _texels(alpha, rectangle)
 
     def reached(factor: float) -> float:
@@ -155,7 +160,7 @@ def _scale(alpha: NDArray[np.uint8], mean: NDArray[np.float32], cutoff: float, r
 
 
 def _texels(picture: NDArray[np.uint8], rectangle: NDArray[np.float64]) -> tuple[slice, slice]:
-    """Rows and columns of a rectangle's texels; rounded, so that rectangles which are apart share none."""
+    """Rows and columns of a rectangle's texels, rounded such that disjoint rectangles share none."""
     (left, top), (right, bottom) = np.rint(rectangle * picture.shape[::-1]).astype(np.int64).tolist()
     return slice(top, bottom), slice(left, right)
 
@@ -181,12 +186,12 @@ def _factor(wanted: float, reached: Callable[[float], float]) -> float:
 
 
 def _filtered(texels: NDArray[np.uint16], first: int, last: int) -> Iterator[NDArray[np.uint16]]:
-    """Bilinear filtering along the first axis, times 16: an array for each place that a point has in its texel.
+    """Bilinear filtering along the first axis, times 16: one array for each offset of a sample within its texel.
 
-    The points are those from ``first`` to before ``last``, counted from the first one in texel 1.
+    The samples are those from ``first`` to ``last - 1``, counted from the first one in texel 1.
     """
     for place in range(_POINTS):
         start, end = (-(-(edge - place) // _POINTS) for edge in (first, last))
-        after = 2 * place >= _POINTS  # whether the point is past its texel's center, and so between that and the next
+        after = 2 * place >= _POINTS  # whether the sample is between its texel's center and the next one
         weight = (2 * place + 1 + _POINTS) % (2 * _POINTS)
         yield texels[start + after : end + after] * (2 * _POINTS - weight) + texels[start + after + 1 : end + after + 1] * weight

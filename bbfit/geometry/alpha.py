@@ -1,4 +1,4 @@
-"""What alpha means to the program that draws a model: the three alpha modes."""
+"""The three alpha modes: how a program that draws a model uses alpha."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Cutoff = Annotated[float, Range(0, 1, open_low=True, open_high=True)]
 
 @dataclass(frozen=True)
 class AlphaMode:
-    """How opaque a sample of a texture is, given its filtered alpha."""
+    """The opacity of a texture sample as a function of its filtered alpha."""
 
     kind: AlphaKind = "blend"
     """blend: as opaque as alpha says. mask: opaque where alpha is at least the cutoff, and nothing elsewhere (glTF 2.0, section 3.9.4).

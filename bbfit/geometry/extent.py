@@ -1,4 +1,4 @@
-"""Where a billboard cloud's rectangles reach to, and where they show something."""
+"""The corners of a billboard cloud's rectangles, and the bounds of its visible part."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def corners(cloud: BillboardCloud) -> Tensor:
 
 
 def shown_bounds(cloud: BillboardCloud, *, spared: float = 0.0) -> Tensor:
-    """Lowest and highest corner of what a cloud shows, its texels of at least half of the largest alpha, [2, 3] float64 in meters.
+    """Lowest and highest corner of a cloud's texels with at least half of the largest alpha, [2, 3] float64 in meters.
 
     Parameters
     ----------
-    spared : share of those texels that may lie beyond on each side, along each axis: stray ones.
+    spared : share of those texels that may lie outside on each side of each axis, for stray texels.
 
     Raises
     ------

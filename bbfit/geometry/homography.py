@@ -49,7 +49,7 @@ def pixel_depth(cloud: BillboardCloud, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def signed_distance(cloud: BillboardCloud, camera: Camera) -> Tensor:
-    """How far each camera stands in front of each plane, [V, N]: positive on the front, negative behind, zero edge-on.
+    """Signed distance of each camera from each plane, [V, N]: positive in front, negative behind, zero edge-on.
 
     In meters for a pinhole; for parallel projection the sine of the angle between the viewing direction and the plane.
     """

@@ -25,9 +25,9 @@ class Orbit:
     """
 
     count: int = 90
-    """Views in all, shared out over the rings as evenly as possible."""
+    """Number of views, divided among the rings as evenly as possible."""
     elevations_degrees: tuple[float, ...] = (0.0,)
-    """Height of each ring as an angle above the horizon, in [-90, 90]."""
+    """Elevation of each ring, in [-90, 90]."""
 
     def __post_init__(self) -> None:
         if not self.elevations_degrees:

@@ -1,4 +1,4 @@
-"""Pictures of a result: ``comparison.png`` (targets beside renders), ``loss.png`` and ``pareto.png``."""
+"""Pictures of a result: ``comparison.png`` (targets beside renders), ``loss.png``, ``pareto.png`` and ``lod.png``."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ if TYPE_CHECKING:
 Cost = Literal["vertices", "texels", "bytes"]
 """What a budget can limit."""
 INK, FAINT, _LINE, PAPER = (32, 36, 42), (112, 118, 126), (214, 217, 222), (242, 243, 245)
-_CELL_LEAST = 220  # pixels: what the writing under a small picture needs
+_CELL_LEAST = 220  # pixels, for the text under a small picture
 
 
 def comparison_picture(model: ShippedModel, views: ViewSet, path: str | Path, *, count: int = 4, title: str = "") -> None:
-    """Write a PNG of some views, a row each: target, result, and the perceived difference.
+    """Write a PNG with one row per view: target, result, and perceived difference.
 
     Pictures are shown over white, pixel for pixel. The difference is the FLIP map (:func:`bbfit.evaluation.metrics.flip_map`) in the
-    colors of magma: black is no difference. Under each row stand the view's name, azimuth, PSNR and SSIM over white and mean FLIP.
+    colors of magma; black is no difference. The text under each row has the view's name, azimuth, PSNR and SSIM over white and mean FLIP.
 
     Parameters
     ----------
     model : the result as it is exported.
     views : held-out views; ``count`` of them are shown, spread evenly in azimuth (:func:`spread_views`).
     path : the PNG to write, completely or not at all.
-    title : stands above the pictures.
+    title : the heading above the pictures.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def comparison_picture(model: ShippedModel, views: ViewSet, path: str | Path, *,
 def spread_views(angles: NDArray[np.float64], count: int) -> list[int]:
     """Indices of at most ``count`` views that are spread evenly in azimuth, in order of azimuth.
 
-    Starting from the first view, each next one is the unused view nearest to a full turn's k-th part; among equally near ones the one
+    Starting from the first view, view k is the unused view nearest to the k-th part of a full turn; of equally near views it is the one
     nearest to the horizon.
 
     Parameters
@@ -147,7 +147,7 @@ def loss_plot(losses: Sequence[float], path: str | Path, *, label: str = "loss")
 
 
 def draw_losses(axes: Axes, losses: Sequence[float], label: str) -> None:
-    """Draw what :func:`loss_plot` shows.
+    """Draw the content of :func:`loss_plot`.
 
     Raises
     ------
@@ -236,9 +236,9 @@ def _draw_front(axes: Any, choice: Choice, cost: Cost) -> None:
 
 
 def lod_picture(levels: Sequence[tuple[LodLevel, ShippedModel]], views: ViewSet, path: str | Path) -> None:
-    """Write a PNG of levels of detail, a column each: one held-out view and the level, as large as where the level takes over.
+    """Write a PNG with one column per level of detail: one held-out view and the level, at the size at which the level takes over.
 
-    Both are enlarged without smoothing until they fill the column.
+    Both are enlarged to the width of the column without smoothing.
     """
     from PIL import Image, ImageDraw
 
@@ -263,7 +263,7 @@ def lod_picture(levels: Sequence[tuple[LodLevel, ShippedModel]], views: ViewSet,
 
 
 def running_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
-    """Centered mean over ``window`` values, shorter at the ends, same length; NaN counts for nothing, and gives NaN where alone."""
+    """Centered mean over ``window`` values, shorter at the ends, same length; NaN values are ignored, and the mean of none is NaN."""
     valid = np.isfinite(values)
     sums, counts = (np.concatenate([[0.0], np.cumsum(part)]) for part in (np.where(valid, values, 0.0), valid))
     index = np.arange(len(values))
@@ -280,7 +280,7 @@ def magma(error: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def _color_bar(sheet: Any, draw: ImageDraw, font: FreeTypeFont, right: int, top: int, text: int) -> None:
-    """The scale of the difference, ending at ``right``."""
+    """The color scale of the difference, which ends at ``right``."""
     from PIL import Image
 
     length, thickness = 5 * text, text * 3 // 4
@@ -296,7 +296,7 @@ def _height(elevation: float) -> str:
 
 
 def picture_font(name: str, size: int) -> FreeTypeFont:
-    """A font that comes with matplotlib, so that pictures look the same everywhere."""
+    """A font of matplotlib, so pictures look the same on all machines."""
     from matplotlib import get_data_path
     from PIL import ImageFont
 
