@@ -23,7 +23,7 @@ VERSIONS: Mapping[str, int] = {
     "budget": 3,
     "fit": 8,
     "export": 3,
-    "evaluate": 6,
+    "evaluate": 7,
     "report": 1,
     "lod": 1,
     "compare": 1,

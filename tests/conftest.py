@@ -36,11 +36,19 @@ MARKED = {
     "node": ("exporting/test_formats.py", "exporting/test_lod.py", "exporting/test_model.py"),
     "ray": ("sweep/test_cluster.py",),
     "slow": (
+        "exporting/test_atlas.py",
+        "exporting/test_drawing.py",
+        "exporting/test_hulls.py",
+        "exporting/test_mips.py",
         "exporting/test_splitting.py",
         "fitting/test_loop.py",
         "fitting/test_max_texels.py",
         "fitting/test_search.py",
         "fitting/test_steps.py",
+        "operators/test_fused.py",
+        "operators/test_gradients.py",
+        "operators/test_kernels.py",
+        "reporting/test_plots.py",
         "rivals/test_learned_mesh.py",
         "sweep/test_local.py",
         "test_budget_runs.py",
@@ -62,9 +70,12 @@ FIRST = (
     "test_cli.py",
     "viewers/test_fits.py",
     "exporting/test_splitting.py",
-    "rendering/test_fused.py",
+    "operators/test_kernels.py",
+    "operators/test_fused.py",
     "fitting/test_loop.py",
 )
+
+assert all((TESTS / place).exists() for place in (*FIRST, *sum(MARKED.values(), ()))), "a module has moved"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

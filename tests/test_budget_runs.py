@@ -159,9 +159,11 @@ def test_how_often_a_state_is_kept_is_no_matter(tmp_path: Path) -> None:
 
 
 def test_only_what_is_lost_is_made_again(tmp_path: Path) -> None:
-    run(VIEWS, tmp_path, CONFIG)
+    killed_after_a_trial(tmp_path)
     tag(tmp_path)
+    run(VIEWS, tmp_path, CONFIG)
     before = snapshot(tmp_path)
+    assert kept(tmp_path)[0]
     (tmp_path / "pareto.png").unlink()
     assert run(VIEWS, tmp_path, CONFIG).skipped == STAGES[1:]
     assert snapshot(tmp_path)["pareto.png"] == before["pareto.png"] and snapshot(tmp_path)["pareto.json"] == before["pareto.json"]

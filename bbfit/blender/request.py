@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -70,7 +70,7 @@ class ViewsRequest:
             If the panorama of the configuration does not exist.
         """
         if config.hdri is not None:
-            check_file("hdri", config.hdri)
+            config = replace(config, hdri=check_file("hdri", config.hdri))
         known = RenderedTree(tree.path.name, tree.digest, tree.bytes, tree.up_axis)
         return ViewsRequest(identity(config), known, bbfit=_version())
 

@@ -1,4 +1,4 @@
-"""Cards cut down to convex polygons around what they show, so that fewer transparent fragments are shaded."""
+"""Cards trimmed to convex polygons around their visible part, so that fewer transparent fragments are shaded."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from bbfit.checks import check_count, check_range
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.polygons import area, kept_half, sides
 
-# Texels that a polygon reaches beyond what shows: far more than float32 coordinates and graphics cards' snapping of vertices move it.
+# Margin of a polygon around the visible part in texels, far more than the rounding of float32 and the vertex snapping of graphics cards.
 _MARGIN = 1 / 64
-# What counts as more than no alpha. Bilinear filtering takes alpha from 1/255 to nothing and passes this within a texel's millionth of it.
+# The least alpha above 0. Bilinear filtering between alpha 1/255 and 0 reaches it within a millionth of a texel from the 0.
 _ANY = 1e-9
-# Directions that sides are tried in: this many around the circle, and those of the hull's longest edges.
+# Candidate directions of sides: this many around the circle, and those of the hull's longest edges.
 _AROUND, _EDGES = 72, 56
-# Samples of a card that overdraw is measured by.
+# Samples of all cards that overdraw is measured with.
 _SAMPLES = 500_000
 
 
 def texel_corners(cards: Cards, card: Card) -> NDArray[np.float64]:
-    """A card's corners in texels of its texture, x to the right and y down, (0, 0) at the top-left texel's center, [K, 2]."""
+    """A card's corners in texels of its texture, [K, 2]: x to the right, y down, (0, 0) at the center of the top-left texel."""
     return card.uvs * np.array(cards.atlas.image.shape[1::-1]) - 0.5 - cards.atlas.corners[card.rectangle]
 
 
@@ -34,10 +34,10 @@ def rimmed_alpha(cards: Cards, rectangle: int) -> NDArray[np.float64]:
 
 
 def bilinear(rimmed: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Alpha at points in texels, [..., 2] -> [...], filtered bilinearly; 0 outside the rim's texel centers."""
+    """Alpha at points in texels, [..., 2] -> [...], filtered bilinearly; 0 outside the texel centers of the rim."""
     height, width = rimmed.shape
     x, y = points[..., 0] + 1, points[..., 1] + 1
-    outside = ~((x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1))  # also what is not a number
+    outside = ~((x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1))  # also NaN
     x, y = np.where(outside, 0, x), np.where(outside, 0, y)
     left, top = np.minimum(x.astype(np.int64), width - 2), np.minimum(y.astype(np.int64), height - 2)
     x, y = x - left, y - top
@@ -48,9 +48,9 @@ def bilinear(rimmed: NDArray[np.float64], points: NDArray[np.float64]) -> NDArra
 
 
 def shown_cells(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], least: float) -> NDArray[np.int64]:
-    """Squares between four texel centers that overlap a convex polygon and in which alpha reaches a value, row and column of each, [C, 2].
+    """Rows and columns of the squares of four texel centers that overlap a convex polygon and where alpha reaches ``least``, [C, 2].
 
-    The square of row r and column c has its top-left corner at (c - 1, r - 1). Exact: by the separating axes of the square and the polygon.
+    The square of row r and column c has its top-left corner at (c - 1, r - 1). The overlap is exact, by the separating axis theorem.
     """
     reached = rimmed >= least
     cells = np.argwhere(reached[:-1, :-1] | reached[1:, :-1] | reached[:-1, 1:] | reached[1:, 1:])
@@ -64,24 +64,27 @@ def shown_cells(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], least
 
 
 def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
-    """Replace every card by a small convex polygon around what it shows.
+    """Replace each card by a small convex polygon around its visible part.
 
-    The polygon holds every point of the card where the bilinearly filtered alpha reaches ``least``, lies inside the card and is never
-    larger. Its sides touch the convex hull of what shows. Of all such polygons whose sides have one of some 130 directions and whose
-    corners lie in the card, the smallest is found, not by leaving out edges one by one, but as a shortest cycle, as areas add up corner by
-    corner (after Aggarwal, Chang and Yap 1985, "Minimum area circumscribing polygons"). More vertices never give a larger polygon.
+    The polygon contains each point of the card where the bilinearly filtered alpha reaches ``least``, and lies inside the card. Its sides
+    touch the convex hull of the visible part. It is the smallest of all such polygons whose sides have one of about 130 directions and
+    whose corners lie in the card. Areas add up corner by corner, so the search is for a shortest cycle (after Aggarwal, Chang and Yap
+    1985, "Minimum area circumscribing polygons"). More vertices never give a larger polygon.
 
-    Mip levels reach farther than the texture itself: from afar up to half of one of their texels may be cut away.
+    The visible part is larger in mip levels than in the texture: the polygon may cut off up to half a texel of the level in use.
 
     Parameters
     ----------
-    vertices : most corners of a polygon, at least 4. A card that came with no more is kept where nothing smaller is found.
-    least : in [0, 1], the cutoff of MASK, or 0 for whatever is not wholly transparent, as BLEND shows it.
+    vertices : int
+        Most corners of a polygon, at least 4. A card with no more corners stays as it is if no smaller polygon exists.
+    least : float
+        Least visible alpha, in [0, 1]: the cutoff of MASK, or 0 for any alpha above 0, as BLEND shows it.
 
     Returns
     -------
-    As many cards in the same order, with the same normals, winding, textures and origins. One that shows nothing shrinks to about
-    one texel around its middle.
+    Cards
+        The same number of cards in the same order, with the same normals, winding, textures and origins. A card with no visible part
+        shrinks to about one texel around its center.
 
     Raises
     ------
@@ -108,7 +111,7 @@ def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
 
 
 def with_texel_corners(cards: Cards, card: Card, polygon: NDArray[np.float64]) -> Card:
-    """The same card with other corners, in texels, [K, 2], that wind like the old ones."""
+    """The same card with other corners in texels, [K, 2], of the same winding."""
     at = texel_corners(cards, card)
     middle, flat = card.corners.mean(0), at.mean(0)
     to_world = np.linalg.lstsq(at - flat, card.corners - middle, rcond=None)[0]
@@ -117,11 +120,12 @@ def with_texel_corners(cards: Cards, card: Card, polygon: NDArray[np.float64]) -
 
 
 def overdraw(cards: Cards, least: float) -> float:
-    """Share of the cards' area, counted in texels, in which nothing shows although it is shaded, in [0, 1].
+    """Share of the cards' area in texels that is shaded although nothing is visible there, in [0, 1].
 
     Parameters
     ----------
-    least : as in :func:`with_hulls`.
+    least : float
+        As in :func:`with_hulls`.
 
     Raises
     ------
@@ -145,10 +149,10 @@ def overdraw(cards: Cards, least: float) -> float:
 
 
 def _shown_points(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], least: float) -> NDArray[np.float64]:
-    """Points in texels whose convex hull holds all of the polygon where alpha reaches ``least``, [N, 2]; none where it never does."""
+    """Points in texels, [N, 2], whose convex hull contains the part of the polygon where alpha reaches ``least``."""
     cells = shown_cells(rimmed, polygon, least)
     row, column = cells.T
-    # Around the square: corner, value there; where the value passes the limit on the way to the next corner, and its gradient there.
+    # For each side of the square: its first corner and the value there, the point where the value passes the limit, and the gradient there.
     steps = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     values = np.stack([rimmed[row + y, column + x] for x, y in steps], -1)  # [C, 4]
     top_left = cells[:, ::-1] - 1.0
@@ -157,8 +161,8 @@ def _shown_points(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], lea
     passes = (values >= least) != (following >= least)
     share = np.where(passes, (values - least) / np.where(passes, values - following, 1.0), 0.0)
     local = steps + share[..., None] * (np.roll(steps, -1, 0) - steps)  # [C, 4, 2]
-    found = [corners, (top_left[:, None] + local)[passes]]
-    # The border of what shows is a hyperbola, and may bulge outwards between two such points. The tangents there meet outside of it.
+    points = [corners, (top_left[:, None] + local)[passes]]
+    # The border of the visible part is a hyperbola, which may bulge outwards between two such points. Its tangents there meet outside.
     a, b, c, d = values.T[..., None]  # clockwise from the top left
     x, y = local[..., 0], local[..., 1]
     gradient = np.stack([(b - a) * (1 - y) + (c - d) * y, (d - a) * (1 - x) + (c - b) * x], -1)
@@ -172,12 +176,12 @@ def _shown_points(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], lea
             meet = at + np.stack([-first[:, 1], first[:, 0]], -1) * (offset / np.where(safe, across, 1.0))[:, None]
             meet = np.where(safe[:, None], meet, at)
             within = ((meet >= -1e-9) & (meet <= 1 + 1e-9)).all(-1)
-            found.append((top_left[both] + meet)[within])
-    return np.concatenate(found)
+            points.append((top_left[both] + meet)[within])
+    return np.concatenate(points)
 
 
 def _hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The convex hull of the points, enlarged by the margin, as far as it lies in the convex polygon, counter-clockwise, [N, 2]."""
+    """The convex hull of the points plus the margin, clipped to the convex polygon, counter-clockwise, [N, 2]."""
     from scipy.spatial import ConvexHull
 
     if np.linalg.eigvalsh(np.cov(points.T, bias=True))[0] > 1e-3:  # points on one line have no hull of their own
@@ -190,7 +194,7 @@ def _hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> N
 
 
 def _enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices: int) -> NDArray[np.float64] | None:
-    """The smallest polygon around the hull inside the convex polygon with that many corners at most, or None if none was found."""
+    """The smallest polygon around the hull and inside the convex polygon with at most ``vertices`` corners; None if there is none."""
     middle = hull.mean(0)
     hull, (normals, offsets) = hull - middle, sides(polygon - middle)
     along = np.roll(hull, -1, 0) - hull
@@ -208,14 +212,14 @@ def _enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices
     reach = (height[None] - height[:, None] * cosine) / np.where(possible, sine, 1.0)  # along a side to its corner with the next
     corner = height[:, None, None] * normal[:, None] + reach[..., None] * np.stack([-normal[:, 1], normal[:, 0]], -1)[:, None]
     possible &= (corner @ normals.T <= offsets + 1e-9).all(-1)
-    # The quadrangle between the middle, the feet on both sides and their corner; all of them make up the polygon.
+    # The quadrangle between the center, its feet on both sides and their corner; these quadrangles make up the polygon.
     share = (2 * height[:, None] * height[None] - (height[:, None] ** 2 + height[None] ** 2) * cosine) / np.where(possible, 2 * sine, 1.0)
     chosen = _shortest_cycle(np.where(possible, share, np.inf), vertices)
     return None if chosen is None else corner[chosen, np.roll(chosen, -1)] + middle
 
 
 def _shortest_cycle(cost: NDArray[np.float64], length: int) -> NDArray[np.int64] | None:
-    """The cheapest once-around cycle through 3 to ``length`` of n nodes that lie on a circle, by the steps' costs [n, n]; in order."""
+    """The cheapest cycle once around a circle of n nodes that visits 3 to ``length`` of them; ``cost`` [n, n] is that of each step."""
     upwards = np.where(np.arange(len(cost))[:, None] < np.arange(len(cost)), cost, np.inf)
     paths, through = [upwards], []
     best, chosen = sys.float_info.max, None

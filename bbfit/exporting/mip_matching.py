@@ -1,9 +1,9 @@
-"""Mip levels with which cards together stay as dense on the screen as their tree, however far away they are.
+"""Mip levels that keep the coverage of all cards together on the screen, at every distance.
 
-Levels that keep the coverage of each texture (:func:`~bbfit.exporting.mips.mip_chain`) are not enough. Mixing two levels trilinearly
-before the test loses what only one of them shows. And cards overlap: what ever coarser texels keep of each is where it is densest,
-which is in the same places of the picture, so that together they cover less and less. Blended cards cover more instead, as averages
-no longer have their leaves and their gaps in different places. All of it is made up for by one factor on alpha for each level.
+Levels that keep the coverage of each texture (:func:`~bbfit.exporting.mips.mip_chain`) are not enough. The trilinear mix of two levels,
+which precedes the alpha test, loses what is visible in only one of them. And cards overlap: coarser texels keep the densest parts of each
+card, which are in the same places of the picture, so together the cards cover less and less. Blended cards cover more instead, because
+the averages no longer have leaves and gaps in different places. One factor on the alpha of each level compensates for all of this.
 """
 
 from __future__ import annotations
@@ -26,46 +26,46 @@ from bbfit.geometry.orbit import Orbit
 from bbfit.operators.drawing.compositing import opacity
 from bbfit.rendering.cards import filtered, hits, joined, sheets_of
 
-# Pictures in which coverage is counted have so many pixels a side at most.
+# Largest side in pixels of the pictures in which coverage is measured.
 _SIDE = 96
-# Where they are taken from.
+# Cameras of those pictures.
 _ORBIT = Orbit(24)
-# Levels count up to the last that matters to views so many pixels wide; those beyond take its factor.
+# Width in pixels of the smallest views whose levels get their own factor; coarser levels get the factor of the last one.
 _LEAST_WIDTH = 8
-# Each level's factor is sought so often, since its neighbors' factors matter to it; the first time with one factor for all beyond it.
+# Number of passes over the levels, as the factors depend on each other; in the first pass one factor holds for all coarser levels too.
 _SWEEPS = 2
-# A factor is sought within so many doublings of 1, later of what it was, which are halved so often; it is good if coverage is as wanted
-# but for this share.
+# Range of the search for a factor in doublings around 1 and number of halvings, the same in later passes around the last factor, and the
+# accepted relative error of coverage.
 _FIRST, _LATER, _TOLERANCE = (2.0, 8), (0.25, 5), 0.002
 
 
 @dataclass(frozen=True)
 class _VisibleTexels:
-    """What V cameras see of the cards, each sheet's hits in all views in one row."""
+    """What V cameras see of the cards: the hits on each sheet, of all views in one list."""
 
     pixels: list[Tensor]
-    """Number of each hit's pixel among those of all views, int64 [M] for each sheet."""
+    """Index of each hit's pixel among the pixels of all views, int64 [M] for each sheet."""
     uvs: list[Tensor]
-    """Float64 [M, 2] each."""
+    """Texture coordinates, float64 [M, 2] each."""
     details: list[Tensor]
-    """Level of detail less the median over all hits, float64 [M] each."""
+    """Level of detail minus the median over all hits, float64 [M] each."""
     count: int
-    """Pixels of all views."""
+    """Number of pixels of all views."""
 
 
 def with_mips(cards: Cards) -> Cards:
-    """Cards with mip levels that look as dense from afar as the cards do from near, by views from all around.
+    """Cards with mip levels that are as dense from afar as the cards are from near, in views from all around.
 
-    Takes some seconds for textures of a million texels.
+    This takes some seconds for textures of a million texels.
     """
     return replace(cards, chain=tuple(matched_chain(cards, _chain(cards), _around(cards))))
 
 
 def reduced(cards: Cards, halvings: int) -> Cards:
-    """Cards with textures of 2^-halvings of their sides, which by themselves look as dense as before in views from all around.
+    """Cards whose textures have sides of 2^-halvings and are as dense as before in views from all around.
 
-    The atlas's padding is halved as often, so there must be 2^halvings texels of it and that many times the block that sides are
-    multiples of.
+    The padding of the atlas shrinks too, so it must be at least 2^halvings texels, and the sides of the atlas multiples of 2^halvings
+    blocks.
     """
     if halvings == 0:
         return cards
@@ -94,21 +94,24 @@ def _around(cards: Cards) -> Camera:
 
 
 def matched_chain(cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Camera) -> list[NDArray[np.uint8]]:
-    """Mip levels whose alpha is multiplied by what makes the cards cover as much of the picture from afar as they do by level 0.
+    """Scale the alpha of each mip level such that the cards cover as much of the picture from afar as with level 0.
 
-    For each level there is a distance from which half of all pixels of the cards are filtered with this or coarser levels. As seen from
-    there, though on more pixels, so that few of them do not decide by chance, coverage is counted in all views together, and the level's
-    factor found by bisection. Level 0 stays as it was fitted. Alpha is clipped at 1, colors are left alone.
+    For each level there is a distance at which half of the cards' pixels use this or coarser levels. Coverage is measured as seen from
+    there, in all views together; the pictures have more pixels than at that distance, so that single pixels matter less. Bisection gives
+    the level's factor. Level 0 stays as it was fitted. Alpha is clipped at 1; colors do not change.
 
-    The modes blend and hash are matched alike: a hash covers as much as a blend does, on average.
+    The modes blend and hash get the same levels, because a hash covers as much as a blend on average.
 
-    Some twenty views from all around are enough, and take a few seconds; four are not.
+    About twenty views from all around are enough and take a few seconds; four are too few.
 
     Parameters
     ----------
-    cards : with the alpha mode that they are shown with.
-    chain : their mip levels, level 0 first (:func:`~bbfit.exporting.mips.mip_chain`, with the cutoff where there is one).
-    cameras : V views of the tree; none that the result is scored on.
+    cards : Cards
+        In the alpha mode in which they are shown.
+    chain : sequence of ndarray
+        Their mip levels, level 0 first (:func:`~bbfit.exporting.mips.mip_chain`, with the cutoff if there is one).
+    cameras : Camera
+        V views of the tree, other than those of the evaluation.
 
     Returns
     -------
@@ -145,7 +148,7 @@ def matched_chain(cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Cam
 
 
 def _visible_texels(cards: Cards, cameras: Camera) -> tuple[_VisibleTexels, float]:
-    """What the cameras see, and the median level of detail."""
+    """What the cameras see of the cards, and the median level of detail."""
     pixels, uvs, details, count = [], [], [], cameras.width * cameras.height
     for sheet in sheets_of(cards):
         seen = [hits(cards, sheet, cameras[index]) for index in range(len(cameras))]
@@ -153,7 +156,7 @@ def _visible_texels(cards: Cards, cameras: Camera) -> tuple[_VisibleTexels, floa
         uvs.append(torch.cat([met.uv for met in seen]))
         details.append(torch.cat([met.detail for met in seen]))
     if not any(map(len, pixels)):
-        fail("cameras", "see nothing of the cards", "give those of the views that they were fitted to")
+        fail("cameras", "none sees a card", "give those of the views that the cards were fitted to")
     detail = float(torch.cat(details).median())
     return _VisibleTexels(pixels, uvs, [each - detail for each in details], count * len(cameras)), detail
 
@@ -166,16 +169,16 @@ def _scaled(alphas: list[NDArray[np.uint8]], factors: NDArray[np.float64]) -> li
 
 
 def _coverage(visible: _VisibleTexels, alphas: list[NDArray[np.uint8]], level: int, mode: AlphaMode) -> float:
-    """Mean alpha of the pictures if that level is the median level of detail, in [0, 1]; ``alphas`` are the levels' [h, w, 1]."""
+    """Mean alpha of the pictures in [0, 1], with ``level`` as the median level of detail; ``alphas`` are those of the levels, [h, w, 1]."""
     levels, clear = joined(alphas, alphas[0].shape), torch.ones(visible.count)
     for pixels, uv, detail in zip(visible.pixels, visible.uvs, visible.details, strict=True):
         alpha = filtered(levels, uv, detail + level)[:, 0] / 255
-        clear[pixels] *= 1 - (alpha if mode.kind == "hash" else opacity(alpha, mode))  # whatever the order of depth
+        clear[pixels] *= 1 - (alpha if mode.kind == "hash" else opacity(alpha, mode))  # in any order of depth
     return 1 - float(clear.double().mean())
 
 
 def _root(excess: Callable[[float], float], around: float, doublings: float, halvings: int) -> float:
-    """The factor at which an excess that grows with it vanishes, or the bound that comes nearest, by bisection of its logarithm."""
+    """The factor at which an increasing excess is 0, or the nearer bound, by bisection of the factor's logarithm."""
     low, high = -doublings, doublings
     for _ in range(halvings + 1):
         middle = (low + high) / 2

@@ -1,4 +1,4 @@
-"""Cards: flat textured polygons with one atlas, which is what model files hold of a cloud."""
+"""Cards: the flat textured polygons and the atlas that model files of a cloud contain."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bbfit.geometry.alpha import AlphaMode
 
 @dataclass(frozen=True)
 class Atlas:
-    """R textures side by side in one picture, texel for texel."""
+    """R textures in one picture, texel for texel."""
 
     image: NDArray[np.uint8]
     """Straight-alpha RGBA, [H, W, 4]; both sides are multiples of 4."""
@@ -23,14 +23,14 @@ class Atlas:
 
     @property
     def used(self) -> float:
-        """Share of the picture that textures cover, in (0, 1]; the rest is padding and gaps."""
+        """Share of the picture that textures cover, in (0, 1]."""
         height, width = self.image.shape[:2]
         return float(self.sizes.prod(-1).sum() / (height * width))
 
 
 @dataclass(frozen=True)
 class Card:
-    """A flat convex polygon that shows a part of one texture of the atlas, or all of it."""
+    """A flat convex polygon that shows a texture of the atlas or a part of it."""
 
     corners: NDArray[np.float64]
     """K >= 3 points in meters, counter-clockwise as seen from where the normal points, [K, 3]."""
@@ -39,15 +39,15 @@ class Card:
     normal: NDArray[np.float64]
     """Unit normal, [3]."""
     culled: bool
-    """Whether only the side that the normal points to is shown; otherwise both sides show the same."""
+    """Whether only the front is drawn, the side that the normal points to; otherwise both sides show the same."""
     rectangle: int
-    """Which texture of the atlas it shows."""
+    """Index of its texture in the atlas."""
     origin: NDArray[np.float64] | None = None
-    """Point in meters by which programs that sort what is transparent are to sort it, [3]; it then gets a node of its own."""
+    """Point in meters by which programs sort the card if it is blended, [3]; such a card gets its own node."""
 
     @property
     def triangles(self) -> NDArray[np.int64]:
-        """A fan of triangles that wind like the polygon, [K - 2, 3]."""
+        """A fan of triangles with the winding of the polygon, [K - 2, 3]."""
         middle = np.arange(1, len(self.corners) - 1)
         return np.stack([np.zeros_like(middle), middle, middle + 1], -1)
 
@@ -57,18 +57,18 @@ class Cards:
     """A cloud's cards and their textures."""
 
     cards: tuple[Card, ...]
-    """Q >= 1 of them."""
+    """Q >= 1 cards."""
     atlas: Atlas
-    """The textures: per billboard the front, then the back if there is one."""
+    """The textures: for each billboard the front, then the back if it has one."""
     alpha: AlphaMode = field(default_factory=AlphaMode)
-    """What their alpha means."""
+    """The alpha mode of all cards."""
     chain: tuple[NDArray[np.uint8], ...] | None = None
-    """Mip levels that files of them bring, straight RGBA, level 0 first and down to 1 x 1 texel; without any, level 0 is filtered
-    bilinearly at every distance."""
+    """Mip levels of the files, straight RGBA, from level 0 to 1 x 1 texel. Without them level 0 is filtered bilinearly at every
+    distance."""
 
     @property
     def vertex_count(self) -> int:
-        """Vertices of all cards, with the two that center the bounds of each that has an origin."""
+        """Vertices of all cards, with two more for each card with an origin, which center its bounds."""
         return sum(len(card.corners) + 2 * (card.origin is not None) for card in self.cards)
 
     @property
@@ -77,5 +77,5 @@ class Cards:
         return self.alpha.cutoff if self.alpha.kind == "mask" else 0.0
 
     def with_cards(self, cards: list[Card]) -> Cards:
-        """Other cards of the same textures."""
+        """Other cards with the same textures."""
         return replace(self, cards=tuple(cards))

@@ -1,4 +1,4 @@
-"""Convex polygons in the plane, arrays of their corners."""
+"""Convex polygons in the plane, as arrays of their corners."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 
 def sides(polygon: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Unit normals n, [K, 2], and offsets d, [K], of a convex polygon's sides: inside is n . p <= d. Either winding will do."""
+    """Unit normals n, [K, 2], and offsets d, [K], of a convex polygon's sides: inside is n . p <= d. For either winding."""
     along = np.roll(polygon, -1, 0) - polygon
     length = np.linalg.norm(along, axis=-1)
     kept = length > 1e-12 * length.max()  # a doubled corner has no side
@@ -17,15 +17,15 @@ def sides(polygon: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def area(polygon: NDArray[np.float64]) -> float:
-    """Signed area, positive where x turns to y, [K, 2] ->."""
+    """Signed area of a polygon [K, 2]; positive if its corners turn from x to y."""
     x, y = (polygon - polygon[0]).T
     return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
 def kept_half(polygon: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The part of a convex polygon, [K, D], where a height, given at the corners, is not positive, [L, D].
+    """The part of a convex polygon [K, D] where a linear function with given values at the corners is at most 0, [L, D].
 
-    One side of a clip after Sutherland and Hodgman (1974, "Reentrant polygon clipping").
+    This is one step of the clipping of Sutherland and Hodgman (1974, "Reentrant polygon clipping").
     """
     made = []
     for here, there, low, high in zip(polygon, np.roll(polygon, -1, 0), heights, np.roll(heights, -1), strict=True):

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bbfit.files import write_bytes
-from bbfit.reporting.sweep_tables import BILLBOARDS, HONEST, SweepRow, label_names
+from bbfit.reporting.sweep_tables import BILLBOARDS, MEASURES, SweepRow, label_names
 
-_MEASURES = (HONEST[0], HONEST[2])
+_MEASURES = (MEASURES[0], MEASURES[2])
 # A loss, or another label, has a line style; everything else has a color.
 _STYLES = ("-", "--", ":", "-.")
 

@@ -1,4 +1,4 @@
-"""Tables of many runs: a row a run as CSV, and, as Markdown, the thesis's figure 11 and table 1 with its figures beside ours."""
+"""Tables of many runs: CSV with one line per run, and Markdown with measures, costs and the comparison with the thesis."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ BILLBOARDS = "billboards"
 
 @dataclass(frozen=True)
 class SweepRow:
-    """One run of a sweep, or what kept it from being made."""
+    """One run of a sweep, or the reason of its failure."""
 
     tree: str
     """Name of the tree."""
     labels: Mapping[str, str]
-    """What sets its configuration apart: names and values in the order of the grid."""
+    """Its place in the grid: names and values in the order of the grid."""
     steps: int
     """Optimizer steps."""
     facts: Mapping[str, Any] | None
-    """What was found: ``report`` (:meth:`bbfit.evaluation.report.Report.to_json` without views and rings), ``billboards`` and ``texels``;
+    """Its results: ``report`` (:meth:`bbfit.evaluation.report.Report.to_json` without views and rings), ``billboards`` and ``texels``;
     ``None`` if it failed."""
     reason: str | None
     """Why it failed."""
     seconds: float
-    """That the run took."""
+    """Time of the run."""
     folder: str
-    """Where its results lie, within the sweep's folder."""
+    """Folder of its results within the sweep's folder."""
 
     @property
     def published(self) -> ThesisScale | None:
-        """What the thesis reports for this tree's species and configuration, if it does."""
+        """The thesis's result for this tree's species and configuration, if there is one."""
         count = self.labels.get(BILLBOARDS, "")
         variant, loss = self.labels.get("variant", "base"), self.labels.get("loss", "l2")
         return published_figures().get(Experiment(self.tree, int(count), variant, loss)) if count.isdecimal() else None
@@ -48,28 +48,28 @@ class Measure:
     """A number of a run."""
 
     name: str
-    """As tables head it."""
+    """Heading in tables."""
     path: tuple[str, ...]
-    """Where it stands in the report."""
+    """Keys in the report."""
     digits: str
-    """Format."""
+    """Format specification."""
     more: bool | None
-    """Whether more is better, less is, or neither."""
+    """Whether more is better (True), less is better (False), or neither (None)."""
 
     def of(self, row: SweepRow) -> float | None:
-        """The number, if the run has it."""
+        """The run's value, if it has one."""
         value: Any = None if row.facts is None else row.facts["report"]
         for name in self.path:
             value = None if value is None else value[name]
         return None if value is None else float(value)
 
     def published(self, row: SweepRow) -> float | None:
-        """The thesis's number."""
+        """The thesis's value, if it has one."""
         figures = row.published
         return float(getattr(figures, self.path[-1])) if figures is not None and self.path[0] == "thesis_scale" else None
 
     def best(self, values: Sequence[float]) -> float | None:
-        """The best of some."""
+        """The best of two or more values."""
         if self.more is None or len(values) < 2:
             return None
         return max(values) if self.more else min(values)
@@ -81,7 +81,7 @@ THESIS_SCALE = (
     Measure("PSNR", ("thesis_scale", "psnr"), ".2f", True),
     Measure("SRE", ("thesis_scale", "sre"), ".2f", True),
 )
-HONEST = (
+MEASURES = (
     Measure("PSNR, dB", ("over_white", "psnr"), ".2f", True),
     Measure("SSIM", ("over_white", "ssim"), ".4f", True),
     Measure("FLIP", ("over_white", "flip"), ".4f", False),
@@ -98,18 +98,18 @@ _COLUMNS = {
     "iou": ("rgba", "iou"),
     "sharpness": ("sharpness",),
     "brightness": ("brightness",),
-    **{f"thesis_{name}": ("thesis_scale", name) for name in ("rmse", "ssim", "psnr", "sre")},
     "vertices": ("vertices", "model"),
     "original_vertices": ("vertices", "original"),
     "vertex_ratio": ("vertices", "ratio"),
     "bytes": ("bytes", "model"),
     "original_bytes": ("bytes", "original"),
     "fit_seconds": ("seconds", "fit"),
+    **{f"thesis_{name}": ("thesis_scale", name) for name in ("rmse", "ssim", "psnr", "sre")},
 }
 
 
 def table_csv(rows: Sequence[SweepRow]) -> bytes:
-    """A row a run: tree, labels, whether it is done or why it failed, every measure, the thesis's figures (``published_``), and costs."""
+    """CSV with one line per run: tree, labels, status, measures, costs, and the thesis's results (``published_``)."""
     labels = label_names(rows)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -153,32 +153,36 @@ def table_csv(rows: Sequence[SweepRow]) -> bytes:
 
 
 def table_markdown(rows: Sequence[SweepRow]) -> str:
-    """What was found, as Markdown: the thesis scale, the honest measures, what changes what, vertices and ratios, failures.
+    """The results as Markdown: measures, effects of each option, vertices and ratios, failures, and the thesis scale last.
 
-    In a table each tree has a column for each number of billboards. Bold is the best number of billboards of a tree, and in the last
-    column the best mean, as in the thesis's figure 11.
+    Tables have a column for each tree and number of billboards. Bold marks the best number of billboards of a tree, and in the last
+    column the best mean, as in figure 11 of the thesis.
     """
     done = [row for row in rows if row.reason is None]
-    parts = ["# Sweep\n", f"{len(done)} of {len(rows)} runs done, {_steps(done)} steps each. Held-out views; plain means over them.\n"]
+    parts = ["# Sweep\n", f"{len(done)} of {len(rows)} runs done, {_steps(done)} steps each. Means over the held-out views.\n"]
     if done:
-        note = "; in parentheses what the thesis reports of its trees" if any(row.published for row in done) else ""
-        parts += [f"## Thesis scale\n\nRMSE, SSIM, PSNR and SRE with a peak of 4095{note}.\n", pivot(done, THESIS_SCALE)]
-        parts += ["## Honest measures\n", pivot(done, HONEST)]
+        parts += ["## Measures\n", pivot(done, MEASURES)]
         changes = effects(done)
         if changes:
             parts += [
-                "## What changes what\n\nMean differences between runs that differ in nothing else.\n",
+                "## Effects\n\nMean differences between runs that differ in one option only.\n",
                 effect_table(changes),
             ]
-        parts += ["## Vertices\n\nOf the model, and in per cent of the tree's; in parentheses the thesis's ratio.\n", vertex_table(done)]
+        parts += [
+            "## Vertices\n\nVertices of the model, and their ratio to the tree's; the thesis's ratio is in parentheses.\n",
+            vertex_table(done),
+        ]
     if failed := [row for row in rows if row.reason]:
         parts.append("## Failed\n")
         parts.append("\n".join(f"- {row.tree}, {', '.join(row.labels.values()) or 'its one run'}: {row.reason}" for row in failed) + "\n")
+    if done:
+        note = "; the thesis's results for its own trees are in parentheses" if any(row.published for row in done) else ""
+        parts += [f"## Thesis scale\n\nRMSE, SSIM, PSNR and SRE with a peak of 4095{note}.\n", pivot(done, THESIS_SCALE)]
     return "\n".join(parts)
 
 
 def pivot(rows: Sequence[SweepRow], measures: Sequence[Measure]) -> str:
-    """A table with a line for each measure of each configuration but for its number of billboards, which has columns, as trees have."""
+    """A table with a line per configuration and measure, and a column per tree and number of billboards."""
     columns = list(dict.fromkeys((row.tree, row.labels.get(BILLBOARDS, "")) for row in rows))
     columns = [column for tree in dict.fromkeys(tree for tree, _ in columns) for column in sorted(c for c in columns if c[0] == tree)]
     lines = list(dict.fromkeys(_line(row) for row in rows))
@@ -205,18 +209,18 @@ def pivot(rows: Sequence[SweepRow], measures: Sequence[Measure]) -> str:
 
 @dataclass(frozen=True)
 class Effect:
-    """What a change of one label does to a tree's runs: mean differences of pairs of runs that differ in it alone."""
+    """The effect of one label on a tree's runs: mean differences between pairs of runs that differ only in this label."""
 
     change: str
-    """From what to what."""
+    """The label, its old and its new value."""
     tree: str
-    """Whose runs."""
+    """Tree of the runs."""
     pairs: int
-    """How many pairs there are."""
+    """Number of pairs."""
     thesis_psnr: float | None
     """Difference in PSNR on the thesis scale, in dB."""
     published_psnr: float | None
-    """The same of the thesis's figures."""
+    """The same difference between the thesis's results."""
     psnr: float | None
     """Difference in PSNR over white, in dB."""
     ssim: float | None
@@ -226,10 +230,10 @@ class Effect:
 
 
 def effects(rows: Sequence[SweepRow]) -> list[Effect]:
-    """Mean differences between runs that differ in one label alone: between neighboring numbers of billboards, and from the first value
-    of any other label to each of its others."""
-    found = []
-    (psnr, ssim, flip), thesis_psnr = HONEST[:3], THESIS_SCALE[2]
+    """Mean differences between runs that differ only in one label: between successive numbers of billboards, and from the first value of
+    any other label to each other value."""
+    changes = []
+    (psnr, ssim, flip), thesis_psnr = MEASURES[:3], THESIS_SCALE[2]
     for name in label_names(rows):
         values = list(dict.fromkeys(row.labels[name] for row in rows if name in row.labels))
         if name == BILLBOARDS:
@@ -239,27 +243,26 @@ def effects(rows: Sequence[SweepRow]) -> list[Effect]:
                 pairs = list(_pairs([row for row in rows if row.tree == tree], name, old, new))
                 if pairs:
                     of = (thesis_psnr.of, thesis_psnr.published, psnr.of, ssim.of, flip.of)
-                    found.append(Effect(f"{name} {old} → {new}", tree, len(pairs), *(_mean_gain(one, pairs) for one in of)))
-    return found
+                    changes.append(Effect(f"{name} {old} → {new}", tree, len(pairs), *(_mean_gain(one, pairs) for one in of)))
+    return changes
 
 
-def effect_table(found: Sequence[Effect]) -> str:
-    """Effects, a line each."""
+def effect_table(changes: Sequence[Effect]) -> str:
+    """A Markdown table with one line per effect."""
 
     def shown(value: float | None, digits: int) -> str:
         return "" if value is None else f"{value:+.{digits}f}"
 
-    head = ["change", "tree", "pairs", "PSNR, thesis scale", "that of the thesis", "PSNR over white, dB", "SSIM", "FLIP"]
+    head = ["change", "tree", "pairs", "PSNR over white, dB", "SSIM", "FLIP", "PSNR, thesis scale", "thesis's own"]
     lines = []
-    for one in found:
-        decibels = (one.thesis_psnr, one.published_psnr, one.psnr)
-        numbers = [*(shown(value, 2) for value in decibels), shown(one.ssim, 4), shown(one.flip, 4)]
+    for one in changes:
+        numbers = [shown(one.psnr, 2), shown(one.ssim, 4), shown(one.flip, 4), shown(one.thesis_psnr, 2), shown(one.published_psnr, 2)]
         lines.append([one.change, one.tree, str(one.pairs), *numbers])
     return markdown(head, lines)
 
 
 def vertex_table(rows: Sequence[SweepRow]) -> str:
-    """The thesis's table 1: what a model's vertices are of its tree's."""
+    """Vertices of the models relative to those of their trees, as in table 1 of the thesis."""
     trees = list(dict.fromkeys(row.tree for row in rows))
     originals = {row.tree: _at(row.facts and row.facts["report"], ("vertices", "original")) for row in rows}
     kinds = sorted({(int(_at(row.facts and row.facts["report"], ("vertices", "model")) or 0)) for row in rows})
@@ -306,9 +309,9 @@ def _values(
     columns: Sequence[tuple[str, str]],
     of: Callable[[SweepRow], float | None],
 ) -> dict[tuple[str, str], float]:
-    """A measure of each column in which a line has it."""
-    found = {column: of(cells[line, column]) for column in columns if (line, column) in cells}
-    return {column: value for column, value in found.items() if value is not None}
+    """A measure's values in one line, by column; columns without a value are left out."""
+    values = {column: of(cells[line, column]) for column in columns if (line, column) in cells}
+    return {column: value for column, value in values.items() if value is not None}
 
 
 def _cell(ours: float | None, theirs: float | None, digits: str, best: float | None) -> str:

@@ -1,4 +1,4 @@
-"""The report as a table for the screen."""
+"""Tables for the terminal."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING
 from bbfit.evaluation.report import Cost, Report
 from bbfit.exporting.lod import LodLevel
 from bbfit.reporting.comparison_tables import CompareRow
-from bbfit.reporting.sweep_tables import HONEST, SweepRow, label_names
+from bbfit.reporting.sweep_tables import MEASURES, SweepRow, label_names
 from bbfit.trees.species import Species
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-# Views from more elevations than this stand in no rings.
+# Reports with more rings than this are shown without rings.
 _MOST_RINGS = 8
 _UP, _DOWN, _ONE = "↑", "↓", "→ 1"
 
 
 def species_table(species: Sequence[Species]) -> Table:
-    """A ``rich`` table of species that can be grown: name, height and levels of stems."""
+    """A ``rich`` table of species: name, height and levels of stems."""
     from rich import box
     from rich.table import Table
 
@@ -36,8 +36,7 @@ def species_table(species: Sequence[Species]) -> Table:
 def report_table(report: Report, title: str = "Held-out views", *, thesis: bool = True) -> Table:
     """A ``rich`` table of the mean measures and the costs, at most 100 columns wide.
 
-    An arrow tells which way is better. With ``thesis`` the thesis scale stands beside the honest ones, for comparison with the thesis's
-    figures only.
+    An arrow shows which direction is better. With ``thesis`` a last column has the thesis scale, for comparison with the thesis's figures.
     """
     from rich import box
     from rich.table import Table
@@ -92,7 +91,7 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
 
 
 def lod_table(levels: Sequence[LodLevel]) -> Table:
-    """A ``rich`` table of levels of detail: what each costs, and from where on it is shown."""
+    """A ``rich`` table of levels of detail: costs, distance and error of each."""
     from rich import box
     from rich.table import Table
 
@@ -117,7 +116,7 @@ def lod_table(levels: Sequence[LodLevel]) -> Table:
 
 
 def sweep_table(rows: Sequence[SweepRow]) -> Table:
-    """A ``rich`` table with a line a run: the honest measures, what it costs, or why it failed."""
+    """A ``rich`` table with one line per run: measures and costs, or the reason of its failure."""
     from rich import box
     from rich.table import Table
 
@@ -133,14 +132,14 @@ def sweep_table(rows: Sequence[SweepRow]) -> Table:
             table.add_row(*start, f"failed: {row.reason}", style="yellow")
             continue
         report = row.facts["report"]
-        measures = [f"{measure.of(row):{measure.digits}}" for measure in HONEST[:3]]
+        measures = [f"{measure.of(row):{measure.digits}}" for measure in MEASURES[:3]]
         costs = [_count(report[name]["model"]) for name in ("vertices", "bytes")]
         table.add_row(*start, *measures, *costs, f"{row.seconds:.1f}")
     return table
 
 
 def compare_table(rows: Sequence[CompareRow]) -> Table:
-    """A ``rich`` table with a line a system: its score on the held-out views and what it costs."""
+    """A ``rich`` table with one line per system: its measures on the held-out views and its costs."""
     from rich import box
     from rich.table import Table
 

@@ -38,7 +38,7 @@ def views_stage(folder: Path, tree: TreeFile, config: ViewsConfig) -> Stage:
         return request.seconds if request else 0.0
 
     files = (f"views/{REQUEST_FILE}", "views/transforms_*.json", "views/images/*.png")
-    return Stage("views", (tree.digest, config), files, work)
+    return Stage("views", (tree.digest, ViewsRequest.of(tree, config).config), files, work)
 
 
 def convert_stage(folder: Path, tree: TreeFile, name: str, *, triangles: int | None = None) -> Stage:

@@ -298,5 +298,5 @@ def test_views_that_see_nothing_are_refused() -> None:
     cloud, camera = leafy("mask")
     cards = cloud_cards(cloud, 8)
     away = Camera(look_at(camera.position, 2 * camera.position), camera.intrinsics, 96, 96)
-    with pytest.raises(InputError, match="cameras: see nothing of the cards"):
+    with pytest.raises(InputError, match="cameras: none sees a card"):
         matched_chain(cards, mip_chain(cards.atlas, 0.5), away)

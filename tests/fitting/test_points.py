@@ -36,8 +36,7 @@ DATA = Path(__file__).resolve().parents[2] / "data"
 
 def viewset(pictures: Tensor, cameras: Camera) -> ViewSet:
     """Views that lie in memory, uint8 [V, H, W, 4], straight alpha."""
-    cache = type("Pictures", (), {"get": lambda self, path: pictures[int(path.name)]})()
-    return ViewSet(tuple(Path(str(index)) for index in range(len(pictures))), cameras, cache)
+    return ViewSet.from_arrays(pictures, cameras)
 
 
 def ring_around_origin(count: int, width: int, height: int, *, elevation: float = 0.0) -> Camera:
@@ -164,7 +163,7 @@ def test_a_missing_mesh_is_said_to_be_missing(views: ViewSet, tmp_path: Path) ->
 def test_what_only_blender_reads_is_refused(views: ViewSet, tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"tree.{ending}"
     path.write_bytes(b"Kaydara FBX Binary")
-    with pytest.raises(InputError, match=rf"^tree: .*tree\.{ending} .*only Blender.*\.glb \.gltf \.obj \.ply \.stl"):
+    with pytest.raises(InputError, match=rf"^tree: only Blender .*tree\.{ending}; .*\.glb \.gltf \.obj \.ply \.stl"):
         mesh_points(TreeFile.open(path), views)
 
 

@@ -102,7 +102,7 @@ def test_the_whole_text() -> None:
     assert "12 of 13 runs done, 20 steps each" in text
     assert "- acer, double, l2, 2: no memory" in text
     assert "| 8 | 0.8 % (0.0071 %) | 0.8 % |" in text and "| the tree | 1,000 | 1,000 |" in text
-    for heading in ("## Thesis scale", "## Honest measures", "## What changes what", "## Vertices", "## Failed"):
+    for heading in ("## Measures", "## Effects", "## Vertices", "## Failed", "## Thesis scale"):
         assert heading in text
 
 
