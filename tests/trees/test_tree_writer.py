@@ -210,7 +210,7 @@ def written(folder: Path) -> dict[str, str]:
 def test_the_same_scene_gives_the_same_bytes_in_every_process(tmp_path: Path) -> None:
     first = written(tmp_path)
     assert written(tmp_path) == first and len(first) == 3
-    script = "import json, pathlib, sys, test_tree_file as t; print(json.dumps(t.written(pathlib.Path(sys.argv[1]))))"
+    script = "import json, pathlib, sys, test_tree_writer as t; print(json.dumps(t.written(pathlib.Path(sys.argv[1]))))"
     command = [sys.executable, "-c", script, str(tmp_path)]
     environment = {**os.environ, "PYTHONHASHSEED": "1234", "PYTHONPATH": str(Path(__file__).parents[1])}
     result = subprocess.run(command, check=True, stdout=subprocess.PIPE, cwd=Path(__file__).parent, env=environment)
