@@ -162,7 +162,7 @@ def best_planes(sums: Tensor, *, upright: bool) -> tuple[Tensor, Tensor, Tensor]
     return normals, (normals * means).sum(-1), values[:, 0].clamp_min(0)
 
 
-def rectangles(points: Tensor, planes: Planes, texels_a_meter: float, margin: float, *, two_sided: bool) -> BillboardCloud:
+def rectangles(points: Tensor, planes: Planes, texels_per_meter: float, margin: float, *, two_sided: bool) -> BillboardCloud:
     """Place the smallest rectangle that contains the points of each plane.
 
     A rectangle is upright unless a rotated one is a fifth smaller.
@@ -173,7 +173,7 @@ def rectangles(points: Tensor, planes: Planes, texels_a_meter: float, margin: fl
         Float64 [P, 3].
     planes
         K planes and the assignment of the points.
-    texels_a_meter
+    texels_per_meter
         Texels per meter along each side.
     margin
         Meters to add on every side.
@@ -200,7 +200,7 @@ def rectangles(points: Tensor, planes: Planes, texels_a_meter: float, margin: fl
     centers, rights, ups, halves = (torch.stack(part) for part in zip(*parts, strict=True))
     sizes, sides = torch.ones(len(centers), 2, dtype=torch.int64), torch.full((len(centers),), two_sided)
     cloud = BillboardCloud(centers, rights, ups, halves, sizes, sides, torch.zeros(len(centers) * (1 + two_sided), 4))
-    return sized(cloud, texels_a_meter)
+    return sized(cloud, texels_per_meter)
 
 
 def splatted(cloud: BillboardCloud, points: Tensor, colors: Tensor, labels: Tensor) -> BillboardCloud:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from bbfit.checks import fail
-from bbfit.fitting.initialize import pixels_a_meter
+from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, convergence_point
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewSet
@@ -97,7 +97,7 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0, batch: int
     # Space outside a picture is background too, unless the border of the picture cuts off the tree.
     cropped = [bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()) for mask in masks]
     cameras = cameras.resized(masks[0].shape[1], masks[0].shape[0])
-    center, extent = convergence_point(cameras), max(cameras.width, cameras.height) / float(pixels_a_meter(cameras))
+    center, extent = convergence_point(cameras), max(cameras.width, cameras.height) / float(pixels_per_meter(cameras))
     low, high = center - extent / 2, center + extent / 2
     generator, batches = torch.Generator().manual_seed(seed), list[Tensor]()
     for _ in range(_ROUNDS):

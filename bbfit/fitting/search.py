@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, splatted, split_planes, view_projection
 from bbfit.fitting.config import ResolvedFit
-from bbfit.fitting.initialize import pixels_a_meter, tree_radius
+from bbfit.fitting.initialize import pixels_per_meter, tree_radius
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.points import pixels_of, point_colors
@@ -101,7 +101,7 @@ class _Search:
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))
         cameras = self._targets.cameras
-        self._density = float(pixels_a_meter(cameras)) * config.texel_density
+        self._density = float(pixels_per_meter(cameras)) * config.texel_density
         self._projection = view_projection(cameras)
         self._pixels = [pixels_of(points, cameras[index]) for index in range(len(cameras))]
         self._all_upright = config.orientation == "upright"
