@@ -74,18 +74,9 @@ def random_textures(cloud: BillboardCloud, sizes: Tensor, seed: int) -> Billboar
 
 
 def bounded(planes: BillboardCloud, bounds: Tensor, texels_per_meter: float, max_texels: int | None = None) -> BillboardCloud:
-    """Resize billboards to bounds and allocate their textures as :func:`sized` does.
+    """Resize N billboards to bounds, [N, 4], and allocate their textures as :func:`sized` does.
 
-    Parameters
-    ----------
-    planes
-        N billboards.
-    bounds
-        Left, right, bottom and top along the billboards' axes from their centers, in meters, [N, 4].
-    texels_per_meter
-        Texels per meter along each side.
-    max_texels
-        Most texels of all billboards together.
+    The bounds are left, right, bottom and top along the billboards' axes from their centers, in meters.
     """
     left, right, bottom, top = bounds.unbind(-1)
     middle, sides = torch.stack([left + right, bottom + top], -1) / 2, torch.stack([right - left, top - bottom], -1)
@@ -96,19 +87,8 @@ def bounded(planes: BillboardCloud, bounds: Tensor, texels_per_meter: float, max
 def sized(cloud: BillboardCloud, texels_per_meter: float, max_texels: int | None = None) -> BillboardCloud:
     """Give billboards transparent textures with square texels, and round the rectangles up to whole texels.
 
-    Parameters
-    ----------
-    cloud
-        N billboards.
-    texels_per_meter
-        Texels per meter along each side. It is lowered if ``max_texels`` requires it.
-    max_texels
-        Most texels of all billboards together.
-
-    Raises
-    ------
-    InputError
-        If there are more textures than ``max_texels`` allows texels.
+    The texels per meter along each side are lowered if ``max_texels``, the most texels of all billboards together, requires it. Raises
+    InputError if there are more textures than ``max_texels`` allows texels.
     """
     sides = 1 + cloud.two_sided.long()
     if max_texels is not None and max_texels < int(sides.sum()):

@@ -79,23 +79,10 @@ def _resized(texture: Tensor, size: list[int]) -> Tensor:
 
 
 def resampled(cloud: BillboardCloud, onto: BillboardCloud, sizes: Tensor) -> BillboardCloud:
-    """Resample the textures of a cloud onto other rectangles in the same planes.
+    """Resample the textures of N billboards to new heights and widths, int64 [N, 2], onto other rectangles in the same planes.
 
-    The filter is that of :func:`resize_textures`. A texture continues beyond its border as transparent texels of the border's color.
-
-    Parameters
-    ----------
-    cloud
-        N billboards with textures.
-    onto
-        The rectangles to resample onto. Their axes are those of ``cloud``; their centers and extents may differ.
-    sizes
-        New texture heights and widths, int64 [N, 2].
-
-    Returns
-    -------
-    BillboardCloud
-        ``onto`` with the new textures.
+    The rectangles of ``onto`` have the axes of ``cloud``; their centers and extents may differ. The filter is that of
+    :func:`resize_textures`. A texture continues beyond its border as transparent texels of the border's color.
     """
     if torch.equal(cloud.centers, onto.centers) and torch.equal(cloud.half_extents, onto.half_extents):
         return resize_textures(cloud, sizes)

@@ -56,17 +56,7 @@ class _Shown:
 class Viewer:
     """A viewer that listens until it is closed; a context manager.
 
-    Parameters
-    ----------
-    host : str
-        The host to listen on.
-    port : int
-        The first port to try; 0 is any free one.
-
-    Raises
-    ------
-    InputError
-        If it cannot listen there.
+    It takes the first free port of the host from ``port`` on; 0 is any free one. Raises InputError if it cannot listen there.
     """
 
     def __init__(self, *, host: str = "127.0.0.1", port: int = 8080) -> None:
@@ -191,18 +181,19 @@ def view(run: str | Path, *, host: str = "127.0.0.1", port: int = 8080, original
 
     Parameters
     ----------
-    run : str or Path
+    run
         The folder of ``bbfit run``, ``bbfit fit`` or ``bbfit lod``.
-    host : str
+    host
         The address to listen on. Whoever can reach it can see the page. ``0.0.0.0`` is all addresses of this machine.
-    port : int
+    port
         The first port to try; 0 is any free one.
-    original_bytes : int
+    original_bytes
         The largest size of the original's file that is sent to browsers.
 
     Returns
     -------
-    The viewer. It listens until its ``close`` is called or the process ends; its ``url`` is the page's address.
+    Viewer
+        It listens until its ``close`` is called or the process ends; its ``url`` is the page's address.
 
     Raises
     ------

@@ -36,18 +36,9 @@ class WatchedRun:
 
 
 class Watch:
-    """Keeps a viewer up to date with a run.
+    """Keeps a viewer up to date with a run; the viewer stays open when the watch ends.
 
-    Parameters
-    ----------
-    viewer : Viewer
-        The viewer, which stays open when the watch ends.
-    run : WatchedRun
-        The run.
-    interval : float
-        The least number of seconds between two previews.
-    share : float
-        The largest share of the time that previews may take.
+    At least ``interval`` seconds pass between two previews, which may take at most the fraction ``share`` of the time.
     """
 
     def __init__(self, viewer: Viewer, run: WatchedRun, *, interval: float = 2.0, share: float = 0.04) -> None:
