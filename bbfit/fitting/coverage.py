@@ -13,14 +13,12 @@ from bbfit.operators.config import Backend
 from bbfit.rendering.dispatch import render
 from bbfit.views import ViewSet
 
-# Most views to compare, largest shift of alpha, and iterations of the bisection.
-_VIEWS, _MAX_SHIFT, _BISECTIONS = 24, 0.3, 8
+# Most views to compare, largest shift of alpha, iterations of the bisection, and Gauss-Newton steps.
+_VIEWS, _MAX_SHIFT, _BISECTIONS, _GAUSS_NEWTON_STEPS = 24, 0.3, 8, 2
 # Exponent that spreads alpha. It applies to the distance from the cutoff as a fraction of the largest possible distance.
 _SPREAD = 0.4
 # The derivatives of coverage are differences: largest side of the pictures that they are measured in, in pixels, and step of alpha.
 _SIDE, _STEP = 256, 0.05
-# Gauss-Newton steps.
-_GAUSS_NEWTON_STEPS = 2
 
 
 def matched_coverage(cloud: BillboardCloud, views: ViewSet, backend: Backend = "auto") -> BillboardCloud:

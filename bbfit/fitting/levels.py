@@ -37,7 +37,6 @@ class Targets:
         if halvings == 0:
             return Targets(views.cameras, views, None)
         width, height = (max(1, round(side / 2**halvings)) for side in (views.cameras.width, views.cameras.height))
-
         shrunk = torch.empty(len(views), height, width, 4, dtype=torch.uint8)
 
         def shrink(index: int) -> None:
@@ -46,8 +45,7 @@ class Targets:
             shrunk[index] = interpolate(picture.permute(2, 0, 1)[None], (height, width), mode="area")[0].permute(1, 2, 0).round()
 
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # each thread has memory of its own
-            for _ in pool.map(shrink, range(len(views))):
-                pass
+            list(pool.map(shrink, range(len(views))))
         return Targets(views.cameras.resized(width, height), views, shrunk)
 
     def packed(self, indices: Sequence[int]) -> Tensor:
