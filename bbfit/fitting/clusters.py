@@ -135,9 +135,7 @@ def rectangles(points: Tensor, planes: Planes, texels_per_meter: float, margin: 
     parts = []
     for k, (normal, offset) in enumerate(zip(planes.normals, planes.offsets, strict=True)):
         members = points[planes.labels == k]
-        up = torch.tensor([0.0, 1.0, 0.0], dtype=points.dtype)
-        if float(normal[1].abs()) > 0.999:
-            up = torch.tensor([0.0, 0.0, -1.0], dtype=points.dtype)
+        up = torch.tensor([0.0, 0.0, -1.0] if float(normal[1].abs()) > 0.999 else [0.0, 1.0, 0.0], dtype=points.dtype)
         right = torch.nn.functional.normalize(torch.linalg.cross(up, normal), dim=0)
         up = torch.linalg.cross(normal, right)
         flat = torch.stack([members @ right, members @ up], -1) if len(members) else torch.zeros(1, 2, dtype=points.dtype)

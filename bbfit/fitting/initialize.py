@@ -29,21 +29,18 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
     axis, focal = convergence_point(camera), pixels_per_meter(camera)
     density = resolved.texel_density * float(focal)
     size = torch.tensor([camera.height, camera.width])
-    sides = resolved.sides
     planes = even_upright(
         resolved.billboards,
         axis=axis,
         half_extents=size.flip(0) / focal / 2,
         texture_sizes=_at_least_one(size * resolved.texel_density),
-        sides=sides,
+        sides=resolved.sides,
         gap=PAIR_GAP * float(camera.width / focal / 2),
     )
-    if resolved.bounds != "viewport":
-        if resolved.bounds == "thesis":
-            bounds = facing_view_bounds(planes, views, pairs=sides == "pair")
-        else:
-            bounds = silhouette_bounds(planes, views)
-        planes = bounded(planes, bounds, density, resolved.max_texels)
+    if resolved.bounds == "thesis":
+        planes = bounded(planes, facing_view_bounds(planes, views, pairs=resolved.sides == "pair"), density, resolved.max_texels)
+    elif resolved.bounds == "silhouette":
+        planes = bounded(planes, silhouette_bounds(planes, views), density, resolved.max_texels)
     elif resolved.max_texels is not None:
         planes = sized(planes, density, resolved.max_texels)
     return random_textures(planes.to(torch.float32), planes.texture_sizes, resolved.seed)
