@@ -1,14 +1,18 @@
-"""One wording for bad input: what is wrong, what was expected, what was got, what to do.
+"""Checks of user input. Every message says what is wrong, what was expected, what was given and what to do.
 
 Everything that a user can get wrong raises :class:`InputError` (a ``ValueError``), its subclass :class:`MissingFileError` (also a
 ``FileNotFoundError``) or :class:`InputTypeError` (also a ``TypeError``). The command line turns exactly these, and operating system
-errors, into exit code 2; any other exception is a fault of ours.
+errors, into exit code 2; any other exception is a bug in bbfit.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
+from functools import cache
+from math import inf
 from pathlib import Path
-from typing import Any, NoReturn
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
 
 
 class InputError(ValueError):
@@ -31,17 +35,78 @@ def fail(name: str, problem: str, hint: str = "") -> NoReturn:
     raise InputError(f"{name}: {problem}" + (f"; {hint}" if hint else ""))
 
 
-def check_range(name: str, value: float, low: float, high: float, *, open_low: bool = False) -> None:
-    """Require ``low <= value <= high`` (``low < value`` with ``open_low``) and a finite number."""
+@dataclass(frozen=True)
+class Range:
+    """The values that a number in a configuration may have, as in ``Annotated[float, Range(0, 1)]``; see :func:`check_fields`."""
+
+    low: float
+    """Least value."""
+    high: float = inf
+    """Greatest value."""
+    open_low: bool = False
+    """Whether ``low`` itself is excluded."""
+    open_high: bool = False
+    """Whether ``high`` itself is excluded."""
+
+
+Count = Annotated[int, Range(1)]
+"""A whole number of at least 1."""
+Seed = Annotated[int, Range(0)]
+"""A seed of random numbers: a whole number of at least 0."""
+
+
+def check_fields(config: Any) -> None:
+    """Require that every field of a dataclass holds what its annotation allows.
+
+    A ``Literal`` has to hold one of its values, a ``bool`` True or False, and a number with a :class:`Range` one within it. ``None`` is
+    allowed where the annotation allows it. Items of a tuple are checked one by one. Other types are not checked.
+
+    Raises
+    ------
+    InputError
+        if a value is not allowed; the message starts with the field's name.
+    """
+    hints = _hints(config.__class__)
+    for field in fields(config):
+        _check(field.name, getattr(config, field.name), hints[field.name])
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+def _check(name: str, value: Any, hint: Any) -> None:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        kinds = [kind for kind in arguments if kind is not NoneType]
+        if len(kinds) == 1 and not (value is None and NoneType in arguments):
+            _check(name, value, kinds[0])
+    elif origin is tuple:
+        if not isinstance(value, tuple | list):
+            raise InputTypeError(f"{name}: expected a tuple, got {value!r}")
+        for item in value:
+            _check(name, item, arguments[0])
+    elif origin is Literal or hint is bool:
+        check_choice(name, value, arguments or (False, True))
+    elif origin is Annotated:
+        for limits in (each for each in arguments[1:] if isinstance(each, Range)):
+            if arguments[0] is int:
+                check_count(name, value, int(limits.low))
+            check_range(name, value, limits.low, limits.high, open_low=limits.open_low, open_high=limits.open_high)
+
+
+def check_range(name: str, value: float, low: float, high: float, *, open_low: bool = False, open_high: bool = False) -> None:
+    """Require a finite number with ``low <= value <= high``; an open end is excluded."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputTypeError(f"{name}: expected a number, got {value!r}")
-    inside = (low < value if open_low else low <= value) and value <= high and value != float("inf")
-    if not inside:  # NaN lands here too
-        if high == float("inf"):
-            wanted = f"more than {low:g}" if open_low else f"at least {low:g}"
+    inside = (low < value if open_low else low <= value) and (value < high if open_high else value <= high) and value != inf
+    if not inside:  # NaN is not inside either
+        if high == inf:
+            expected = f"more than {low:g}" if open_low else f"at least {low:g}"
         else:
-            wanted = f"a value in {'(' if open_low else '['}{low:g}, {high:g}]"
-        fail(name, f"expected {wanted}, got {value!r}")
+            expected = f"a value in {'(' if open_low else '['}{low:g}, {high:g}{')' if open_high else ']'}"
+        fail(name, f"expected {expected}, got {value!r}")
 
 
 def check_count(name: str, value: int, least: int = 1) -> None:
@@ -62,8 +127,8 @@ def check_shape(name: str, got: tuple[int, ...], expected: tuple[int | None, ...
     """Require a shape; ``None`` matches any length."""
     fits = len(got) == len(expected) and all(e is None or e == g for g, e in zip(got, expected, strict=True))
     if not fits:
-        wanted = "[" + ", ".join("*" if e is None else str(e) for e in expected) + "]"
-        fail(name, f"expected shape {wanted}, got {list(got)}")
+        shape = "[" + ", ".join("*" if e is None else str(e) for e in expected) + "]"
+        fail(name, f"expected shape {shape}, got {list(got)}")
 
 
 def check_file(name: str, path: str | Path) -> Path:

@@ -35,8 +35,8 @@ def gltf_parts(data: bytes, name: str = "model", path: str | Path = "the file") 
 
     Returns
     -------
-    tuple of dict and bytes
-        The JSON's object and the contents of the first binary chunk, which are empty if there is none.
+    tuple[dict[str, Any], bytes]
+        tuple of dict and bytes The JSON's object and the contents of the first binary chunk, which are empty if there is none.
 
     Raises
     ------

@@ -19,12 +19,12 @@ _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
 def check_model_path(name: str, path: str | Path) -> Path:
-    """Require one of the endings :data:`SUFFIXES` and an existing folder; return the path as a ``Path``.
+    """Require one of the endings ``SUFFIXES`` and an existing folder; return the path as a ``Path``.
 
     Raises
     ------
-    InputError, MissingFileError
-        that call the file ``name``.
+    InputError or MissingFileError
+        That call the file ``name``.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:

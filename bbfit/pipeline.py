@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,11 @@ class RunConfig:
     """Limits of the result. They determine the options of the fit that ``fit`` does not set."""
     export: ExportConfig = field(default_factory=ExportConfig)
     """Options for writing the model."""
+
+    def seeded(self, seed: int) -> RunConfig:
+        """The same options with one seed for growing, rendering and fitting."""
+        views, fit = replace(self.views, seed=seed), replace(self.fit, seed=seed)
+        return replace(self, grow=replace(self.grow, seed=seed), views=views, fit=fit)
 
 
 @dataclass(frozen=True)
@@ -145,7 +150,7 @@ def prepare(
         species = load_species(config.species or (None if config.grow.species_file else "quaking_aspen"), config.grow.species_file)
         record = Record(output_folder("out", out), _head(species.name, config, grown=species, rendered=True))
         tree = _grown(record, grow_stage(record.folder, species, config.grow), on_progress)
-    elif config.species is not None or config.grow != RunConfig().grow:
+    elif config.species is not None or replace(config.grow, seed=0) != RunConfig().grow:
         fail("run", f"{path} is given, so no tree is grown", "omit the species and the options for growing")
     elif views_folder is not None:
         views = ViewDataset.load(views_folder, seed=config.fit.seed)  # check the inputs before creating the output folder
@@ -186,12 +191,12 @@ def _head(source: str, config: RunConfig, *, grown: Species | None = None, rende
 def _facts(record: Record) -> dict[str, Any]:
     """The parts of the record that the report shows: options and their defaults, seeds and versions."""
     head = record.head
-    usual = RunConfig(fit=FitConfig(preset=head["config"]["fit"]["preset"]).resolve())
+    defaults = RunConfig(fit=FitConfig(preset=head["config"]["fit"]["preset"]).resolve())
     stages = ("grow", "views", "fit", "budget", "export")
     return {
         "source": Path(head["source"]).name,
-        "asked": {stage: options for stage in stages if (options := head["config"][stage]) is not None},
-        "usual": _plain(asdict(usual)),
+        "options": {stage: options for stage in stages if (options := head["config"][stage]) is not None},
+        "defaults": _plain(asdict(defaults)),
         "seeds": head["seeds"],
         "versions": head["versions"],
     }

@@ -1,55 +1,33 @@
-"""Views of a tree: pictures, cameras and their split, read from a folder in the NeRF-synthetic layout."""
+"""Views of a tree: pictures, cameras and their split, read from a folder in the NeRF-synthetic layout or made from arrays."""
 
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import torch
+from cachetools import LRUCache, cached
+from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from bbfit.blender.request import ViewsRequest
-from bbfit.checks import MissingFileError, check_folder, fail
+from bbfit.checks import InputTypeError, MissingFileError, check_folder, check_shape, fail
 from bbfit.geometry.camera import Camera
-from bbfit.images import premultiply, read_rgba
+from bbfit.images import premultiply, read_rgba, to_bytes
 from bbfit.layout import REQUEST_FILE, Frame, cameras_of, read_frames, split_views
 
 CACHE_BYTES = 3 << 29
-"""Decoded pictures that a dataset keeps in memory at most, in bytes; the ones used longest ago go first."""
+"""Most bytes of decoded pictures that a dataset keeps in memory; it drops the least recently used ones first."""
 
 
 LEAST_PIXELS = 11
 """Least width and height of a picture: that of the window of the structural similarity."""
-
-
-class _Cache:
-    """Decoded pictures, least recently used out first; safe to use from several threads."""
-
-    def __init__(self, limit_bytes: int) -> None:
-        self._limit, self._held, self._pictures = limit_bytes, 0, OrderedDict[Path, Tensor]()
-        self._lock = threading.Lock()
-
-    def get(self, path: Path) -> Tensor:
-        with self._lock:
-            if path in self._pictures:
-                self._pictures.move_to_end(path)
-                return self._pictures[path]
-        picture = torch.from_numpy(read_rgba(path))
-        if not picture[..., 3].any():
-            fail("views", f"{path} is fully transparent", "render it anew or take it out of the transforms file")
-        with self._lock:
-            if path not in self._pictures:
-                self._pictures[path] = picture
-                self._held += picture.numel()
-            while self._held > self._limit and len(self._pictures) > 1:
-                self._held -= self._pictures.popitem(last=False)[1].numel()
-        return picture
 
 
 @dataclass(frozen=True)
@@ -57,10 +35,39 @@ class ViewSet:
     """V pictures of one size with their cameras."""
 
     paths: tuple[Path, ...]
-    """The pictures' files, V of them."""
+    """The pictures' files, V of them; for pictures from arrays, names without a file."""
     cameras: Camera
     """V cameras, float64."""
-    _cache: _Cache = field(repr=False, compare=False)
+    read: Callable[[Path], Tensor] = field(repr=False, compare=False)
+    """Returns the picture of a path, uint8 [H, W, 4], straight alpha; it may be called from several threads."""
+
+    @staticmethod
+    def from_arrays(images: NDArray[Any] | Tensor, cameras: Camera) -> ViewSet:
+        """Views from pictures in memory, which are named 0000, 0001 and so on.
+
+        Parameters
+        ----------
+        images : array or tensor
+            straight-alpha RGBA, [V, H, W, 4]: uint8, or floats in [0, 1], which are rounded to 8 bits.
+        cameras : Camera
+            V cameras of pictures of W x H pixels.
+
+        Raises
+        ------
+        InputError
+            if the pictures have another shape or type, or values out of range.
+        """
+        pictures = torch.as_tensor(images).detach().cpu()
+        cameras = cameras.batch().to(torch.float64).to("cpu")
+        check_shape("images", tuple(pictures.shape), (len(cameras), cameras.height, cameras.width, 4))
+        if pictures.is_floating_point():
+            if not bool(((pictures >= 0) & (pictures <= 1)).all()):
+                fail("images", "floats are not all in [0, 1]", "divide 8-bit values by 255, or give uint8")
+            pictures = torch.from_numpy(to_bytes(pictures))
+        if pictures.dtype != torch.uint8:
+            raise InputTypeError(f"images: expected uint8 or floats, got {pictures.dtype}")
+        paths = [Path(f"{index:04}.png") for index in range(len(pictures))]
+        return ViewSet(tuple(paths), cameras, dict(zip(paths, pictures, strict=True)).__getitem__)
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -71,8 +78,8 @@ class ViewSet:
         return [path.stem for path in self.paths]
 
     def take(self, indices: Sequence[int]) -> ViewSet:
-        """Some of the views, with the same memory of pictures."""
-        return ViewSet(tuple(self.paths[index] for index in indices), self.cameras[list(indices)], self._cache)
+        """Some of the views, which share the pictures in memory."""
+        return ViewSet(tuple(self.paths[index] for index in indices), self.cameras[list(indices)], self.read)
 
     def image(self, index: int) -> Tensor:
         """One picture, uint8 [H, W, 4], straight alpha. Do not write to it: it may be cached.
@@ -83,7 +90,7 @@ class ViewSet:
             if the file is missing, damaged, without alpha, fully transparent or of another size than the rest.
         """
         path = self.paths[index]
-        picture = self._cache.get(path)
+        picture = self.read(path)
         expected = (self.cameras.height, self.cameras.width)
         if tuple(picture.shape[:2]) != expected:
             fail("views", f"{path} is {picture.shape[1]}x{picture.shape[0]}, others {expected[1]}x{expected[0]}", "make them equal")
@@ -107,7 +114,7 @@ class ViewSet:
         return digest.hexdigest()
 
     def check(self) -> None:
-        """Decode every picture once, so that a bad one is found now and not in the middle of long work."""
+        """Decode every picture once, so that a bad one is reported before long work begins."""
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # each thread keeps memory of its own
             for _ in pool.map(self.image, range(len(self))):
                 pass
@@ -117,11 +124,11 @@ class ViewSet:
 class ViewDataset:
     """Training and test views of one tree.
 
-    Pictures stay uint8 and are decoded when asked for; at most :data:`CACHE_BYTES` of them are kept.
+    Pictures stay uint8. Those of files are decoded when they are first used, and :data:`CACHE_BYTES` bounds how many stay in memory.
     """
 
-    folder: Path
-    """Where the views lie."""
+    folder: Path | None
+    """Folder of the views; None for views from arrays."""
     train: ViewSet
     """Views to fit to."""
     test: ViewSet
@@ -135,8 +142,12 @@ class ViewDataset:
 
         Parameters
         ----------
-        seed : chooses the random quarter that becomes the test split where the folder has none.
-        cache_bytes : bound on the decoded pictures kept in memory.
+        folder : str or Path
+            folder with one or two transforms files.
+        seed : int
+            seed of the random quarter that becomes the test split if the folder has none.
+        cache_bytes : int
+            most bytes of decoded pictures that stay in memory.
 
         Raises
         ------
@@ -152,20 +163,60 @@ class ViewDataset:
         if not train or not test:
             fail("views", f"{folder} has {len(train)} training and {len(test or [])} test views", "at least one of each is needed")
         width, height = _common_size([*train, *test])
-        if min(width, height) < LEAST_PIXELS:
-            fail("views", f"{folder} has pictures of {width}x{height} pixels", f"give at least {LEAST_PIXELS}x{LEAST_PIXELS}")
-        cache = _Cache(cache_bytes)
+        _check_size("views", f"pictures in {folder}", width, height)
+
+        @cached(LRUCache(cache_bytes, getsizeof=Tensor.numel), lock=threading.Lock())
+        def read(path: Path) -> Tensor:
+            picture = torch.from_numpy(read_rgba(path))
+            if not picture[..., 3].any():
+                fail("views", f"{path} is fully transparent", "render it anew or take it out of the transforms file")
+            return picture
 
         def view_set(frames: list[Frame]) -> ViewSet:
-            return ViewSet(tuple(frame.image for frame in frames), cameras_of(frames, width, height), cache)
+            return ViewSet(tuple(frame.image for frame in frames), cameras_of(frames, width, height), read)
 
         request = ViewsRequest.load(folder / REQUEST_FILE) if (folder / REQUEST_FILE).is_file() else None
         return ViewDataset(folder, view_set(train), view_set(test), request)
+
+    @staticmethod
+    def from_arrays(images: NDArray[Any] | Tensor, cameras: Camera, *, test: Sequence[int] | None = None, seed: int = 0) -> ViewDataset:
+        """A dataset from pictures in memory.
+
+        Parameters
+        ----------
+        images, cameras
+            as for :meth:`ViewSet.from_arrays`; no picture may be fully transparent.
+        test : sequence of int, optional
+            indices of the held-out views. Default: the random quarter of ``seed``.
+        seed : int
+            seed of that quarter.
+
+        Raises
+        ------
+        InputError
+            if a picture cannot be used, there are fewer than two, or no view is left for training or for the test.
+        """
+        views = ViewSet.from_arrays(images, cameras)
+        if len(views) < 2:
+            fail("images", f"expected at least two views, got {len(views)}")
+        held = split_views(len(views), seed)[1] if test is None else sorted({int(index) for index in test})
+        rest = [index for index in range(len(views)) if index not in held]
+        if not held or not rest or not 0 <= held[0] <= held[-1] < len(views):
+            fail("test", f"expected some of the indices 0 to {len(views) - 1}, not all, got {held}")
+        _check_size("images", "they", views.cameras.width, views.cameras.height)
+        if empty := [index for index in range(len(views)) if not views.image(index)[..., 3].any()]:
+            fail("images", f"view {empty[0]} is fully transparent", "leave it out")
+        return ViewDataset(None, views.take(rest), views.take(held))
 
     @property
     def fingerprint(self) -> str:
         """SHA-256 over both splits' fingerprints."""
         return sha256((self.train.fingerprint + self.test.fingerprint).encode()).hexdigest()
+
+
+def _check_size(name: str, pictures: str, width: int, height: int) -> None:
+    if min(width, height) < LEAST_PIXELS:
+        fail(name, f"{pictures} have {width}x{height} pixels", f"give at least {LEAST_PIXELS}x{LEAST_PIXELS}")
 
 
 def _common_size(frames: list[Frame]) -> tuple[int, int]:

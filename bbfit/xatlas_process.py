@@ -68,8 +68,8 @@ def unfolded(
     Returns
     -------
     tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
-        The given vertex of each new vertex, [Q]; triangles of new vertices in the given order, [F, 3]; texture coordinates in [0, 1],
-        [Q, 2]. Vertices without triangles are left out.
+        The given vertex of each new vertex, [Q]; triangles of new vertices in the given order, [F, 3]; texture coordinates in [0, 1], [Q,
+        2]. Vertices without triangles are left out.
 
     Raises
     ------

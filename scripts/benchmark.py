@@ -123,7 +123,7 @@ def enlarged(views: ViewSet, size: int) -> ViewSet:
         picture = views.image(index).permute(2, 0, 1)[None].float()
         picture = interpolate(picture, (size, size), mode="bilinear")[0].permute(1, 2, 0)
         pictures[path] = picture.round().to(torch.uint8).contiguous()
-    return replace(views, cameras=views.cameras.resized(size, size), _cache=pictures)  # type: ignore[arg-type]
+    return replace(views, cameras=views.cameras.resized(size, size), read=pictures.__getitem__)
 
 
 def seconds_of(work: Callable[[], object], device: torch.device) -> float:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import pytest
 
 from bbfit.checks import (
+    Count,
     InputError,
     InputTypeError,
     MissingFileError,
+    Range,
     check_choice,
     check_count,
+    check_fields,
     check_file,
     check_folder,
     check_range,
@@ -99,3 +105,60 @@ def test_files_and_folders(tmp_path: Path) -> None:
             check_folder("views", path)
     with pytest.raises(FileNotFoundError):
         check_file("tree", missing)
+
+
+@dataclass(frozen=True)
+class Options:
+    """A field of every kind that is checked, and one that is not."""
+
+    count: Count = 1
+    limit: Count | None = None
+    corners: Annotated[int, Range(4, 8)] = 4
+    cutoff: Annotated[float, Range(0, 1, open_low=True, open_high=True)] = 0.5
+    angles: tuple[Annotated[float, Range(-90, 90)], ...] = (0.0,)
+    loss: Literal["l1", "l2"] = "l1"
+    mode: Literal["mask", "blend"] | None = None
+    switch: bool | None = None
+    folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+class Decided(Options):
+    """The same, with a choice that has to be made."""
+
+    mode: Literal["mask", "blend"]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"count": 0}, "count: expected at least 1, got 0"),
+        ({"count": True}, "count: expected a whole number, got True"),
+        ({"count": None}, "count: expected a whole number, got None"),
+        ({"limit": 0}, "limit: expected at least 1, got 0"),
+        ({"corners": 3}, "corners: expected at least 4, got 3"),
+        ({"corners": 9}, r"corners: expected a value in \[4, 8\], got 9"),
+        ({"corners": 5.0}, "corners: expected a whole number, got 5.0"),
+        ({"cutoff": 0}, r"cutoff: expected a value in \(0, 1\), got 0"),
+        ({"cutoff": 1.0}, r"cutoff: expected a value in \(0, 1\), got 1.0"),
+        ({"cutoff": math.nan}, "cutoff: .*got nan"),
+        ({"angles": (0.0, 91.0)}, r"angles: expected a value in \[-90, 90\], got 91.0"),
+        ({"angles": 3.0}, "angles: expected a tuple, got 3.0"),
+        ({"loss": "l3"}, "loss: expected one of l1, l2, got 'l3'"),
+        ({"loss": None}, "loss: expected one of l1, l2, got None"),
+        ({"mode": "hash"}, "mode: expected one of mask, blend, got 'hash'"),
+        ({"switch": 2}, "switch: expected one of False, True, got 2"),
+    ],
+)
+def test_fields_hold_what_their_annotations_allow(values: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=f"^{message}$"):
+        Options(**values)  # type: ignore[arg-type]
+
+
+def test_allowed_fields_pass() -> None:
+    Options(limit=3, corners=8, cutoff=0.99, angles=[-90, 90], mode="blend", switch=False, folder="x")  # type: ignore[arg-type]
+    assert Decided(mode="mask").limit is None
+    with pytest.raises(InputError, match=r"^mode: expected one of mask, blend, got None$"):
+        Decided()

@@ -193,3 +193,8 @@ def test_an_obj_of_a_z_up_tree_is_z_up(views_folder: Path, tmp_path: Path) -> No
     run(views, tmp_path / "out", CONFIG)
     assert "Z up" in (tmp_path / "out" / "model.obj").read_text().splitlines()[0]
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["vertices"] == {"model": 8, "original": 5000, "ratio": 8 / 5000}
+
+
+def test_one_seed_is_that_of_all_stages() -> None:
+    seeded = CONFIG.seeded(7)
+    assert (seeded.grow.seed, seeded.views.seed, seeded.fit.seed) == (7, 7, 7) and seeded.seeded(0) == CONFIG

@@ -38,7 +38,7 @@ VIEWS = ("tree", "acer", "quaking_aspen", "weeping_willow")
 SMALL_TREE = {"detail": 0.1, "leaves": 0.02}
 SMALL_VIEWS = {"size": 32, "count": 8, "samples": 1}
 SMALL_FIT = {"steps": 4, "restarts": 1, "candidates": 1, "refinement_rounds": 0}
-BUDGETS = {"--vertices", "--texels", "--bytes", "--target-psnr", "--auto", "--budget.vertices"}
+BUDGETS = {"--vertices", "--texels", "--bytes", "--target-psnr", "--auto"}
 """Options that decide how many billboards there are."""
 # Blocks that are no commands: output and formulas, and what belongs into a page of an engine.
 NOT_RUN = {"text": PAGES, "js": [DOCS / "engines.md"]}
@@ -66,9 +66,9 @@ class Place:
     """For what no command should see."""
 
 
-def options(values: dict[str, Any], stage: str = "") -> list[str]:
-    """Options of the command line, of a stage where that is named."""
-    return [word for name, value in values.items() for word in (f"--{stage}{name}", str(value))]
+def options(values: dict[str, Any]) -> list[str]:
+    """Options of the command line."""
+    return [word for name, value in values.items() for word in (f"--{name}", str(value))]
 
 
 @pytest.fixture(scope="module")
@@ -99,34 +99,24 @@ def small(words: list[str]) -> list[str]:
     """The options that make a ``bbfit`` command small."""
     command, given = words[0], set(words)
     with_tree = len(words) > 1 and not words[1].startswith("-")
-    stages = [*options(SMALL_VIEWS, "views."), *options(SMALL_FIT, "fit.")]
+    stages = options(SMALL_VIEWS | SMALL_FIT)
     if command == "grow":
         return [] if "--list" in given else options(SMALL_TREE)
     if command == "views":
         return options(SMALL_VIEWS)
     page = ["--port", "0"] if "--watch" in given else []
-    few = (
-        {"vertices": 8}
-        if command == "fit" and given & BUDGETS
-        else {}
-        if given & (BUDGETS | {"--billboards", "--fit.billboards"})
-        else {"billboards": 2}
-    )
+    few = {"vertices": 8} if command == "fit" and given & BUDGETS else {} if given & (BUDGETS | {"--billboards"}) else {"billboards": 2}
     if command == "fit":
         return [*options(SMALL_FIT | few), *page]
     if command == "run":
-        return [*stages, *options(few, "fit."), *([] if with_tree else options(SMALL_TREE)), *page]
+        return [*stages, *options(few), *([] if with_tree else options(SMALL_TREE)), *page]
     if command == "lod":
         return [*stages, "--planes", "2", "1"]
     if command == "sweep":
-        one = (
-            ["--fit.billboards", "2"]
-            if "--grid" in given
-            else ["--species", "acer", "--billboards", "2", "--loss", "l2", "--variants", "base"]
-        )
+        one = ["--billboards", "2"] + ([] if "--grid" in given else ["--species", "acer", "--loss", "l2", "--variants", "base"])
         grown = [] if "--trees" in given else options(SMALL_TREE)
         machine = ["--ray", "local"] if "--ray" in given else ["--workers", "1"]
-        return [*stages, *one, *grown, *machine, "--steps", "4"]
+        return [*stages, *one, *grown, *machine]
     if command == "compare":  # tests/test_comparison.py has the others
         some = [] if "--systems" in given else ["--systems", "bbfit", "crossed", "draco"]
         return [*stages, *some, "--billboards", "2", "--many", "3"]
@@ -270,8 +260,8 @@ def work_small(patch: pytest.MonkeyPatch, size: int = SMALL_VIEWS["size"]) -> No
         "fit": lambda data, config=None, **given: real["fit"](data, fit(config), **given),
         "choose": lambda data, config, budget: real["choose"](data, fit(config), replace(budget, vertices=8)),
         "run": lambda source, out, config=None: real["run"](source, out, stages(config)),
-        "run_sweep": lambda out, config, **given: real["run_sweep"](
-            out, replace(config, billboards=(2,), loss=("l2",), variants=("base",), steps=4, workers=1), grown, **given
+        "run_sweep": lambda out, config, stages, **given: real["run_sweep"](
+            out, replace(config, billboards=(2,), loss=("l2",), variants=("base",), workers=1), grown, **given
         ),
         "compare": lambda tree, out: real["compare"](tree, out, few, stages(None)),
         "build_lod": lambda tree, out, config: real["build_lod"](tree, out, replace(config, planes=(2, 1)), stages(None)),
@@ -333,9 +323,9 @@ def offered() -> set[str]:
 @each(PAGES)
 def test_options_and_commands_that_are_mentioned_exist(page: Path, offered: set[str]) -> None:
     text = prose(page)
-    other = {"--help", "--fast", "--out", "--quick", "--fit...", "--strict"}
+    other = {"--help", "--fast", "--out", "--quick", "--strict"}
     mentioned = {option.rstrip(".") for option in re.findall(r"(?<![\w-])--[a-z][\w.-]*", text)}
-    assert mentioned - other - offered <= {"--fit", "--views", "--export"}
+    assert mentioned - other <= offered
     assert {name for name in re.findall(r"`bbfit ([a-z]+)", text)} <= set(_COMMANDS)
 
 
@@ -349,7 +339,7 @@ def test_the_last_of_an_option_given_twice_counts(stand_ins: Path, tmp_path: Pat
 
 def test_the_table_of_a_run_s_files_is_complete(place: Place) -> None:
     """Of a run that grows its tree within a budget; README.md and docs/commands.md have the same files."""
-    assert main(["run", "--out", "all", *small(["run", "--budget.vertices"]), "--budget.vertices", "4"]) == 0
+    assert main(["run", "--out", "all", *small(["run", "--vertices"]), "--vertices", "4"]) == 0
     made = {f"{path.name}/" if path.is_dir() else path.name for path in Path("all").iterdir()}
     for page in (ROOT / "README.md", DOCS / "commands.md"):
         table = page.read_text(encoding="utf-8").split("| file | what |")[1].split("\n\n")[0]

@@ -14,6 +14,9 @@ import pytest
 import torch
 
 from bbfit.checks import InputError, MissingFileError
+from bbfit.evaluation.scoring import evaluate
+from bbfit.fitting.config import FitConfig
+from bbfit.fitting.loop import fit
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, write_png
@@ -233,3 +236,67 @@ def test_shared_views(shared: Path, tree: str) -> None:
     picture = premultiply(views.train.image(0).float() / 255)
     assert picture[row, column, 3] == 1
     assert picture[row + 20 :, :, 3].max() == 0
+
+
+@pytest.fixture
+def arrays(views_folder: Path, ring: Camera) -> tuple[np.ndarray, Camera]:
+    """The pictures of all views in order, uint8 [V, H, W, 4], and their cameras."""
+    return np.stack(
+        [cv2.cvtColor(cv2.imread(str(path), -1), cv2.COLOR_BGRA2RGBA) for path in sorted((views_folder / "images").iterdir())]
+    ), ring
+
+
+@pytest.mark.parametrize("form", ["uint8", "float", "tensor"])
+def test_views_from_arrays_are_those_of_the_folder(form: str, arrays: tuple[np.ndarray, Camera], views_folder: Path) -> None:
+    images, cameras = arrays
+    given = {"uint8": images, "float": images / np.float32(255), "tensor": torch.from_numpy(images) / 255}[form]
+    views = ViewDataset.from_arrays(given, cameras)
+    assert views.folder is None and views.test.names == ViewDataset.load(views_folder).test.names
+    for split in (views.train, views.test):
+        assert torch.equal(split.images(range(len(split))), torch.from_numpy(images[[int(name) for name in split.names]]))
+        assert split.cameras.world_to_camera.dtype == torch.float64
+    again = ViewDataset.from_arrays(images, cameras)
+    assert views.fingerprint == again.fingerprint != ViewDataset.from_arrays(images, cameras, seed=5).fingerprint
+
+
+def test_held_out_views_of_arrays_are_chosen_by_index(arrays: tuple[np.ndarray, Camera]) -> None:
+    views = ViewDataset.from_arrays(*arrays, test=[7, 2])
+    assert views.test.names == ["0002", "0007"] and len(views.train) == 14
+
+
+def test_a_fit_to_arrays_is_that_to_files(arrays: tuple[np.ndarray, Camera], views_folder: Path) -> None:
+    """The cameras of files have been through their text."""
+    loaded, config = ViewDataset.load(views_folder), FitConfig(billboards=2, placement="even", steps=4)
+    cameras = Camera(arrays[1].world_to_camera.clone(), arrays[1].intrinsics.clone(), arrays[1].width, arrays[1].height)
+    for split in (loaded.train, loaded.test):
+        numbers = [int(name) for name in split.names]
+        cameras.world_to_camera[numbers], cameras.intrinsics[numbers] = split.cameras.world_to_camera, split.cameras.intrinsics
+    views = ViewDataset.from_arrays(arrays[0], cameras)
+    assert views.fingerprint == loaded.fingerprint
+    ours, theirs = (fit(each, config).cloud for each in (views, loaded))
+    assert torch.equal(ours.texels, theirs.texels)
+    assert evaluate(ours, views.test).mean == evaluate(theirs, loaded.test).mean
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda images, cameras: (images[:4], cameras), r"images: expected shape \[16, 40, 48, 4\], got \[4, 40, 48, 4\]"),
+        (lambda images, cameras: (images[..., :3], cameras), "images: expected shape"),
+        (lambda images, cameras: (images.astype(np.int16), cameras), "images: expected uint8 or floats, got torch.int16"),
+        (lambda images, cameras: (images.astype(np.float64), cameras), r"images: floats are not all in \[0, 1\]"),
+        (lambda images, cameras: (images * np.float32("nan"), cameras), "images: floats are not all in"),
+        (lambda images, cameras: (images * (np.arange(16) != 3)[:, None, None, None].astype(np.uint8), cameras), "images: view 3 is fully"),
+        (lambda images, cameras: (images[:1], cameras[:1]), "images: expected at least two views"),
+        (lambda images, cameras: (images[:, :9], cameras.resized(48, 9)), "images: they have 48x9 pixels; give at least 11x11"),
+    ],
+)
+def test_arrays_that_are_no_views_are_refused(change: Callable, message: str, arrays: tuple[np.ndarray, Camera]) -> None:
+    with pytest.raises(InputError, match=message):
+        ViewDataset.from_arrays(*change(*arrays))
+
+
+@pytest.mark.parametrize("test", [[], [16], [-1], range(16)])
+def test_bad_indices_of_held_out_views_are_refused(test: Sequence[int], arrays: tuple[np.ndarray, Camera]) -> None:
+    with pytest.raises(InputError, match="test: expected some of the indices 0 to 15"):
+        ViewDataset.from_arrays(*arrays, test=test)

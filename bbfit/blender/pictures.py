@@ -102,7 +102,9 @@ def render_pictures(
         request.save(out / PICTURES_FILE)
         visible = clips or [clip_distances(points, position) for position in cameras.position]
         report, finished = on_progress, count - len(missing)
-        pool.render(frames(cameras, paths, missing, visible, config.seed), config.workers, finished, lambda done: report(done, count))
+        pool.render(
+            frames(cameras, paths, missing, visible, config.seed), config.render_workers, finished, lambda done: report(done, count)
+        )
     return paths
 
 
@@ -151,8 +153,8 @@ def worker_settings(tree: TreeFile, config: ViewsConfig, size: int, count: int) 
         "sun_strength": config.sun_strength,
         "ambient_strength": config.ambient_strength,
         "hdri": None if config.hdri is None else str(Path(config.hdri).resolve()),
-        "device": config.device,
-        "threads": max(1, (os.cpu_count() or 1) // max(1, min(config.workers, count))),
+        "device": config.render_device,
+        "threads": max(1, (os.cpu_count() or 1) // max(1, min(config.render_workers, count))),
     }
 
 

@@ -100,7 +100,7 @@ def render_views(
         finished = config.count - len(missing)
         on_done(finished)
         clips = [clip_distances(points, camera.position[0])] * config.count
-        pool.render(frames(camera, paths, missing, clips, config.seed), config.workers, finished, on_done)
+        pool.render(frames(camera, paths, missing, clips, config.seed), config.render_workers, finished, on_done)
     train, test = split_views(config.count, config.seed)
     write_transforms(out, camera, [f"images/{path.name}" for path in paths], train, test)
     save(complete=True)

@@ -16,7 +16,7 @@ from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
-from bbfit.fitting.config import FitConfig, Placement, Sides
+from bbfit.fitting.config import FitConfig, Placement, ResolvedFit, Sides
 from bbfit.fitting.levels import resize_textures
 from bbfit.fitting.loop import fit
 from bbfit.geometry.cloud import BillboardCloud
@@ -74,8 +74,8 @@ class Trial:
 class Choice:
     """The result of :func:`choose`: the trials and the configuration to fit."""
 
-    config: FitConfig
-    """The configuration to fit with, resolved."""
+    config: ResolvedFit
+    """The configuration to fit with."""
     trials: tuple[Trial, ...]
     """All trials, in order."""
     chosen: int

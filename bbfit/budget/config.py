@@ -1,45 +1,46 @@
-"""What a result may cost, and how good it has to be."""
+"""The options of a budget: what a result may cost, and how good it has to be."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from typing import Annotated
 
-from bbfit.checks import check_count, check_range, fail
+from bbfit.checks import Range, check_count, check_fields, fail
 
 _FACTORS, _MOST = {"k": 1_000, "m": 1_000_000}, 10**15
 
 
 @dataclass(frozen=True)
 class BudgetConfig:
-    """Limits, all of which hold at once. With any of them the number of billboards, their sides, their placement and their texel density
-    are chosen on validation views, which are taken out of the training views."""
+    """Limits of a result; all of them hold at once.
 
-    vertices: int | None = None
-    """Vertices of the model at most: 4 for a billboard, 8 for a two-sided one."""
+    With any limit, bbfit chooses the number of billboards, their sides, placement and texel density. It compares the choices on validation
+    views, which it takes from the training views.
+    """
+
+    vertices: Annotated[int, Range(4)] | None = None
+    """Most vertices of the model: a billboard has 4, a two-sided one 8."""
     texels: int | str | None = None
-    """Texels at most; 500k and 2M are understood."""
+    """Most texels, such as 500k or 2M."""
     bytes: int | str | None = None
-    """Bytes of model.glb at most; 500k and 2M are understood."""
-    target_psnr: float | None = None
-    """PSNR over white in dB to reach on validation views, with as few billboards as will do."""
+    """Most bytes of model.glb, such as 500k or 2M."""
+    target_psnr: Annotated[float, Range(0, 100, open_low=True)] | None = None
+    """PSNR over white, in dB, to reach on validation views with as few billboards as possible."""
     auto: bool = False
-    """Take as many billboards as pay: until twice as many gain less than 0.75 dB."""
+    """Add billboards until twice as many gain less than 0.75 dB."""
 
     def __post_init__(self) -> None:
-        if self.vertices is not None:
-            check_count("vertices", self.vertices, 4)
+        check_fields(self)
         for name in ("texels", "bytes"):
             if getattr(self, name) is not None:
                 check_count(name, amount(name, getattr(self, name)))
-        if self.target_psnr is not None:
-            check_range("target_psnr", self.target_psnr, 0, 100, open_low=True)
-            if self.auto:
-                fail("auto", "it and a target PSNR both say when to stop", "leave one of them out")
+        if self.auto and self.target_psnr is not None:
+            fail("auto", "auto and a target PSNR both decide when to stop", "leave one of them out")
 
     @property
     def given(self) -> bool:
-        """Whether there is anything to choose for."""
+        """Whether there is any limit."""
         return self != BudgetConfig()
 
     @property

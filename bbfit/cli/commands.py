@@ -1,4 +1,4 @@
-"""The commands that turn one tree into billboards, and the stages of it: parse, call, print."""
+"""The commands that turn one tree into billboards, and one command for each stage of it: parse, call, print."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import tyro
 from bbfit.blender.config import ViewsConfig
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import fail
-from bbfit.cli.console import out_console, progress, show, show_missed
+from bbfit.cli.console import out_console, progress, show, show_missing_encoder
 from bbfit.cli.viewing import WatchConfig, watched
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.fitting.config import FitConfig
@@ -24,38 +24,40 @@ def run_command(
     /,
     out: Path = Path("runs/tree"),
     species: str | None = None,
-    grow: Annotated[GrowConfig, tyro.conf.arg(name="")] = GrowConfig(detail=0.5),  # noqa: B008
+    seed: int = 0,
+    grow: GrowConfig = GrowConfig(detail=0.5),  # noqa: B008
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
     fit: FitConfig = FitConfig(),  # noqa: B008
     budget: BudgetConfig = BudgetConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
-    page: Annotated[WatchConfig, tyro.conf.arg(name="")] = WatchConfig(),  # noqa: B008
+    page: WatchConfig = WatchConfig(),  # noqa: B008
 ) -> None:
     """Do everything: take a tree or grow one, render views of it, fit billboards to them, write the models and a report with the scores.
 
-    Stopped and started again, it goes on where it was.
+    Interrupted and started again, it resumes where it stopped.
 
     For example: bbfit run tree.glb --out runs/tree
 
     Args:
-        tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend) or a folder of views; left out, one is grown.
+        tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend) or a folder of views. Default: grow one.
         out: Folder for the results.
-        species: What to grow if there is no tree, a quaking aspen if left out; `bbfit grow --list` names the species.
+        species: Species to grow if there is no tree; `bbfit grow --list` lists them. Default: a quaking aspen.
+        seed: Seed of all stages; --grow.seed, --views.seed and --fit.seed override it for one of them.
         grow: How a tree is grown.
         views: How the tree is rendered.
-        fit: How the billboards are fitted; what is left out, the preset decides.
-        budget: What the result may cost. Short fits choose how many billboards there are.
+        fit: How the billboards are fitted. The preset decides options that are not given.
+        budget: What the result may cost. With any limit, short fits choose the number of billboards.
         export: How the models are written.
-        page: Looking on in a browser.
+        page: Watching the fit in a browser.
     """
     from bbfit.pipeline import RunConfig, run
 
     config = RunConfig(species=species, grow=grow, views=views, fit=fit, budget=budget, export=export)
     with watched(page, out, tree, None, fit) as display:
-        with display.progress() as tell:
-            result = run(tree, out, config, on_progress=tell, on_step=display.on_step)
+        with display.progress() as on_progress:
+            result = run(tree, out, config, on_progress=on_progress, on_step=display.on_step)
         show(result, thesis=fit.preset == "thesis")
-        show_missed(export)
+        show_missing_encoder(export)
         display.finish()
 
 
@@ -64,35 +66,35 @@ def grow_command(
     /,
     out: Path | None = None,
     list: tyro.conf.FlagCreatePairsOff[bool] = False,
-    config: Annotated[GrowConfig, tyro.conf.arg(name="")] = GrowConfig(),  # noqa: B008
+    grow: GrowConfig = GrowConfig(),  # noqa: B008
 ) -> None:
     """Grow a tree of a species, after Weber and Penn 1995. The same seed gives the same file.
 
     For example: bbfit grow acer --seed 7 --out acer.glb
 
     Args:
-        species: What to grow; may be left out where --species-file holds one species only.
+        species: Species to grow; optional if --species-file has only one species.
         out: The tree's file, ending in .glb, or in .obj (its .mtl comes beside it).
-        list: Name the species and where their figures are, and grow nothing.
-        config: How it is grown.
+        list: List the species and the file of their parameters, and grow nothing.
+        grow: How it is grown.
     """
     from bbfit.model_files import check_model_path
-    from bbfit.trees.growth import grow
+    from bbfit.trees import growth
     from bbfit.trees.species import figures_file, known_species, load_species
 
     if list:
         from bbfit.reporting.tables import species_table
 
-        out_console.print(species_table([load_species(name, config.species_file) for name in known_species(config.species_file)]))
-        out_console.print(f"figures in {config.species_file or figures_file()}", soft_wrap=True, highlight=False)
+        out_console.print(species_table([load_species(name, grow.species_file) for name in known_species(grow.species_file)]))
+        out_console.print(f"figures in {grow.species_file or figures_file()}", soft_wrap=True, highlight=False)
         return
     from bbfit.trees.tree_writer import write_tree
 
-    figures = load_species(species, config.species_file)
+    figures = load_species(species, grow.species_file)
     if out is None:
-        fail("out", "no file is named to write the tree to", f"say for example --out {figures.name}.glb")
+        fail("out", "a file to write the tree to is missing", f"for example --out {figures.name}.glb")
     check_model_path("tree", out)
-    scene = grow(figures, seed=config.seed, detail=config.detail, leaves=config.leaves, max_vertices=config.max_vertices)
+    scene = growth.grow(figures, seed=grow.seed, detail=grow.detail, leaves=grow.leaves, max_vertices=grow.max_vertices)
     paths = write_tree(scene, out)
     out_console.print(f"{figures.name}: {sum(len(mesh.vertices) for mesh in scene.geometry.values()):,} vertices")
     for path in paths:
@@ -103,24 +105,24 @@ def views_command(
     tree: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TREE")],
     /,
     out: Path,
-    config: Annotated[ViewsConfig, tyro.conf.arg(name="")] = ViewsConfig(),  # noqa: B008
+    views: ViewsConfig = ViewsConfig(),  # noqa: B008
 ) -> None:
     """Render views of a tree from all around with Blender, into a folder in the NeRF-synthetic layout.
 
-    Stopped and started again, it renders what is missing.
+    Interrupted and started again, it renders the missing views.
 
     For example: bbfit views tree.glb --out views/tree
 
     Args:
         tree: The tree's file (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
-        out: Folder for the views; one that holds a part of them is completed.
-        config: How the tree is rendered.
+        out: Folder for the views; one with a part of them is completed.
+        views: How the tree is rendered.
     """
     from bbfit.blender.views_folder import render_views
 
-    with progress() as tell:
-        render_views(tree, out, config, on_progress=lambda done, total: tell("views", done, total))
-    out_console.print(f"{config.count} views in {out}")
+    with progress() as on_progress:
+        render_views(tree, out, views, on_progress=lambda done, total: on_progress("views", done, total))
+    out_console.print(f"{views.count} views in {out}")
 
 
 def fit_command(
@@ -128,25 +130,25 @@ def fit_command(
     /,
     out: Path,
     tree: Path | None = None,
-    config: Annotated[FitConfig, tyro.conf.arg(name="")] = FitConfig(),  # noqa: B008
-    budget: Annotated[BudgetConfig, tyro.conf.arg(name="")] = BudgetConfig(),  # noqa: B008
+    fit: FitConfig = FitConfig(),  # noqa: B008
+    budget: BudgetConfig = BudgetConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
-    page: Annotated[WatchConfig, tyro.conf.arg(name="")] = WatchConfig(),  # noqa: B008
+    page: WatchConfig = WatchConfig(),  # noqa: B008
 ) -> None:
     """Fit billboards to a folder of views, write the models and a report with the scores. Needs no Blender.
 
-    Stopped and started again, it goes on where it was.
+    Interrupted and started again, it resumes where it stopped.
 
     For example: bbfit fit views/tree --tree tree.glb --out runs/tree
 
     Args:
         views: Folder of views, bbfit's own or any in the NeRF-synthetic layout.
         out: Folder for the results.
-        tree: The mesh that the views show (.glb .gltf .obj .ply .stl), to place billboards by; without it the views tell where the tree is.
-        config: How the billboards are fitted; what is left out, the preset decides.
-        budget: What the result may cost. Short fits choose how many billboards there are.
+        tree: The mesh that the views show (.glb .gltf .obj .ply .stl), to place billboards by. Default: the visual hull of the views.
+        fit: How the billboards are fitted. The preset decides options that are not given.
+        budget: What the result may cost. With any limit, short fits choose the number of billboards.
         export: How the models are written.
-        page: Looking on in a browser.
+        page: Watching the fit in a browser.
     """
     from bbfit.checks import check_folder
     from bbfit.pipeline import RunConfig, run
@@ -154,12 +156,12 @@ def fit_command(
     if views.is_file():
         fail("views", f"{views} is a file", "give a folder of views; bbfit run takes a tree")
     check_folder("views", views)
-    stages = RunConfig(tree=tree, fit=config, budget=budget, export=export)
-    with watched(page, out, views, tree, config) as display:
-        with display.progress() as tell:
-            result = run(views, out, stages, on_progress=tell, on_step=display.on_step)
-        show(result, thesis=config.preset == "thesis")
-        show_missed(export)
+    stages = RunConfig(tree=tree, fit=fit, budget=budget, export=export)
+    with watched(page, out, views, tree, fit) as display:
+        with display.progress() as on_progress:
+            result = run(views, out, stages, on_progress=on_progress, on_step=display.on_step)
+        show(result, thesis=fit.preset == "thesis")
+        show_missing_encoder(export)
         display.finish()
 
 
@@ -195,9 +197,9 @@ def evaluate_command(
     out, earlier = out or cloud.with_name("metrics.json"), cloud.with_name("metrics.json")
     seconds = Report.load(earlier).seconds if earlier.is_file() else {}
     output_folder("out", out.parent)
-    with progress() as tell:
-        original, on_progress = original_tree(dataset, None if tree is None else TreeFile.open(tree)), partial(tell, "evaluate")
-        report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=on_progress)
+    with progress() as on_progress:
+        original = original_tree(dataset, None if tree is None else TreeFile.open(tree))
+        report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=partial(on_progress, "evaluate"))
     report = replace(report, seconds={**seconds, **report.seconds})
     report.save(out)
     out_console.print(report_table(report, thesis=False))
@@ -208,7 +210,7 @@ def export_command(
     cloud: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLOUD")],
     /,
     out: Path,
-    config: Annotated[ExportConfig, tyro.conf.arg(name="")] = ExportConfig(),  # noqa: B008
+    export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
     """Write fitted billboards as a model for an engine or another program.
 
@@ -217,14 +219,14 @@ def export_command(
     Args:
         cloud: The cloud.safetensors of a run's folder.
         out: The model's file, ending in .glb, or in .obj (its .mtl and .png come beside it).
-        config: How the model is written.
+        export: How the model is written.
     """
-    from bbfit.exporting.model import export
+    from bbfit.exporting import model
     from bbfit.geometry.cloud import BillboardCloud
 
-    for path in export(BillboardCloud.load(cloud), out, config):
+    for path in model.export(BillboardCloud.load(cloud), out, export):
         out_console.print(f"{path}  {path.stat().st_size:,} bytes")
-    show_missed(config)
+    show_missing_encoder(export)
 
 
 def lod_command(
@@ -232,34 +234,36 @@ def lod_command(
     /,
     out: Path,
     work: Path | None = None,
-    config: Annotated[LodConfig, tyro.conf.arg(name="")] = LodConfig(),  # noqa: B008
+    seed: int = 0,
+    lod: LodConfig = LodConfig(),  # noqa: B008
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
-    """Make levels of detail: the tree and ever fewer billboards in one GLB, with the distances from which each looks the same.
+    """Make levels of detail: the tree and fewer and fewer billboards in one GLB, with the distance from which each looks the same.
 
-    Stopped and started again, it goes on where it was.
+    Interrupted and started again, it resumes where it stopped.
 
     For example: bbfit lod tree.glb --out lod.glb
 
     Args:
         tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
         out: The file, ending in .glb.
-        work: Folder for views, a run for each level, lod.json and lod.png; left out, it is called as the file is without its ending.
-        config: Which levels there are.
+        work: Folder for views, a run for each level, lod.json and lod.png. Default: the file without its ending.
+        seed: Seed of all stages; --views.seed and --fit.seed override it for one of them.
+        lod: The levels.
         views: How the tree is rendered.
-        fit: How the billboards are fitted; what is left out, the preset decides.
+        fit: How the billboards are fitted. The preset decides options that are not given.
         export: How they are written.
     """
     from bbfit.lod import build_lod
     from bbfit.pipeline import RunConfig
     from bbfit.reporting.tables import lod_table
 
-    with progress() as tell:
-        result = build_lod(tree, out, config, RunConfig(views=views, fit=fit, export=export), work=work, on_progress=tell)
+    with progress() as on_progress:
+        result = build_lod(tree, out, lod, RunConfig(views=views, fit=fit, export=export), work=work, on_progress=on_progress)
     out_console.print(lod_table(result.levels))
-    show_missed(export)
+    show_missing_encoder(export)
     out_console.print(
         f"levels of detail in {result.path}, {result.path.stat().st_size:,} bytes; measures in {result.folder}", soft_wrap=True
     )

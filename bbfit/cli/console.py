@@ -1,4 +1,4 @@
-"""What the commands share of the terminal: results on standard output, progress and complaints on standard error."""
+"""The terminal: results on standard output, progress and errors on standard error."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ err_console = Console(stderr=True)
 
 
 def show(result: RunResult, *, thesis: bool) -> None:
-    """Print a run's score, on the thesis's scale too if asked for, and where its results are."""
+    """Print the scores of a run, with those on the thesis's scale if ``thesis``, and the folder of its results."""
     from bbfit.reporting.tables import report_table
 
     out_console.print(report_table(result.report, thesis=thesis))
     if result.skipped:
-        out_console.print(f"unchanged, not done again: {', '.join(result.skipped)}", style="dim")
+        out_console.print(f"unchanged and skipped: {', '.join(result.skipped)}", style="dim")
     if result.missed is not None:
         out_console.print(
             f"no short fit within the budget reached {result.missed:g} dB on validation views; this is the best one, fitted for longer",
@@ -36,14 +36,14 @@ def show(result: RunResult, *, thesis: bool) -> None:
     )
 
 
-def show_missed(config: ExportConfig) -> None:
-    """Say if a texture format was left out for want of a package."""
-    if config.missed is not None:
-        out_console.print(f"textures are PNG alone, without mip levels; for KTX2 {config.missed}", style="yellow", soft_wrap=True)
+def show_missing_encoder(config: ExportConfig) -> None:
+    """Print what to install, if a texture format was omitted because its encoder is missing."""
+    if config.missing_encoder is not None:
+        out_console.print(f"textures are PNG alone, without mip levels; for KTX2 {config.missing_encoder}", style="yellow", soft_wrap=True)
 
 
 def progress() -> contextlib.AbstractContextManager[OnProgress]:
-    """One bar a stage on standard error."""
+    """A progress bar for each stage, on standard error."""
     from bbfit.reporting.progress import progress_bars
 
     return progress_bars(err_console)

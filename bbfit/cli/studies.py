@@ -21,28 +21,30 @@ def sweep_command(
     species: tuple[str, ...] = (),
     trees: tuple[Path, ...] = (),
     folders: Annotated[tuple[Path, ...], tyro.conf.arg(name="views")] = (),
-    config: Annotated[SweepConfig, tyro.conf.arg(name="")] = SweepConfig(),  # noqa: B008
-    grow: Annotated[GrowConfig, tyro.conf.arg(name="")] = GrowConfig(detail=0.5),  # noqa: B008
+    seed: int = 0,
+    sweep: SweepConfig = SweepConfig(),  # noqa: B008
+    grow: GrowConfig = GrowConfig(detail=0.5),  # noqa: B008
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
     """Fit many configurations to many trees, on this machine or on a Ray cluster, and compare them in tables.
 
-    Without options these are the 72 experiments of the thesis that the method comes from. Stopped and started again, it goes on where it
-    was; every run is made once.
+    Without options it runs the 72 experiments of the thesis that the method comes from. Interrupted and started again, it resumes where it
+    stopped; every run is done once.
 
     For example: bbfit sweep --out runs/sweep --species acer apple --grid default
 
     Args:
         out: Folder for trees, runs and the tables table.csv, table.md and table.png.
-        species: Species to grow; `bbfit grow --list` names them.
+        species: Species to grow; `bbfit grow --list` lists them.
         trees: Tree files to render.
         folders: Folders of views.
-        config: What is varied, and what it runs on.
+        seed: Seed of all stages; --grow.seed, --views.seed and --fit.seed override it for one of them.
+        sweep: What is varied, and where it runs.
         grow: How trees are grown.
         views: How trees are rendered.
-        fit: What all runs have in common besides what the grid says.
+        fit: Options of all fits; the grid overrides them.
         export: How the models are written.
     """
     from bbfit.pipeline import RunConfig
@@ -50,14 +52,14 @@ def sweep_command(
     from bbfit.sweep.scheduling import run_sweep
 
     stages = RunConfig(grow=grow, views=views, fit=fit, export=export)
-    with progress() as tell:
-        result = run_sweep(out, config, stages, species=species, trees=trees, views=folders, on_progress=tell)
+    with progress() as on_progress:
+        result = run_sweep(out, sweep, stages, species=species, trees=trees, views=folders, on_progress=on_progress)
     out_console.print(sweep_table(result.rows))
     failed = sum(row.reason is not None for row in result.rows)
     if result.kept:
-        out_console.print(f"{result.kept} results stood from an earlier start", style="dim")
+        out_console.print(f"{result.kept} results kept from an earlier start", style="dim")
     if failed:
-        out_console.print(f"{failed} runs failed; table.md says why, and --retry-failed tries them again", style="yellow")
+        out_console.print(f"{failed} runs failed; table.md gives the reasons, and --retry-failed runs them again", style="yellow")
     out_console.print(f"tables in {result.folder}: table.csv, table.md, table.png", soft_wrap=True)
 
 
@@ -65,31 +67,33 @@ def compare_command(
     tree: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TREE")],
     /,
     out: Path = Path("runs/compare"),
-    config: Annotated[CompareConfig, tyro.conf.arg(name="")] = CompareConfig(),  # noqa: B008
+    seed: int = 0,
+    compare: CompareConfig = CompareConfig(),  # noqa: B008
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
 ) -> None:
-    """Give a tree to bbfit and to other methods, and score all on the same held-out views, with bytes, vertices and seconds.
+    """Compare bbfit with other methods on one tree: scores on the same held-out views, bytes, vertices and seconds.
 
-    Stopped and started again, it goes on where it was.
+    Interrupted and started again, it resumes where it stopped.
 
     For example: bbfit compare tree.glb --out runs/compare
 
     Args:
         tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
         out: Folder for the results.
-        config: Which systems there are, and how large.
+        seed: Seed of all stages; --views.seed and --fit.seed override it for one of them.
+        compare: Which systems are compared, and how large each is.
         views: How the tree is rendered.
         fit: How bbfit's billboards are fitted.
         export: How they are written.
     """
-    from bbfit.comparison import compare
+    from bbfit import comparison
     from bbfit.pipeline import RunConfig
     from bbfit.reporting.tables import compare_table
 
-    with progress() as tell:
-        result = compare(tree, out, config, RunConfig(views=views, fit=fit, export=export), on_progress=tell)
+    with progress() as on_progress:
+        result = comparison.compare(tree, out, compare, RunConfig(views=views, fit=fit, export=export), on_progress=on_progress)
     out_console.print(compare_table(result.rows))
     out_console.print(
         f"tables in {result.folder}: compare.md, compare.csv, compare.json; pictures: systems.png, quality.png", soft_wrap=True

@@ -116,7 +116,6 @@ def watched(config: WatchConfig, out: Path, source: Path | None, tree: Path | No
     from bbfit.viewing.watching import Watch, WatchedRun
 
     alpha = fit.resolve().alpha
-    assert alpha is not None
     with Viewer(host=config.host, port=config.port) as viewer:
         with contextlib.closing(Watch(viewer, WatchedRun(out, source, tree, alpha))) as watch:
             _announce(viewer.url, config.port, open=config.open)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.encoders import encode_ktx2, encode_webp
 from bbfit.exporting.splitting import centered
 from bbfit.geometry.cards import Card, Cards
@@ -31,7 +31,7 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
     import trimesh
     from PIL import Image
 
-    config = config.resolve()
+    resolved = config.resolve()
     placeholder = Image.new("RGBA", (1, 1))  # trimesh writes texture coordinates for textured materials only
     scene = trimesh.Scene(base_frame="billboard_cloud")
     for name, chosen in _meshes(cards).items():
@@ -57,8 +57,8 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
         origin = chosen[0].origin
         place = None if origin is None else trimesh.transformations.translation_matrix(origin)
         scene.add_geometry(mesh, node_name=name, geom_name=name, transform=place)
-    tree, views = split_glb(glb_of_scene(scene, lambda tree: _complete(tree, cards, config)))
-    return joined_glb(tree, _with_pictures(tree, views, cards, config))
+    tree, views = split_glb(glb_of_scene(scene, lambda tree: _complete(tree, cards, resolved)))
+    return joined_glb(tree, _with_pictures(tree, views, cards, resolved))
 
 
 def _vertices(card: Card) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -82,7 +82,7 @@ def _meshes(cards: Cards) -> dict[str, list[Card]]:
     return meshes
 
 
-def _complete(tree: dict[str, Any], cards: Cards, config: ExportConfig) -> None:
+def _complete(tree: dict[str, Any], cards: Cards, config: ResolvedExport) -> None:
     """Add to trimesh's glTF what trimesh cannot write, except for the pictures."""
     # trimesh lists the picture once per material.
     assert len({image["bufferView"] for image in tree["images"]}) == 1
@@ -101,7 +101,7 @@ def _complete(tree: dict[str, Any], cards: Cards, config: ExportConfig) -> None:
         tree["extensionsUsed"] = sorted(used)
 
 
-def _with_pictures(tree: dict[str, Any], views: list[bytes], cards: Cards, config: ExportConfig) -> list[bytes]:
+def _with_pictures(tree: dict[str, Any], views: list[bytes], cards: Cards, config: ResolvedExport) -> list[bytes]:
     """The contents of the buffer views, with the pictures added; the JSON gets the references to them."""
     pictures = {"image/png": encode_png(cards.atlas.image)}
     if config.textures in _EXTENSIONS:

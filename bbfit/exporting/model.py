@@ -9,7 +9,7 @@ from pathlib import Path
 from torch import Tensor
 
 from bbfit.exporting.cards import cloud_cards
-from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import overdraw, with_hulls
 from bbfit.exporting.mip_matching import reduced, with_mips
@@ -40,8 +40,8 @@ class ShippedModel:
 
     cloud: BillboardCloud
     """The billboards, with the alpha mode of the files."""
-    config: ExportConfig
-    """The export options, resolved."""
+    config: ResolvedExport
+    """The export options."""
     halvings: int = 0
     """How many times the sides of the textures are halved, for a model that is only seen from afar."""
 
@@ -54,7 +54,7 @@ class ShippedModel:
         if self.config.hull is not None:
             cards = with_hulls(cards, self.config.hull, cards.visible_alpha)
         cards = reduced(cards, self.halvings)
-        return with_mips(cards) if self.config.brings_mips else cards
+        return with_mips(cards) if self.config.has_mips else cards
 
     @cached_property
     def glb(self) -> bytes:
@@ -72,7 +72,7 @@ class ShippedModel:
         Without mip levels the polygons show what the cloud's renderer shows, but for the rounding of textures to 8 bits; the renderer is
         faster and draws them. Trimmed outlines cut off nothing visible.
         """
-        if self.config.brings_mips or self.halvings:
+        if self.config.has_mips or self.halvings:
             return draw_cards(self.cards, camera)
         return render(self.cloud, camera.to(self.cloud.texels.device))
 
@@ -107,9 +107,9 @@ def shipped_model(cloud: BillboardCloud, config: ExportConfig | None = None, hal
     halvings : int
         How many times the sides of the textures are halved, for a model that is only seen from afar.
     """
-    config = (config or ExportConfig()).resolve()
-    alpha = AlphaMode(config.alpha or cloud.alpha.kind, config.alpha_cutoff or cloud.alpha.cutoff)
-    return ShippedModel(replace(cloud, alpha=alpha), config, halvings)
+    resolved = (config or ExportConfig()).resolve()
+    alpha = AlphaMode(resolved.alpha or cloud.alpha.kind, resolved.alpha_cutoff or cloud.alpha.cutoff)
+    return ShippedModel(replace(cloud, alpha=alpha), resolved, halvings)
 
 
 def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None = None) -> list[Path]:

@@ -1,12 +1,12 @@
-"""What a fit is asked to do."""
+"""The options of a fit."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
-from bbfit.checks import check_choice, check_count, check_range, fail
-from bbfit.geometry.alpha import AlphaKind, check_cutoff
+from bbfit.checks import Count, Range, Seed, check_fields, fail
+from bbfit.geometry.alpha import AlphaKind, Cutoff
 from bbfit.operators.config import Backend, Loss
 from bbfit.provenance import EXECUTION
 
@@ -16,6 +16,14 @@ Placement = Literal["even", "clusters"]
 Orientation = Literal["any", "upright", "free"]
 Bounds = Literal["viewport", "thesis", "silhouette"]
 Schedule = Literal["cosine", "growth"]
+_Binarization = Annotated[float, Range(0, 10)]
+_Density = Annotated[float, Range(0, 16, open_low=True)]
+_Rate = Annotated[float, Range(0, 10, open_low=True)]
+_Rounds = Annotated[int, Range(0)]
+_Sharpness = Annotated[float, Range(0, 1000)]
+_Unit = Annotated[float, Range(0, 1)]
+_Decay = Annotated[float, Range(0, 0.9999)]
+_Config = TypeVar("_Config", bound="FitConfig")
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "default": {
@@ -56,8 +64,8 @@ _PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
-# What the default preset takes by the alpha mode: what is cut off has no half-transparent texels to smooth it, and drawing by chance is
-# the noisier the more there are.
+# Values of the default preset that depend on the alpha mode. A cutoff leaves no half-transparent texels that could smooth an edge, and
+# stochastic alpha is the noisier the more of them there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
     "mask": {"texel_density": 1.0, "sharpness_weight": 24.0, "binarization_weight": 0.06},
     "blend": {"texel_density": 1.25, "sharpness_weight": 14.0, "binarization_weight": 0.004},
@@ -67,148 +75,136 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How to fit. A field left at None takes the preset's value."""
+    """How to fit. A field that is None takes the value of the preset; see :meth:`resolve`."""
 
     preset: Preset = "default"
-    """default is the best that bbfit knows; thesis is as the thesis did it: 10,000 steps of one random view, no bounds, L2."""
+    """default is the best that bbfit can do; thesis follows the thesis: 10,000 steps of one random view, no bounds, L2."""
     alpha: AlphaKind | None = None
-    """How alpha will be drawn: cut off below the cutoff (mask), blended (blend), or by chance with alpha as the probability (hash).
+    """Alpha mode to fit for: cut off below the cutoff (mask), blended (blend), or drawn at random with alpha as the probability (hash).
     Preset: mask; thesis: blend."""
-    alpha_cutoff: float = 0.5
+    alpha_cutoff: Cutoff = 0.5
     """Least alpha that shows with mask, in (0, 1)."""
-    billboards: int | None = None
-    """How many billboards there are. Preset: 8; thesis: 4."""
+    billboards: Count | None = None
+    """Number of billboards. Preset: 8; thesis: 4."""
     placement: Placement | None = None
     """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
-    Clusters are found by a search over clusterings of points on the mesh or, without one, in the visual hull of the views.
+    A search compares clusterings of points on the mesh or, without a mesh, in the visual hull of the views.
     Preset: clusters; thesis: even."""
     orientation: Orientation = "any"
-    """How clusters may stand: upright, leaning any way (free), or as does better (any)."""
-    restarts: int | None = None
-    """Searches for a placement, of which the best one counts. Left out: two from eight billboards on, else one."""
-    candidates: int = 12
-    """Clusterings that a search compares; more take longer and may find a better one."""
-    refinement_rounds: int | None = None
-    """Rounds in which the best placement found is revised, by moving, splitting and merging billboards.
-    Left out: five for eight billboards, at least one and at most six."""
-    placement_learning_rate: float | None = None
-    """How fast billboards move while they are fitted, at first: radians a step, and shares of the tree's radius. 0: they stay.
+    """Orientation of clustered billboards: upright, in any direction (free), or whichever of the two fits better (any)."""
+    restarts: Count | None = None
+    """Independent searches for a placement; the best result is kept. Default: two for eight billboards or more, else one."""
+    candidates: Count = 12
+    """Clusterings that a search compares; more take longer and may find a better placement."""
+    refinement_rounds: _Rounds | None = None
+    """Rounds that refine the best placement by moving, splitting and merging billboards.
+    Default: three fewer than there are billboards, at least one and at most six."""
+    placement_learning_rate: _Unit | None = None
+    """Initial step size of the billboards' placement: radians a step, and fractions of the tree's radius. With 0 they do not move.
     Preset: 0.015; thesis: 0."""
     sides: Sides = "one"
-    """one texture seen from both sides; two, each seen from its own side; or the thesis's pair of rectangles a hair apart."""
+    """one: one texture, seen from both sides. two: a texture for each side. pair: two rectangles a hair apart, as in the thesis."""
     bounds: Bounds | None = None
-    """How large evenly placed billboards are: as the viewport, as the tree in the facing view (thesis), or as the tree in all (silhouette).
-    Clustered ones are as large as what they carry.
+    """Size of evenly placed billboards: the viewport, the tree in the view that faces them (thesis), or the tree in all views (silhouette).
+    Clustered billboards are as large as their clusters.
     Preset: silhouette; thesis: viewport."""
-    texel_density: float | None = None
-    """Texels per pixel of a view, both ways, where the tree's axis is seen face on. Preset: 1 (mask) or 1.25; thesis: 1."""
+    texel_density: _Density | None = None
+    """Texels per pixel of a view along each side, for a billboard that faces the camera at the tree's axis.
+    Preset: 1 (mask) or 1.25; thesis: 1."""
     loss: Loss | None = None
-    """What is made small: absolute (l1) or squared (l2) differences of premultiplied RGBA, or squared ones over random backgrounds.
-    They are summed over channels and averaged over pixels; of backgrounds it is the expectation.
+    """Loss to minimize: absolute (l1) or squared (l2) differences of premultiplied RGBA, or squared ones over random backgrounds.
+    It is summed over channels and averaged over pixels; for backgrounds it is the expectation.
     Preset: backgrounds; thesis: l2."""
-    max_texels: int | None = None
-    """Texels of all billboards at most, for which their density is lowered. Left out: any number."""
-    ssim_weight: float | None = None
-    """Weight of 1 - SSIM, which keeps structure, beside the loss. Preset: 0.01; thesis: 0."""
-    sharpness_weight: float | None = None
-    """Weight against blur: of the squared difference in mean contrast of neighboring pixels, at full resolution.
+    max_texels: Count | None = None
+    """Most texels of all billboards together; their density is lowered to stay within it. Default: no limit."""
+    ssim_weight: _Unit | None = None
+    """Weight of 1 - SSIM, which preserves structure, beside the loss. Preset: 0.01; thesis: 0."""
+    sharpness_weight: _Sharpness | None = None
+    """Weight of the sharpness loss: the squared difference in mean contrast between neighboring pixels, at full resolution.
     Preset: 24 (mask) or 14; thesis: 0."""
-    binarization_weight: float | None = None
-    """Weight for opaque leaves and clear air: of alpha * (1 - alpha), summed over texels, over a view's pixels, at full resolution.
+    binarization_weight: _Binarization | None = None
+    """Weight that pushes alpha to 0 or 1: of alpha * (1 - alpha), summed over texels, over a view's pixels, at full resolution.
     Preset: 0.06 (mask), 0.004 (blend) or 0.03 (hash); thesis: 0."""
-    levels: int | None = None
-    """How many resolutions there are, from coarse to fine, sides doubling from each to the next; steps are shared out evenly.
+    levels: Count | None = None
+    """Number of resolutions, from coarse to fine; each doubles the sides of the one before. Steps are divided evenly among them.
     Preset: 4; thesis: 1."""
-    steps: int | None = None
+    steps: Count | None = None
     """Steps of the optimizer. Preset: 1200; thesis: 10000."""
-    views_per_step: int | None = None
-    """Views that a step looks at, at full resolution; twice as many at each coarser one. Preset: 2; thesis: 1."""
-    learning_rate: float | None = None
-    """Step size of the optimizer, Adam, at first. Preset: 0.3; thesis: 0.01."""
-    beta1: float | None = None
-    """What is left of Adam's first moment, the mean gradient, after a step. Preset: 0.8; thesis: 0.9."""
-    beta2: float | None = None
-    """What is left of Adam's second moment, the mean squared gradient, after a step. Preset: 0.95; thesis: 0.999."""
+    views_per_step: Count | None = None
+    """Views in each step at full resolution; each coarser resolution doubles their number. Preset: 2; thesis: 1."""
+    learning_rate: _Rate | None = None
+    """Initial step size of the optimizer, Adam. Preset: 0.3; thesis: 0.01."""
+    beta1: _Decay | None = None
+    """Decay rate of Adam's first moment, the mean gradient. Preset: 0.8; thesis: 0.9."""
+    beta2: _Decay | None = None
+    """Decay rate of Adam's second moment, the mean squared gradient. Preset: 0.95; thesis: 0.999."""
     schedule: Schedule | None = None
-    """How the step size changes: to zero along a cosine, or by (1 + 0.1 / steps) a step (growth). Preset: cosine; thesis: growth."""
-    seed: int = 0
-    """Another seed gives another search, other start textures and another order of views."""
+    """Schedule of the step size: to zero along a cosine, or by (1 + 0.1 / steps) a step (growth). Preset: cosine; thesis: growth."""
+    seed: Seed = 0
+    """Seed of the search, of the initial textures and of the order of views."""
     backend: Backend = "auto"
-    """What draws while fitting: the kernels (fused, auto), or the reference, which is many times slower."""
+    """Renderer of the fit: the kernels (fused, auto), or the reference, which is many times slower."""
     device: str = field(default="cpu", metadata=EXECUTION)
     """Torch device to fit on, such as cpu or cuda."""
-    checkpoint_every: int = field(default=250, metadata=EXECUTION)
-    """Steps between two checkpoints; a fit that was stopped goes on from the last."""
+    checkpoint_every: Count = field(default=250, metadata=EXECUTION)
+    """Steps between two checkpoints; an interrupted fit resumes from the last one."""
 
     def __post_init__(self) -> None:
-        check_choice("preset", self.preset, ("default", "thesis"))
-        check_choice("alpha", self.alpha, (None, *get_args(AlphaKind)))
-        check_cutoff("alpha_cutoff", self.alpha_cutoff)
-        if self.billboards is not None:
-            check_count("billboards", self.billboards)
-        check_choice("placement", self.placement, (None, "even", "clusters"))
-        check_choice("orientation", self.orientation, ("any", "upright", "free"))
-        if self.restarts is not None:
-            check_count("restarts", self.restarts)
-        check_count("candidates", self.candidates)
-        if self.refinement_rounds is not None:
-            check_count("refinement_rounds", self.refinement_rounds, 0)
-        if self.placement_learning_rate is not None:
-            check_range("placement_learning_rate", self.placement_learning_rate, 0, 1)
-        check_choice("sides", self.sides, ("one", "two", "pair"))
-        check_choice("bounds", self.bounds, (None, "viewport", "thesis", "silhouette"))
-        if self.texel_density is not None:
-            check_range("texel_density", self.texel_density, 0, 16, open_low=True)
-        if self.max_texels is not None:
-            check_count("max_texels", self.max_texels)
-        check_choice("loss", self.loss, (None, "l1", "l2", "backgrounds"))
-        check_choice("schedule", self.schedule, (None, "cosine", "growth"))
-        check_count("seed", self.seed, 0)
-        check_count("checkpoint_every", self.checkpoint_every)
-        if self.ssim_weight is not None:
-            check_range("ssim_weight", self.ssim_weight, 0, 1)
-        if self.sharpness_weight is not None:
-            check_range("sharpness_weight", self.sharpness_weight, 0, 1000)
-        if self.binarization_weight is not None:
-            check_range("binarization_weight", self.binarization_weight, 0, 10)
-        check_choice("backend", self.backend, ("auto", "reference", "fused"))
-        if self.levels is not None:
-            check_count("levels", self.levels)
-        if self.steps is not None:
-            check_count("steps", self.steps)
-        if self.views_per_step is not None:
-            check_count("views_per_step", self.views_per_step)
-        if self.learning_rate is not None:
-            check_range("learning_rate", self.learning_rate, 0, 10, open_low=True)
-        for name in ("beta1", "beta2"):
-            if getattr(self, name) is not None:
-                check_range(name, getattr(self, name), 0, 0.9999)
+        check_fields(self)
 
-    def coarse(self) -> FitConfig:
+    def coarse(self: _Config) -> _Config:
         """The same for less than full resolution: without the weights that count only there."""
         return replace(self, sharpness_weight=0.0, binarization_weight=0.0)
 
-    def resolve(self) -> FitConfig:
-        """The same with every ``None`` replaced by the preset's value.
+    def resolve(self) -> ResolvedFit:
+        """Replace every ``None`` by the value of the preset; a :class:`ResolvedFit` returns itself.
 
         Raises
         ------
         InputError
-            if the values do not go together.
+            if the values contradict each other.
         """
-        preset = _PRESETS[self.preset]
-        preset = _BY_ALPHA[self.alpha or preset["alpha"]] | preset
-        missing = {name: value for name, value in preset.items() if getattr(self, name) is None}
-        resolved = replace(self, **missing)
-        textures = (resolved.billboards or 0) * (1 if resolved.sides == "one" else 2)
-        if resolved.max_texels is not None and resolved.max_texels < textures:
-            fail("max_texels", f"{resolved.max_texels} are too few for {textures} textures", "allow more")
-        if resolved.restarts is None:
-            assert resolved.billboards is not None
-            resolved = replace(resolved, restarts=min(2, max(1, resolved.billboards // 4)))
-        if resolved.refinement_rounds is None:
-            assert resolved.billboards is not None
-            resolved = replace(resolved, refinement_rounds=min(6, max(1, resolved.billboards - 3)))
-        if resolved.sides == "pair" and resolved.placement == "clusters":
-            fail("sides", "pairs stand evenly around an axis, not in clusters", "add --placement even, or choose one or two")
-        return resolved
+        if isinstance(self, ResolvedFit):
+            return self
+        preset, given = _PRESETS[self.preset], {name: value for name, value in vars(self).items() if value is not None}
+        values = _BY_ALPHA[given.get("alpha", preset["alpha"])] | preset | given
+        count = values["billboards"]
+        return ResolvedFit(**{"restarts": min(2, max(1, count // 4)), "refinement_rounds": min(6, max(1, count - 3))} | values)
+
+
+class ResolvedFit(FitConfig):
+    """A :class:`FitConfig` with every choice made: of its fields only ``max_texels`` may be None.
+
+    Raises
+    ------
+    InputError
+        if a value is missing, or values contradict each other.
+    """
+
+    alpha: AlphaKind
+    billboards: Count
+    placement: Placement
+    restarts: Count
+    refinement_rounds: _Rounds
+    placement_learning_rate: _Unit
+    bounds: Bounds
+    texel_density: _Density
+    loss: Loss
+    ssim_weight: _Unit
+    sharpness_weight: _Sharpness
+    binarization_weight: _Binarization
+    levels: Count
+    steps: Count
+    views_per_step: Count
+    learning_rate: _Rate
+    beta1: _Decay
+    beta2: _Decay
+    schedule: Schedule
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        textures = self.billboards * (1 if self.sides == "one" else 2)
+        if self.max_texels is not None and self.max_texels < textures:
+            fail("max_texels", f"{self.max_texels} are too few for {textures} textures", "allow more")
+        if self.sides == "pair" and self.placement == "clusters":
+            fail("sides", "pairs need an even placement around an axis", "add --placement even, or choose one or two")

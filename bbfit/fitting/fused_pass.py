@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.movement import Movement
 from bbfit.geometry.alpha import AlphaMode
@@ -25,30 +25,19 @@ class FusedPass:
 
     adam = AdamFused
 
-    def __init__(self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None, groups: int) -> None:
+    def __init__(self, cloud: BillboardCloud, targets: Targets, config: ResolvedFit, movement: Movement | None, groups: int) -> None:
         self._targets, self._config, self._movement, self._groups = targets, config, movement, groups
         self._scratch: list[Tensor] | None = None
         self._fixed = None if movement else project(cloud, targets.cameras.to(cloud.texels.device))
         self._projector = Projector(cloud, targets.cameras) if movement else None
 
     def differentiate(self, state: AdamFused, chosen: Sequence[int], alpha: AlphaMode, moves: bool) -> tuple[Tensor, Tensor | None]:
-        """Add the gradient in the texels to ``state.gradient``.
-
-        Parameters
-        ----------
-        state : AdamFused
-            Current texels.
-        chosen : Sequence[int]
-            Indices of the views to compare with.
-        alpha : AlphaMode
-            Alpha mode in which they are drawn.
-        moves : bool
-            Whether to differentiate in the movement's parameters.
+        """Add the gradient in the texels to ``state.gradient``, for the chosen views drawn in an alpha mode.
 
         Returns
         -------
         tuple[Tensor, Tensor or None]
-            The loss, a scalar, and the gradient in the movement's parameters, [N, 8], if ``moves``.
+            The loss, a scalar, and the gradient in the movement's parameters, [N, 8], if the billboards move.
         """
         config, device, movement, projector, groups = self._config, state.texels.device, self._movement, self._projector, self._groups
         if movement is not None and projector is not None:
@@ -62,7 +51,6 @@ class FusedPass:
         target = self._targets.packed(chosen).to(device)
         if groups > 1:
             target = target.repeat(groups, 1, 1, 1)
-        assert config.loss is not None
         loss = PixelLoss(target, self._targets.shrunk is None, config.loss, 1 / pixels)
         structure, of_image = self._structure(state, projection, loss)
         sums, of_matrices = differentiate(
@@ -78,7 +66,7 @@ class FusedPass:
     def _structure(self, state: AdamFused, projection: Projection, loss: PixelLoss) -> tuple[Tensor | float, Tensor | None]:
         """The loss in structure and sharpness and its gradient in the picture, [B, H, W, 4], which exists only for a weight above 0."""
         # Both terms are means over views, but losses of groups are added.
-        weights = [self._groups * (weight or 0.0) for weight in (self._config.ssim_weight, self._config.sharpness_weight)]
+        weights = [self._groups * weight for weight in (self._config.ssim_weight, self._config.sharpness_weight)]
         if not any(weights):
             return 0.0, None
         # The memory is kept: new pages for a few large pictures in every step would cost as much as drawing.

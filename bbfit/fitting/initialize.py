@@ -25,29 +25,28 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
     The axis is the vertical line through the point that the cameras converge on. With the bounds ``viewport``, billboards fill the picture
     of a camera that faces them (thesis, sections 4.2 and 6.3).
     """
-    camera, config = views.cameras, config.resolve()
-    assert config.billboards is not None and config.texel_density is not None
+    camera, resolved = views.cameras, config.resolve()
     axis, focal = convergence_point(camera), pixels_a_meter(camera)
-    density = config.texel_density * float(focal)
+    density = resolved.texel_density * float(focal)
     size = torch.tensor([camera.height, camera.width])
-    sides = config.sides
+    sides = resolved.sides
     planes = even_upright(
-        config.billboards,
+        resolved.billboards,
         axis=axis,
         half_extents=size.flip(0) / focal / 2,
-        texture_sizes=_at_least_one(size * config.texel_density),
+        texture_sizes=_at_least_one(size * resolved.texel_density),
         sides=sides,
         gap=PAIR_GAP * float(camera.width / focal / 2),
     )
-    if config.bounds != "viewport":
-        if config.bounds == "thesis":
+    if resolved.bounds != "viewport":
+        if resolved.bounds == "thesis":
             bounds = facing_view_bounds(planes, views, pairs=sides == "pair")
         else:
             bounds = silhouette_bounds(planes, views)
-        planes = bounded(planes, bounds, density, config.max_texels)
-    elif config.max_texels is not None:
-        planes = sized(planes, density, config.max_texels)
-    return random_textures(planes.to(torch.float32), planes.texture_sizes, config.seed)
+        planes = bounded(planes, bounds, density, resolved.max_texels)
+    elif resolved.max_texels is not None:
+        planes = sized(planes, density, resolved.max_texels)
+    return random_textures(planes.to(torch.float32), planes.texture_sizes, resolved.seed)
 
 
 def pixels_a_meter(camera: Camera) -> Tensor:

@@ -17,7 +17,7 @@ from torch import Tensor
 from bbfit.checks import InputTypeError, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.coverage import matched_coverage
 from bbfit.fitting.initialize import bounded, pixels_a_meter, random_textures, sized, start_cloud, tree_radius
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
@@ -63,7 +63,7 @@ class FitResult:
     """The fitted cloud, float32 on the CPU."""
     losses: list[float]
     """Loss of every step."""
-    config: FitConfig
+    config: ResolvedFit
     """The configuration, resolved."""
     seconds: float
     """Duration of the fit, including the time before it was resumed."""
@@ -129,7 +129,6 @@ def fit(
     if not isinstance(views, ViewDataset):
         raise InputTypeError(f"views: expected a ViewDataset, got {views!r}; ViewDataset.load(folder) reads one")
     config = (config or FitConfig()).resolve()
-    assert config.steps is not None and config.views_per_step is not None and config.learning_rate is not None
     device = _device(config.device)
     started = time.perf_counter()
     views.train.check()
@@ -144,7 +143,6 @@ def fit(
     started -= state.seconds
 
     start, fitted, losses = state.start, state.placement, state.losses
-    assert config.texel_density is not None
     density, radius = config.texel_density * float(pixels_a_meter(views.train.cameras)), tree_radius(views.train)
     for level in (levels := resolution_levels(config, views.train.cameras)):
         if len(losses) > level.end:
@@ -160,7 +158,7 @@ def fit(
             stepper.restore(state.tensors, len(losses) - level.begin)
         for index in range(len(losses), level.end):
             rate = learning_rate(config, index)
-            placement_learning_rate = (config.placement_learning_rate or 0.0) * rate / config.learning_rate
+            placement_learning_rate = config.placement_learning_rate * rate / config.learning_rate
             indices = sample_views(config, len(views.train), index, level.halvings)
             losses.append(float(stepper.step(indices, rate, placement_learning_rate, step_alpha(config, level, index))))
             if on_step is not None:
@@ -171,7 +169,7 @@ def fit(
         del stepper
         if movement is not None:
             start = bounded(fitted, opaque_bounds(fitted), density, config.max_texels).to(torch.float32)
-    assert fitted is not None and config.alpha is not None
+    assert fitted is not None
     fitted = replace(fitted, alpha=AlphaMode(config.alpha, config.alpha_cutoff))
     if config.alpha == "mask":
         fitted = matched_coverage(fitted, views.train, config.backend)
@@ -188,12 +186,13 @@ def fit_inputs(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> 
     return config, views.train.fingerprint, None if tree is None or config.placement == "even" else tree.digest
 
 
-def _initial_state(views: ViewDataset, config: FitConfig, tree: TreeFile | None, on_place: Callable[[int, int], None] | None) -> _FitState:
+def _initial_state(
+    views: ViewDataset, config: ResolvedFit, tree: TreeFile | None, on_place: Callable[[int, int], None] | None
+) -> _FitState:
     """Place the billboards evenly, or search for a placement."""
     if config.placement == "even":
         return _FitState([], start_cloud(views.train, config), None, {}, 0.0)
     points = hull_points(views.train, seed=config.seed) if tree is None else mesh_points(tree, views.train, seed=config.seed)
-    assert config.texel_density is not None
     placement = find_placement(views.train, points, config, on_place)
     density = config.texel_density * float(pixels_a_meter(views.train.cameras))
     return _FitState([], sized(placement, density, config.max_texels), placement, {}, 0.0)
@@ -211,16 +210,15 @@ class ResolutionLevel:
     """Number of steps at the end of the level."""
 
 
-def resolution_levels(config: FitConfig, cameras: Camera) -> list[ResolutionLevel]:
+def resolution_levels(config: ResolvedFit, cameras: Camera) -> list[ResolutionLevel]:
     """Divide the steps of a resolved configuration evenly among levels, from coarse to fine, without levels of very small pictures."""
-    assert config.levels is not None and config.steps is not None
     side = min(cameras.width, cameras.height)
     halvings = [h for h in reversed(range(config.levels)) if h == 0 or side >> h >= LEAST_SIDE]
     edges = [config.steps * i // len(halvings) for i in range(len(halvings) + 1)]
     return [ResolutionLevel(*level) for level in zip(halvings, edges, edges[1:], strict=False)]
 
 
-def step_alpha(config: FitConfig, level: ResolutionLevel, index: int) -> AlphaMode:
+def step_alpha(config: ResolvedFit, level: ResolutionLevel, index: int) -> AlphaMode:
     """Return the alpha mode that step ``index``, from 0, of a resolved configuration renders with.
 
     It is ``blend``, except for a ``mask`` at full resolution. There the ramp around the cutoff hardens over the first 30 % of the level's
@@ -235,25 +233,23 @@ def step_alpha(config: FitConfig, level: ResolutionLevel, index: int) -> AlphaMo
     return AlphaMode("mask", config.alpha_cutoff, hardness)
 
 
-def learning_rate(config: FitConfig, index: int) -> float:
+def learning_rate(config: ResolvedFit, index: int) -> float:
     """Return Adam's learning rate in step ``index``, from 0, of a resolved configuration.
 
     ``growth`` is the schedule of the thesis, lr_i = lr_(i-1) * (1 + 0.1 / n): the rate grows by about a tenth over n steps.
     """
-    assert config.learning_rate is not None and config.steps is not None
     if config.schedule == "growth":
         return config.learning_rate * (1 + 0.1 / config.steps) ** index
     return config.learning_rate * 0.5 * (1 + math.cos(math.pi * index / config.steps))
 
 
-def sample_views(config: FitConfig, count: int, index: int, halvings: int = 0) -> list[int]:
+def sample_views(config: ResolvedFit, count: int, index: int, halvings: int = 0) -> list[int]:
     """Sample the indices of the training views, out of ``count``, for step ``index``.
 
     The sample depends only on the seed and the step, so that a fit can resume at any step. A single view per step is sampled with
     replacement (thesis, algorithm 1). Several views per step are taken from random permutations of all views, so that all views occur
     equally often. Every halving of the resolution doubles the number of views.
     """
-    assert config.views_per_step is not None
     requested = config.views_per_step << halvings
     if requested == 1:
         return np.random.default_rng([config.seed, index]).integers(count, size=1).tolist()

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.movement import Movement
 from bbfit.geometry.alpha import AlphaMode
@@ -23,7 +23,7 @@ class ReferencePass:
 
     adam = AdamReference
 
-    def __init__(self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None, groups: int) -> None:
+    def __init__(self, cloud: BillboardCloud, targets: Targets, config: ResolvedFit, movement: Movement | None, groups: int) -> None:
         self._cloud, self._targets, self._config, self._movement, self._groups = cloud, targets, config, movement, groups
 
     def differentiate(self, state: AdamReference, chosen: Sequence[int], alpha: AlphaMode, moves: bool) -> tuple[Tensor, Tensor | None]:
@@ -36,10 +36,9 @@ class ReferencePass:
             cloud = replace(self._movement.placed(parameters, texels).to(torch.float32).to(device), alpha=alpha)
         cameras, target = self._targets.cameras[list(chosen)].to(device), self._targets.pictures(chosen).to(device)
         loss = torch.zeros((), device=device)
-        assert config.loss is not None
         for group in cloud.parts(self._groups):
             image = render_reference(group, cameras)
-            loss = loss + image_loss_reference(image, target, config.loss, config.ssim_weight or 0.0, config.sharpness_weight or 0.0)
+            loss = loss + image_loss_reference(image, target, config.loss, config.ssim_weight, config.sharpness_weight)
         loss.backward()
         assert texels.grad is not None
         state.gradient.add_(texels.grad)

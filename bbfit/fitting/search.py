@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, splatted, split_planes, view_projection
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.initialize import pixels_a_meter, tree_radius
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.movement import Movement
@@ -58,7 +58,7 @@ USUAL = Effort()
 
 
 def find_placement(
-    views: ViewSet, points: Tensor, config: FitConfig, on_progress: Callable[[int, int], None] | None = None, effort: Effort = USUAL
+    views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None] | None = None, effort: Effort = USUAL
 ) -> BillboardCloud:
     """Search for the placement of billboards that explains the training views best at a low resolution.
 
@@ -94,15 +94,13 @@ def find_placement(
 
 class _Search:
     def __init__(
-        self, views: ViewSet, points: Tensor, config: FitConfig, on_progress: Callable[[int, int], None], effort: Effort = USUAL
+        self, views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None], effort: Effort = USUAL
     ) -> None:
         self._config, self._points, self._on_progress, self._effort = replace(config.coarse(), ssim_weight=0.0), points, on_progress, effort
         side = min(views.cameras.width, views.cameras.height)
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))
         cameras = self._targets.cameras
-        assert config.texel_density is not None and config.billboards is not None
-        assert config.restarts is not None and config.refinement_rounds is not None
         self._density = float(pixels_a_meter(cameras)) * config.texel_density
         self._projection = view_projection(cameras)
         self._pixels = [pixels_of(points, cameras[index]) for index in range(len(cameras))]
@@ -120,7 +118,6 @@ class _Search:
 
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
-        assert self._config.restarts is not None and self._config.refinement_rounds is not None
         best = min((self._searched(number) for number in range(self._config.restarts)), key=itemgetter(1))
         for number in range(self._config.refinement_rounds):
             best = min(best, self._best_of([best[0], *self._revised(best[0], number)]), key=itemgetter(1))
@@ -235,7 +232,7 @@ class _Search:
         for step in range(steps):
             decay = 0.5 * (1 + math.cos(math.pi * step / steps))
             batch = torch.randperm(len(self._targets.cameras), generator=self._generator)[:_BATCH].tolist()
-            stepper.step(batch, rate * decay, (config.placement_learning_rate or 0.0) * decay)
+            stepper.step(batch, rate * decay, config.placement_learning_rate * decay)
             self._done += len(clouds)
             self._on_progress(self._done, self._total)
         clouds = stepper.finish().parts(len(clouds))
@@ -243,7 +240,6 @@ class _Search:
 
     def _losses(self, cloud: BillboardCloud) -> Tensor:
         """Compute the loss of every pixel of every training view, [V, H, W]."""
-        assert self._config.loss is not None
         device = self._config.device
         image = render(cloud.to(device), self._targets.cameras.to(device), backend=self._config.backend)
         return pixel_loss_reference(image.cpu(), self._pictures, self._config.loss)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.movement import Movement
 from bbfit.geometry.alpha import AlphaMode
@@ -41,8 +41,8 @@ class Stepper:
         Its texels, on their device, are the start.
     targets : Targets
         Views to compare with.
-    config : FitConfig
-        A resolved configuration.
+    config : ResolvedFit
+        The configuration.
     movement : Movement, optional
         Placement to optimize; every step changes it.
     groups : int
@@ -50,12 +50,11 @@ class Stepper:
     """
 
     def __init__(
-        self, cloud: BillboardCloud, targets: Targets, config: FitConfig, movement: Movement | None = None, *, groups: int = 1
+        self, cloud: BillboardCloud, targets: Targets, config: ResolvedFit, movement: Movement | None = None, *, groups: int = 1
     ) -> None:
-        assert config.beta1 is not None and config.beta2 is not None
         self._cloud, self._movement, self._betas = cloud.without_textures(), movement, (config.beta1, config.beta2)
-        self._binarization = (config.binarization_weight or 0.0) / (targets.cameras.width * targets.cameras.height)
-        self._pass = _pass_of(config)(self._cloud, targets, config, movement, groups)
+        self._binarization = config.binarization_weight / (targets.cameras.width * targets.cameras.height)
+        self._pass: Any = _pass_of(config)(self._cloud, targets, config, movement, groups)
         self._begin, self.steps = self._pass.adam.padded(cloud.texels), 0
 
     @cached_property
@@ -80,22 +79,7 @@ class Stepper:
         return self._movement.now(texels) if self._movement else self._cloud.to("cpu").with_texels(texels)
 
     def step(self, chosen: Sequence[int], rate: float, placement_learning_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
-        """Take the next step.
-
-        Parameters
-        ----------
-        chosen : Sequence[int]
-            Indices of the views to compare with.
-        rate, placement_learning_rate : float
-            Learning rates of texels and placement.
-        alpha : AlphaMode
-            Alpha mode in which views are drawn.
-
-        Returns
-        -------
-        Tensor
-            The loss before the update, a scalar.
-        """
+        """Take the next step with the chosen views, drawn in an alpha mode; return the loss before the update, a scalar."""
         movement = self._movement if placement_learning_rate > 0 else None
         loss, of_parameters = self._pass.differentiate(self.state, chosen, alpha, movement is not None)
         if movement is not None and of_parameters is not None:
@@ -115,7 +99,7 @@ class Stepper:
             self._movement.restore(tensors)
 
 
-def _pass_of(config: FitConfig) -> type[ReferencePass] | type[FusedPass]:
+def _pass_of(config: ResolvedFit) -> type[ReferencePass] | type[FusedPass]:
     if config.backend == "reference":
         from bbfit.fitting.reference_pass import ReferencePass
 

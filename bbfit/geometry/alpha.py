@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
-from bbfit.checks import InputTypeError, check_choice, check_range, fail
+from bbfit.checks import Range, check_choice, check_range
 
 AlphaKind = Literal["mask", "blend", "hash"]
-
-
-def check_cutoff(name: str, cutoff: float) -> None:
-    """Require a cutoff in (0, 1)."""
-    if isinstance(cutoff, bool) or not isinstance(cutoff, int | float):
-        raise InputTypeError(f"{name}: expected a number, got {cutoff!r}")
-    if not 0 < cutoff < 1:
-        fail(name, f"expected a value in (0, 1), got {cutoff!r}", "0.5 is what most programs assume")
+Cutoff = Annotated[float, Range(0, 1, open_low=True, open_high=True)]
+"""Least alpha that shows with mask, in (0, 1)."""
 
 
 @dataclass(frozen=True)
@@ -34,5 +28,5 @@ class AlphaMode:
 
     def __post_init__(self) -> None:
         check_choice("alpha", self.kind, get_args(AlphaKind))
-        check_cutoff("alpha_cutoff", self.cutoff)
+        check_range("alpha_cutoff", self.cutoff, 0, 1, open_low=True, open_high=True)
         check_range("hardness", min(self.hardness, 1e30), 0.5 / min(self.cutoff, 1 - self.cutoff), 1e30)

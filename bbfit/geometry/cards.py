@@ -23,14 +23,14 @@ class Atlas:
 
     @property
     def used(self) -> float:
-        """Share of the picture that textures cover, in (0, 1]; the rest is padding and gaps."""
+        """Share of the picture that textures cover, in (0, 1]."""
         height, width = self.image.shape[:2]
         return float(self.sizes.prod(-1).sum() / (height * width))
 
 
 @dataclass(frozen=True)
 class Card:
-    """A flat convex polygon that shows a part of one texture of the atlas, or all of it."""
+    """A flat convex polygon that shows a texture of the atlas or a part of it."""
 
     corners: NDArray[np.float64]
     """K >= 3 points in meters, counter-clockwise as seen from where the normal points, [K, 3]."""

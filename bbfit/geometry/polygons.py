@@ -17,7 +17,7 @@ def sides(polygon: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def area(polygon: NDArray[np.float64]) -> float:
-    """Signed area, positive where x turns to y, [K, 2] ->."""
+    """Signed area of a polygon [K, 2]; positive if its corners turn from x to y."""
     x, y = (polygon - polygon[0]).T
     return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 

@@ -1,8 +1,8 @@
-"""What a graphics card shows of exported cards, near and from afar: bilinear and trilinear filtering, then the alpha mode.
+"""Renderer of exported cards: what a graphics card shows, with bilinear or trilinear filtering and the alpha mode.
 
-It differs from the renderer of clouds in what files add to a cloud: textures of 8 bits, polygons that may be smaller than their
-rectangles, culling, mip levels. Graphics cards also round the level and filter weights, to 8 bits or so, and take the derivatives from
-differences of neighboring pixels; that is left out.
+Unlike the renderer of clouds it knows what files add: 8-bit textures, polygons smaller than their rectangles, culling, mip levels. It does
+not model that graphics cards round the level of detail and the filter weights to about 8 bits, and that they compute derivatives from
+differences between neighboring pixels.
 """
 
 from __future__ import annotations
@@ -22,43 +22,43 @@ from bbfit.geometry.polygons import area, sides
 from bbfit.operators.drawing.compositing import composite, opacity, thresholds
 from bbfit.operators.drawing.reference import EDGE_ON
 
-# How far outside a polygon, in shares of the atlas, a pixel's center counts as in it, so that no rounding opens a seam between two.
+# Distance outside a polygon, as a share of the atlas, at which a pixel's center still counts as inside, so that rounding opens no seams.
 _SLACK = 1e-9
-# Pieces belong to one sheet if their corners lie where its map takes them, but for this share of their distance from the origin.
+# Relative error of corners up to which a card belongs to a sheet.
 _SAME = 1e-6
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """Cards that are parts of one textured plane, as cutting leaves them: they share no area, and a ray meets one of them at most."""
+    """Cards that are disjoint parts of one textured plane; a ray meets at most one of them."""
 
     pieces: list[Card]
     """At least one card."""
     to_world: NDArray[np.float64]
     """From (u, v, 1) to homogeneous world points, [4, 3]."""
     first: int
-    """Number of its texture's first texel among those of all textures, which the mode hash is seeded with."""
+    """Index of its texture's first texel among the texels of all textures, which seeds the mode ``hash``."""
 
 
 @dataclass(frozen=True)
 class Hits:
-    """Where the rays through the centers of a camera's pixels meet a sheet from a side that is shown: M of them."""
+    """The M pixels of a camera whose rays meet a sheet on a side that is shown."""
 
     x: Tensor
-    """Columns of the pixels, int64 [M]; no pixel occurs twice."""
+    """Columns, int64 [M]; no pixel occurs twice."""
     y: Tensor
-    """Their rows, int64 [M]."""
+    """Rows, int64 [M]."""
     uv: Tensor
     """Texture coordinates, float64 [M, 2]."""
     detail: Tensor
-    """Level of detail, float64 [M], negative where texels are magnified."""
+    """Level of detail, float64 [M]; negative where texels are magnified."""
     depth: Tensor
-    """Meters along the camera's axis, float64 [M]."""
+    """Depth in meters, float64 [M]."""
 
 
 @dataclass(frozen=True)
 class MipChain:
-    """A mip chain as one list of texels."""
+    """The texels of all levels of a mip chain."""
 
     texels: Tensor
     """uint8 [T, C]."""
@@ -71,34 +71,37 @@ class MipChain:
 
 
 def draw_cards(cards: Cards, camera: Camera) -> Tensor:
-    """Draw cards as a graphics card does, one sample a pixel.
+    """Draw cards as a graphics card does, with one sample per pixel.
 
-    Without mip levels the picture is that of :func:`~bbfit.rendering.dispatch.render` up to the rounding of textures to 8 bits, for cards
-    that show all of their rectangles. Filtering, like blending, is done on display-referred values, which is what fits are made for;
-    programs that filter in linear light show slightly lighter colors, and the same alpha.
+    Without mip levels, and for cards that show their whole rectangles, the picture equals that of :func:`~bbfit.rendering.dispatch.render`
+    up to the rounding of textures to 8 bits. Filtering and blending use display-referred values, as fits do. Programs that filter in linear
+    light show slightly lighter colors and the same alpha.
 
-    With mip levels the level of detail is log2 of the longer of the texel coordinates' two derivatives along the screen's axes (OpenGL
-    4.6, section 8.14.1), exact for every pixel; it is held within the levels that there are. The bilinear samples of the two nearest
-    levels are mixed by it (LINEAR_MIPMAP_LINEAR), color and alpha apart, and what comes out is tested or blended. Beyond the atlas its
-    outermost texels go on.
+    With mip levels the level of detail is log2 of the larger norm of the texel coordinates' derivatives along the screen's two axes (OpenGL
+    4.6, section 8.14.1), exact for every pixel and clamped to the existing levels. The bilinear samples of the two nearest levels are
+    interpolated (LINEAR_MIPMAP_LINEAR), straight color and alpha separately, and the result is tested or blended. Beyond its border the
+    atlas is clamped.
 
     A pixel shows a card if its center lies in the polygon. Layers are ordered by depth in every pixel, as in
     :func:`~bbfit.operators.drawing.compositing.composite`. A plane shows nothing edge-on and behind the camera.
 
     Parameters
     ----------
-    cards : polygons, their atlas, and their mip levels; there need not be all down to one texel. Without any, the atlas is filtered
-        bilinearly at every distance (sampler LINEAR).
-    camera : one camera, or V of them.
+    cards : Cards
+        Polygons, their atlas and their mip levels, which need not reach down to one texel. Without levels the atlas is filtered bilinearly
+        at every distance (sampler LINEAR).
+    camera : Camera
+        One camera or V cameras.
 
     Returns
     -------
-    Premultiplied RGBA over nothing in [0, 1], float32 [H, W, 4] for one camera and [V, H, W, 4] for a batch, on the CPU.
+    Tensor
+        Premultiplied RGBA in [0, 1], float32 [H, W, 4] for one camera and [V, H, W, 4] for a batch, on the CPU.
 
     Raises
     ------
     InputError
-        if a level is not half the one before, rounded down, or not of bytes.
+        If a level is not uint8 or not half as large as the level before, rounded down.
     """
     levels, sheets = joined([cards.atlas.image] if cards.chain is None else cards.chain, cards.atlas.image.shape), sheets_of(cards)
     cameras = camera.batch()
@@ -108,17 +111,19 @@ def draw_cards(cards: Cards, camera: Camera) -> Tensor:
 
 
 def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> MipChain:
-    """Mip levels in one list.
+    """Concatenate mip levels.
 
     Parameters
     ----------
-    chain : uint8 [h, w, C] each, level 0 first.
-    shape : that of level 0.
+    chain : Sequence[NDArray]
+        uint8 [h, w, C] each, level 0 first.
+    shape : tuple[int, ...]
+        Shape of level 0.
 
     Raises
     ------
     InputError
-        if a level is not half the one before, rounded down, or not of bytes.
+        If a level is not uint8 or not half as large as the level before, rounded down.
     """
     if not chain:
         fail("chain", "has no levels", "level 0 is the atlas's picture")
@@ -132,7 +137,7 @@ def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> MipCha
 
 
 def sheets_of(cards: Cards) -> list[Sheet]:
-    """The planes that cards are parts of, in the order of their first cards; a card without an area shows nothing."""
+    """The textured planes of cards, in the order of their first cards; cards without an area are left out."""
     sheets: list[Sheet] = []
     areas = cards.atlas.sizes.prod(-1)
     for card in cards.cards:
@@ -154,7 +159,7 @@ def sheets_of(cards: Cards) -> list[Sheet]:
 
 
 def hits(cards: Cards, sheet: Sheet, camera: Camera) -> Hits:
-    """What a single camera sees of one of the cards' sheets, whatever its alpha."""
+    """The pixels in which a single camera meets one of the cards' sheets, whatever its alpha."""
     camera = camera.to("cpu").to(torch.float64)
     to_world = torch.from_numpy(sheet.to_world)
     to_pixel, to_depth = camera.world_to_pixel @ to_world, camera.world_to_camera[2] @ to_world
@@ -162,8 +167,8 @@ def hits(cards: Cards, sheet: Sheet, camera: Camera) -> Hits:
     # [u, v, 1] / depth for a pinhole, [u, v, 1] for parallel projection, from a pixel [x, y, 1]
     to_uv = torch.linalg.inv(to_pixel) if shown else torch.eye(3, dtype=torch.float64)
     free = torch.full((camera.height, camera.width), shown)
-    found = [_hits(piece, camera, to_uv, to_depth, free) for piece in (sheet.pieces if shown else sheet.pieces[:1])]
-    x, y, u, v, scale, depth = (torch.cat(parts) for parts in zip(*found, strict=True))
+    parts = [_hits(piece, camera, to_uv, to_depth, free) for piece in (sheet.pieces if shown else sheet.pieces[:1])]
+    x, y, u, v, scale, depth = (torch.cat(column) for column in zip(*parts, strict=True))
     uv = torch.stack([u, v], -1)
     # d(a / c) = (da - (a / c) dc) / c, in x and in y
     size = torch.tensor(cards.atlas.image.shape[1::-1], dtype=torch.float64)
@@ -176,11 +181,11 @@ def filtered(levels: MipChain, uv: Tensor, detail: Tensor) -> Tensor:
     detail = detail.clamp(0, len(levels.starts) - 1)
     level = detail.long()
     share = (detail - level).float()
-    found = _bilinear(levels, uv, level)
+    sample = _bilinear(levels, uv, level)
     mixed = share > 0
-    further = _bilinear(levels, uv[mixed], level[mixed] + 1)
-    found[mixed] += (further - found[mixed]) * share[mixed, None]
-    return found
+    coarser = _bilinear(levels, uv[mixed], level[mixed] + 1)
+    sample[mixed] += (coarser - sample[mixed]) * share[mixed, None]
+    return sample
 
 
 def _bilinear(levels: MipChain, uv: Tensor, level: Tensor) -> Tensor:
@@ -192,13 +197,13 @@ def _bilinear(levels: MipChain, uv: Tensor, level: Tensor) -> Tensor:
     x, y = (x - left).float()[:, None], (y - top).float()[:, None]  # beyond the last texel both neighbors are that one
     start = levels.starts[level] + top * width + left
     a, b, c, d = (levels.texels[start + step].float() for step in (0, right, down, down + right))
-    # So written, equal texels give their own value exactly, whatever the weights: alpha at the cutoff stays there.
+    # In this form equal texels give their own value exactly, whatever the weights: alpha at the cutoff stays at the cutoff.
     upper, lower = a + (b - a) * x, c + (d - c) * x
     return upper + (lower - upper) * y
 
 
 def _view(cards: Cards, sheets: list[Sheet], levels: MipChain, camera: Camera) -> Tensor:
-    """One camera's picture, [H, W, 4]."""
+    """Picture of a single camera, [H, W, 4]."""
     height, width = camera.height, camera.width
     colors, alphas, depths = [], [], []
     for sheet in sheets:
@@ -219,7 +224,7 @@ def _view(cards: Cards, sheets: list[Sheet], levels: MipChain, camera: Camera) -
 
 
 def _faces(sheet: Sheet, camera: Camera) -> bool:
-    """Whether the camera sees the plane from a side that is shown, and not edge-on."""
+    """Whether the camera sees a side of the plane that is shown, and not edge-on."""
     normal = torch.from_numpy(sheet.pieces[0].normal)
     towards = camera.position - torch.from_numpy(np.concatenate([piece.corners for piece in sheet.pieces]).mean(0))
     if camera.orthographic:
@@ -229,13 +234,13 @@ def _faces(sheet: Sheet, camera: Camera) -> bool:
 
 
 def _hits(piece: Card, camera: Camera, to_uv: Tensor, to_depth: Tensor, free: Tensor) -> tuple[Tensor, ...]:
-    """Pixels in which rays meet a piece: x, y, u, v, the third coordinate and the depth there, [M] each.
+    """Pixels whose rays meet a piece: x, y, u, v, the third homogeneous coordinate and the depth, [M] each.
 
-    Only those count that are ``free``, bool [H, W], which they are not any more.
+    Only pixels that are ``free``, bool [H, W], are returned; they are then marked as taken.
     """
     low, high = torch.zeros(2, dtype=torch.int64), torch.tensor([camera.width, camera.height])
     corners = torch.from_numpy(_homogeneous(piece.corners)) @ camera.world_to_pixel.mT
-    if bool((corners[:, 2] > 1e-9).all()):  # else the piece is not wholly before the camera, and reaches who knows where
+    if bool((corners[:, 2] > 1e-9).all()):  # otherwise a part is behind the camera, and the corners bound nothing
         at = corners[:, :2] / corners[:, 2:]
         low, high = (torch.minimum(edge.clamp_min(0), high.double()).long() for edge in (at.amin(0).floor(), at.amax(0).floor() + 2))
     y, x = torch.meshgrid(torch.arange(int(low[1]), int(high[1])), torch.arange(int(low[0]), int(high[0])), indexing="ij")

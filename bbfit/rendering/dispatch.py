@@ -1,4 +1,4 @@
-"""Choosing a renderer."""
+"""Public renderer of billboard clouds."""
 
 from __future__ import annotations
 
@@ -17,15 +17,19 @@ def render(cloud: BillboardCloud, camera: Camera, *, backend: Backend = "auto") 
 
     Parameters
     ----------
-    cloud : N billboards, N >= 0.
-    camera : one camera, or V of them.
-    backend : ``"fused"``, Warp kernels, float32; ``"reference"``, kornia and autograd, any precision; ``"auto"``: the reference for a
-        float64 cloud and the kernels for any other.
+    cloud : BillboardCloud
+        N >= 0 billboards.
+    camera : Camera
+        One camera or V cameras.
+    backend : {"auto", "reference", "fused"}
+        ``fused``: Warp kernels in float32; ``reference``: kornia and autograd in any precision; ``auto``: the reference for a float64
+        cloud and the kernels for any other.
 
     Returns
     -------
-    Premultiplied RGBA over nothing in [0, 1], [H, W, 4] for one camera and [V, H, W, 4] for a batch, in the cloud's dtype and on its
-    device. See :func:`bbfit.operators.drawing.reference.render_reference` for what it means.
+    Tensor
+        Premultiplied RGBA in [0, 1], [H, W, 4] for one camera and [V, H, W, 4] for a batch, in the cloud's dtype and on its device;
+        defined by :func:`bbfit.operators.drawing.reference.render_reference`.
     """
     check_choice("backend", backend, ("auto", "reference", "fused"))
     if backend == "reference" or (backend == "auto" and cloud.texels.dtype == torch.float64):

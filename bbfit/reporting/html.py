@@ -1,4 +1,4 @@
-"""``report.html``: all there is to see of a run, in one file that needs no network."""
+"""``report.html``: the results of a run in one file that needs no network."""
 
 from __future__ import annotations
 
@@ -28,58 +28,61 @@ from bbfit.reporting.plots import magma, spread_views
 from bbfit.reporting.threejs import drawing_script, library_page
 from bbfit.views import ViewSet
 
-# Pictures of this many held-out views are in the page at most, besides the worst ones, and none is wider than so many pixels.
-_MOST_VIEWS, _WIDEST = 36, 512
+# The most held-out views with pictures, besides the worst ones, and the largest width of a picture in pixels.
+_MAX_VIEWS, _MAX_WIDTH = 36, 512
 
 
 @dataclass(frozen=True)
 class RunFacts:
-    """What is known of a run besides its result."""
+    """A run's options, seeds, versions and losses."""
 
     source: str
-    """What it was made of: a file's or folder's name, or a species. May hold anything; the page escapes it."""
-    asked: Mapping[str, Mapping[str, Any]]
+    """Name of the source: a file, a folder or a species. It may contain any characters; the page escapes it."""
+    options: Mapping[str, Mapping[str, Any]]
     """Every option of each stage, resolved."""
-    usual: Mapping[str, Mapping[str, Any]]
-    """What the options are if nothing is said."""
+    defaults: Mapping[str, Mapping[str, Any]]
+    """The default of every option of each stage."""
     seeds: Mapping[str, int]
-    """Seeds by what they are of."""
+    """Seed of each stage."""
     versions: Mapping[str, str | None]
-    """Versions of the programs that took part."""
+    """Versions of bbfit and of the libraries that it used."""
     losses: Sequence[float]
     """Loss of every step of the fit."""
     pareto: bytes | None = None
-    """The picture of a budget's trials (PNG), if there was one."""
-    cut_up: bool = False
-    """Whether the model is cut up so that programs blend it in the right order."""
+    """The picture of a budget's trials (PNG), if there was a budget."""
 
 
 def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunFacts, glb: bytes) -> str:
-    """The page as text: everything that it shows is in it, and what users named is escaped.
+    """The report as HTML. The page loads nothing from elsewhere, and names that users chose are escaped.
 
-    Shown are the key figures beside the tree's, held-out views (target, result, FLIP map) with a slider, every measure by azimuth with the
-    worst views, the model in 3D by trimesh's viewer, which holds three.js, textures and a plan of the billboards, the quality from afar,
-    the loss, and what was asked.
+    It shows the key figures beside the original's, held-out views (target, result, FLIP map) with a slider, every measure by azimuth with
+    the worst views, the model in 3D, textures and a plan of the billboards, the quality from a distance, the loss, and the options.
 
     Parameters
     ----------
-    report : the scores of ``model`` on ``views``.
-    model : the billboards as they are exported.
-    views : V held-out views; at most 36 of them and the worst ones are shown, no wider than 512 pixels.
-    glb : the model for the 3D view, with pictures that browsers read (PNG or WebP).
+    report
+        The scores of ``model`` on ``views``.
+    model
+        The billboards as they are exported.
+    views
+        V held-out views. The page shows the worst ones and at most 36 others, no wider than 512 pixels.
+    facts
+        What the page shows of the run besides its result.
+    glb
+        The model for the 3D view as a GLB file, with pictures that browsers read (PNG or WebP).
 
     Raises
     ------
     InputError
-        if a view cannot be read, or there are none.
+        If a view cannot be read, or if there are none.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
     cloud, worst = model.cloud, _worst(report.views)
     angles = np.array([(view.azimuth_degrees, view.elevation_degrees) for view in report.views])
-    shown = sorted({*spread_views(angles, _MOST_VIEWS), *(entry["index"] for entry in worst)}, key=lambda index: (*angles[index], index))
-    layered = report.alpha.kind != "mask" and not facts.cut_up
+    shown = sorted({*spread_views(angles, _MAX_VIEWS), *(entry["index"] for entry in worst)}, key=lambda index: (*angles[index], index))
+    layered = report.alpha.kind != "mask" and not model.config.split
     azimuth, plan = azimuth_chart(report.views), plan_chart(cloud)
     environment = Environment(
         loader=PackageLoader("bbfit.reporting", "page"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -115,16 +118,16 @@ def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunF
 
 
 def _least_seen(cloud: BillboardCloud) -> float:
-    """The alpha that counts as opaque."""
+    """The alpha from which a texel counts as opaque."""
     return cloud.alpha.cutoff if cloud.alpha.kind == "mask" else 0.5
 
 
 def _view(model: ShippedModel, views: ViewSet, score: ViewScore, index: int) -> dict[str, Any]:
-    """A held-out view for the strip: its pictures and figures."""
+    """The pictures and measures of a held-out view."""
     target, result = held_out(model.draw, views, index)
     error = metrics.flip_map(over_color(target).numpy(), over_color(result).numpy())
     height, width = error.shape
-    size = (min(width, _WIDEST), max(1, height * min(width, _WIDEST) // width))
+    size = (min(width, _MAX_WIDTH), max(1, height * min(width, _MAX_WIDTH) // width))
     mapped = magma(shrunk(torch.from_numpy(error)[..., None], *size)[..., 0].numpy())
     pictures = [to_bytes(unpremultiply(shrunk(picture, *size))) for picture in (target, result)]
     opaque = np.full((*mapped.shape[:2], 1), 255, np.uint8)
@@ -145,7 +148,7 @@ def _view(model: ShippedModel, views: ViewSet, score: ViewScore, index: int) -> 
 
 
 def _worst(views: Sequence[ViewScore]) -> list[dict[str, Any]]:
-    """The views to show as the worst, by each measure and the three of most FLIP: their figures, and by which they are the worst."""
+    """The worst view by each measure and the three views with the largest FLIP, with their measures."""
     worst = worst_views(views)
     most = sorted(range(len(views)), key=lambda index: -views[index].measures.over_white.flip)[:3]
     titles = {name: title.removesuffix(", dB") for name, title, _ in MEASURES}
@@ -159,7 +162,7 @@ def _worst(views: Sequence[ViewScore]) -> list[dict[str, Any]]:
 
 
 def _billboards(cloud: BillboardCloud) -> list[dict[str, Any]]:
-    """Each billboard's textures, sizes and how it stands."""
+    """The textures, sizes and tilt of each billboard."""
     described = []
     for number, textures in enumerate(cloud.textures()):
         half, normal = cloud.half_extents[number].tolist(), cloud.normals[number].double()
@@ -182,12 +185,12 @@ def _costs(report: Report) -> list[tuple[str, Cost]]:
 
 
 def _changed(facts: RunFacts) -> list[tuple[str, Any]]:
-    """The options that are not as usual, by stage and name."""
+    """The options that differ from their defaults, by stage and name."""
     return [
         (f"{stage}.{name}", value)
-        for stage, options in facts.asked.items()
+        for stage, options in facts.options.items()
         for name, value in options.items()
-        if value != facts.usual.get(stage, {}).get(name)
+        if value != facts.defaults.get(stage, {}).get(name)
     ]
 
 
@@ -204,7 +207,7 @@ def _count(value: int | None) -> str:
 
 
 def _share(value: float | None) -> str:
-    """A share in per cent, with two digits that say something."""
+    """A share in percent, with two significant digits."""
     if value is None:
         return ""
     return f"{100 * value:.2g} %" if value < 0.1 else f"{100 * value:.0f} %"

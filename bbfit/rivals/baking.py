@@ -95,24 +95,29 @@ def bake(
 
     Parameters
     ----------
-    tree : as for :func:`~bbfit.blender.views_folder.render_views`.
-    slabs : N rectangles. They must contain everything that is to be visible; a margin for the renderer's filter is added.
-    fill_cuts : give texels that show the dark inside of a stem, which the slab cuts open, the color of the nearest lit texel. A texel
-        counts as inside if it reflects less than 3% of ``config.views.ambient_strength``, in sunlight or not.
-    folder : keeps the pictures, so that an interrupted bake can resume (:func:`~bbfit.blender.pictures.render_pictures`); not kept when
-        left out.
-    on_progress : called with the number of finished pictures and of all pictures.
+    tree
+        As for ``render_views``.
+    slabs
+        N rectangles. They must contain everything that is to be visible; a margin for the renderer's filter is added.
+    fill_cuts
+        Give texels that show the dark inside of a stem, which the slab cuts open, the color of the nearest lit texel. A texel counts as
+        inside if it reflects less than 3% of ``config.views.ambient_strength``, in sunlight or not.
+    folder
+        Keeps the pictures, so that an interrupted bake can resume (``render_pictures``); not kept when left out.
+    on_progress
+        Called with the number of finished pictures and of all pictures.
 
     Returns
     -------
-    A float32 cloud in the order of the slabs, without empty ones.
+    BillboardCloud
+        A float32 cloud in the order of the slabs, without empty ones.
 
     Raises
     ------
-    MissingFileError, InputError
-        if the tree or the folder cannot be used, if a picture would have more than 16384 texels a side, or if there is no Blender.
+    MissingFileError or InputError
+        If the tree or the folder cannot be used, if a picture would have more than 16384 texels a side, or if there is no Blender.
     BlenderError
-        if Blender crashes again and again.
+        If Blender crashes again and again.
     """
     if folder is None:
         with tempfile.TemporaryDirectory(prefix="bbfit-") as scratch:
@@ -146,10 +151,10 @@ def tree_triangles(tree: str | Path | TreeFile) -> NDArray[np.float64]:
 
     Raises
     ------
-    MissingFileError, InputError
-        if the file is missing, cannot be read or has no triangles, or if it takes Blender to read it and there is none.
+    MissingFileError or InputError
+        If the file is missing, cannot be read or has no triangles, or if it takes Blender to read it and there is none.
     BlenderError
-        if Blender crashes over it.
+        If Blender crashes over it.
     """
     tree = TreeFile.open(tree)
     if tree.suffix not in _MESH_SUFFIXES:

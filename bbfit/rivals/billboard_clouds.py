@@ -77,13 +77,16 @@ def billboard_cloud(
     """Choose planes for a tree's triangles and bake onto each all that lies within epsilon of it.
 
     A rectangle bounds the triangles of its plane. It shows everything within epsilon, including parts of triangles that are not valid; the
-    inside of stems that are cut open takes the bark's color. For everything else see :func:`~bbfit.rivals.baking.bake`.
+    inside of stems that are cut open takes the bark's color. For everything else see ``bake``.
 
     Parameters
     ----------
-    count : N >= 1 billboards at most.
-    share : of the tree's area that the planes must hold, in (0, 1].
-    samples : triangles on which planes are chosen, sampled by area with the seed ``config.views.seed``; all triangles if there are fewer.
+    count
+        N >= 1 billboards at most.
+    share
+        Of the tree's area that the planes must hold, in (0, 1].
+    samples
+        Triangles on which planes are chosen, sampled by area with the seed ``config.views.seed``; all triangles if there are fewer.
     """
     check_count("samples", samples)
     triangles = tree_triangles(tree)
@@ -100,15 +103,19 @@ def choose_planes(triangles: Array, count: int, *, areas: Array | None = None, s
 
     Parameters
     ----------
-    triangles : corners, [T, 3, 3] in meters.
-    count : N >= 1.
-    areas : weight of each triangle, [T]; its area when left out.
-    share : in (0, 1].
+    triangles
+        Corners, [T, 3, 3] in meters.
+    count
+        N >= 1.
+    areas
+        Weight of each triangle, [T]; its area when left out.
+    share
+        In (0, 1].
 
     Raises
     ------
     InputError
-        if there are no triangles, or all have zero area.
+        If there are no triangles, or all have zero area.
     """
     check_count("billboards", count)
     check_range("share", share, 0, 1, open_low=True)

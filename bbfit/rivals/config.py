@@ -1,10 +1,10 @@
-"""The systems that ``bbfit compare`` runs on a tree."""
+"""The options of a comparison."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bbfit.checks import check_choice, check_count
+from bbfit.checks import Count, check_choice, check_fields
 
 SYSTEMS = (
     "bbfit",
@@ -28,29 +28,28 @@ SYSTEMS = (
 
 @dataclass(frozen=True)
 class CompareConfig:
-    """Systems to compare, and their sizes."""
+    """Which systems are compared, and how large each is."""
 
     systems: tuple[str, ...] = ()
-    """Names of the systems; all if left out. Systems whose package is not installed are skipped and reported."""
-    billboards: int = 8
-    """Planes of bbfit's smaller fits and of the smaller billboard cloud."""
-    many: int = 32
-    """Planes of the larger fit and of the larger billboard cloud."""
-    crossed: int = 4
+    """Names of the systems. Default: all of them. The table names those that are skipped because a package is not installed."""
+    billboards: Count = 8
+    """Billboards of bbfit's smaller fits, and planes of the smaller billboard cloud."""
+    many: Count = 32
+    """Billboards of bbfit's larger fit, and planes of the larger billboard cloud."""
+    crossed: Count = 4
     """Number of crossed planes."""
-    directions: int = 6
-    """Number of slicings."""
-    slices: int = 5
-    """Slices per slicing."""
-    mesh_vertices: int = 500
+    directions: Count = 6
+    """Number of slicing directions."""
+    slices: Count = 5
+    """Slices per direction."""
+    mesh_vertices: Count = 500
     """Vertices of the smaller learned mesh."""
-    mesh_vertices_many: int = 2000
+    mesh_vertices_many: Count = 2000
     """Vertices of the larger learned mesh."""
-    mesh_steps: int = 600
-    """Optimization steps of a learned mesh."""
+    mesh_steps: Count = 600
+    """Optimizer steps of a learned mesh."""
 
     def __post_init__(self) -> None:
         for system in self.systems:
             check_choice("systems", system, SYSTEMS)
-        for name in ("billboards", "many", "crossed", "directions", "slices", "mesh_vertices", "mesh_vertices_many", "mesh_steps"):
-            check_count(name, getattr(self, name))
+        check_fields(self)

@@ -35,11 +35,12 @@ def crossed_planes(
     """N upright billboards at k·180°/N degrees through the tree's axis, each showing all of the tree in parallel projection.
 
     The axis is the one that the views' cameras circle (``config.views.axis``). Billboard 0 faces the first view. Rectangles are cropped to
-    their visible part. For everything else see :func:`~bbfit.rivals.baking.bake`.
+    their visible part. For everything else see ``bake``.
 
     Parameters
     ----------
-    count : N >= 1.
+    count
+        N >= 1.
     """
     check_count("billboards", count)
     points = tree_triangles(tree).reshape(-1, 3)
@@ -57,9 +58,12 @@ def upright_slabs(points: NDArray[np.floating], axis: Tensor, azimuth_degrees: f
 
     Parameters
     ----------
-    points : [P, 3] in meters.
-    axis : [3] origin of the azimuths; it only decides which side is the front.
-    azimuth_degrees : direction of the normal: 0 is +Z, 90 is +X, as in :class:`~bbfit.geometry.orbit.Orbit`.
+    points
+        [P, 3] in meters.
+    axis
+        [3] origin of the azimuths; it only decides which side is the front.
+    azimuth_degrees
+        Direction of the normal: 0 is +Z, 90 is +X, as in ``Orbit``.
     """
     angle = math.radians(azimuth_degrees)
     right, up, normal = (

@@ -59,15 +59,18 @@ def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: 
 
     Parameters
     ----------
-    tree : .glb, .gltf or .obj.
-    vertices : at least 4.
-    size : bytes, textures and materials included.
+    tree
+        .glb, .gltf or .obj.
+    vertices
+        At least 4.
+    size
+        bytes, textures and materials included.
 
     Raises
     ------
-    MissingFileError, InputError
-        if the file cannot be used, the package fast-simplification is missing, both limits or neither are
-        given, or the limit cannot be reached.
+    MissingFileError or InputError
+        If the file cannot be used, the package fast-simplification is missing, both limits or neither are given, or the limit cannot be
+        reached.
     """
     if (vertices is None) == (size is None):
         fail("decimate", "expected either vertices or a size", "give one of them")

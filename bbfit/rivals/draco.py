@@ -30,14 +30,16 @@ def draco_size(tree: str | Path | TreeFile, *, position_bits: int = 14) -> Draco
 
     Parameters
     ----------
-    tree : .glb, .gltf or .obj.
-    position_bits : bits for each coordinate of a position, of 1 to 30; texture coordinates take 12 and normals 10, as in Draco's own
-        encoder, whose highest level of compression is used.
+    tree
+        .glb, .gltf or .obj.
+    position_bits
+        Bits for each coordinate of a position, of 1 to 30; texture coordinates take 12 and normals 10, as in Draco's own encoder, whose
+        highest level of compression is used.
 
     Raises
     ------
-    MissingFileError, InputError
-        if the file cannot be used or the package DracoPy is missing.
+    MissingFileError or InputError
+        If the file cannot be used or the package DracoPy is missing.
     """
     check_range("position_bits", position_bits, 1, 30)
     try:

@@ -2,8 +2,8 @@
 
 In the spirit of "Appearance-Driven Automatic 3D Model Simplification" (Hasselgren et al. 2021, with opacity in the texture, as for its
 foliage) and "Extracting Triangular 3D Models, Materials, and Lighting From Images" (Munkberg et al. 2022), without their
-normal maps, materials and lights: the texture is shown as it is. The start is the visual hull (:mod:`bbfit.rivals.mesh_hull`), not a
-tetrahedral grid, and the renderer a ray caster on the CPU (:mod:`bbfit.rivals.mesh_rays`), not a rasterizer on a GPU.
+normal maps, materials and lights: the texture is shown as it is. The start is the visual hull (``mesh_hull``), not a
+tetrahedral grid, and the renderer a ray caster on the CPU (``mesh_rays``), not a rasterizer on a GPU.
 """
 
 from __future__ import annotations
@@ -63,12 +63,13 @@ class LearnedMesh:
 
         Returns
         -------
-        Premultiplied RGBA in [0, 1], float32 [H, W, 4].
+        Tensor
+            Premultiplied RGBA in [0, 1], float32 [H, W, 4].
 
         Raises
         ------
         InputError
-            if the camera is a batch, or Mitsuba or LLVM is missing.
+            If the camera is a batch, or Mitsuba or LLVM is missing.
         """
         if camera.batched:
             fail("camera", "expected one camera, got a batch", "draw its cameras one by one")
@@ -89,19 +90,23 @@ def learn_mesh(
     seed: int = 0,
     on_step: Callable[[int, float], None] | None = None,
 ) -> LearnedMesh:
-    """Learn a mesh and its texture from views of a tree: visual hull, texture coordinates, then :func:`refine_mesh`.
+    """Learn a mesh and its texture from views of a tree: visual hull, texture coordinates, then ``refine_mesh``.
 
     Parameters
     ----------
-    views : training views, from around the tree.
-    vertices : upper bound on the vertices of the result, which comes close to it; vertices on seams count once for each side, as in a file.
-    texels : width and height of the texture.
-    steps, size, seed, on_step : see :func:`refine_mesh`.
+    views
+        Training views, from around the tree.
+    vertices
+        Upper bound on the vertices of the result, which comes close to it; vertices on seams count once for each side, as in a file.
+    texels
+        Width and height of the texture.
+    steps, size, seed, on_step
+        See ``refine_mesh``.
 
     Raises
     ------
     InputError
-        if an argument is out of range, the views share no common silhouette, or Mitsuba, LLVM or fast-simplification is missing.
+        If an argument is out of range, the views share no common silhouette, or Mitsuba, LLVM or fast-simplification is missing.
     """
     check_count("vertices", vertices, 20)
     check_count("texels", texels, 16)
@@ -152,17 +157,23 @@ def refine_mesh(
 
     Parameters
     ----------
-    start : the mesh to begin with.
-    views : training views.
-    steps : views drawn; the first half of them at half of the size.
-    size : larger side of the pictures drawn, in pixels; the views' own at most.
-    seed : chooses the order of the views and the places of the samples.
-    on_step : called after each step with the number of steps done and the step's loss.
+    start
+        The mesh to begin with.
+    views
+        Training views.
+    steps
+        Views drawn; the first half of them at half of the size.
+    size
+        Larger side of the pictures drawn, in pixels; the views' own at most.
+    seed
+        Chooses the order of the views and the places of the samples.
+    on_step
+        Called after each step with the number of steps done and the step's loss.
 
     Raises
     ------
     InputError
-        if an argument is out of range, or Mitsuba or LLVM is missing.
+        If an argument is out of range, or Mitsuba or LLVM is missing.
     """
     _check_plan(steps, size, seed)
     threads = torch.get_num_threads()

@@ -28,12 +28,13 @@ def hull_surface(views: ViewSet) -> tuple[NDArray[np.float64], NDArray[np.int64]
 
     Returns
     -------
-    Vertices in meters [P, 3] and triangles [F, 3] of a closed surface, counter-clockwise from outside (Lorensen and Cline 1987).
+    tuple[NDArray[np.float64], NDArray[np.int64]]
+        Vertices in meters [P, 3] and triangles [F, 3] of a closed surface, counter-clockwise from outside (Lorensen and Cline 1987).
 
     Raises
     ------
     InputError
-        if no point lies inside the silhouettes of all views.
+        If no point lies inside the silhouettes of all views.
     """
     center, half = _reach(views.cameras)
     low, high = center - half, center + half

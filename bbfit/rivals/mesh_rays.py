@@ -33,13 +33,17 @@ def pixel_rays(camera: Camera, places: Tensor, grid: int) -> tuple[Tensor, Tenso
 
     Parameters
     ----------
-    camera : one camera.
-    places : where in its cell each ray passes, in [0, 1], [H·W·grid², 2] (right, down): pixel by pixel, in it row by row.
-    grid : cells along a pixel's side.
+    camera
+        One camera.
+    places
+        Where in its cell each ray passes, in [0, 1], [H·W·grid², 2] (right, down): pixel by pixel, in it row by row.
+    grid
+        Cells along a pixel's side.
 
     Returns
     -------
-    Origins in meters and unit directions, float32 [H·W·grid², 3] each.
+    tuple[Tensor, Tensor]
+        Origins in meters and unit directions, float32 [H·W·grid², 3] each.
     """
     rows, columns = torch.arange(camera.height * grid), torch.arange(camera.width * grid)
     y, x = torch.meshgrid(rows, columns, indexing="ij")
@@ -78,7 +82,7 @@ class RayCaster:
     """A mesh of fixed triangles and texture coordinates whose vertices can move."""
 
     def __init__(self, faces: Tensor, uvs: Tensor) -> None:
-        """Take triangles, int64 [F, 3], and texture coordinates, [P, 2]; :meth:`move` gives it vertices."""
+        """Take triangles, int64 [F, 3], and texture coordinates, [P, 2]; ``move`` gives it vertices."""
         mi, _ = _libraries()
         mesh = mi.Mesh("mesh", len(uvs), len(faces))
         self._faces, self._uvs = mi.UInt32(_flat(faces, np.uint32)), mi.Float(_flat(uvs))
@@ -102,8 +106,10 @@ class RayCaster:
 
         Parameters
         ----------
-        origins, directions : [S, 3], directions of unit length.
-        texture : straight RGBA in [0, 1], [h, w, 4].
+        origins, directions
+            [S, 3], directions of unit length.
+        texture
+            Straight RGBA in [0, 1], [h, w, 4].
         """
         mi, dr = _libraries()
         seen = self._trace(_points(origins), _points(directions), self._vertices, mi.TensorXf(_array(texture)), attached=False)
@@ -117,13 +123,16 @@ class RayCaster:
 
         Parameters
         ----------
-        origins, directions, texture : as :meth:`colors`, S = pixels · ``samples``.
-        loss : from the pixels, [S / ``samples``, 4], to its derivative by them.
+        origins, directions, texture
+            As ``colors``, S = pixels · ``samples``.
+        loss
+            From the pixels, [S / ``samples``, 4], to its derivative by them.
 
         Returns
         -------
-        The derivative by the pixels, [S / ``samples``, 4], by the vertices, [P, 3], with fixed silhouettes, and by the texture,
-        [h, w, 4].
+        tuple[Tensor, Tensor, Tensor]
+            The derivative by the pixels, [S / ``samples``, 4], by the vertices, [P, 3], with fixed silhouettes, and by the texture, [h, w,
+            4].
         """
         mi, dr = _libraries()
         vertices, texels = mi.Float(self._vertices), mi.TensorXf(_array(texture))

@@ -84,16 +84,23 @@ def boundary_gradient(
 
     Parameters
     ----------
-    surface, points : the mesh and its points, [points, 3].
-    camera : one camera.
-    slope : derivative of the loss by the premultiplied RGBA of each pixel, [H·W, 4].
-    colors : what rays of given origins and directions see, premultiplied RGBA: :meth:`bbfit.rivals.mesh_rays.RayCaster.colors`.
-    random : chooses the samples.
-    density : samples per pixel of the view.
+    surface, points
+        The mesh and its points, [points, 3].
+    camera
+        One camera.
+    slope
+        Derivative of the loss by the premultiplied RGBA of each pixel, [H·W, 4].
+    colors
+        What rays of given origins and directions see, premultiplied RGBA: ``colors``.
+    random
+        Chooses the samples.
+    density
+        Samples per pixel of the view.
 
     Returns
     -------
-    The gradient by the points, [points, 3].
+    Tensor
+        The gradient by the points, [points, 3].
     """
     points = points.detach().requires_grad_()
     ends = camera.project(points.double())[surface.silhouette(points.detach(), camera)]  # [K, 2, 2]

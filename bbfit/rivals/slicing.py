@@ -69,7 +69,8 @@ class Slicings:
 
         Returns
         -------
-        Premultiplied RGBA, [V, H, W, 4] ([H, W, 4] for a single camera).
+        Tensor
+            Premultiplied RGBA, [V, H, W, 4] ([H, W, 4] for a single camera).
         """
         if camera.batched:
             return torch.stack([self.draw(camera[index]) for index in range(len(camera))])
@@ -89,12 +90,14 @@ def slicing(
     """Slice a tree along evenly spaced directions.
 
     Empty slices are left out. With ``config.two_sided`` slices have back textures, unlike in the paper. For everything else see
-    :func:`~bbfit.rivals.baking.bake`.
+    ``bake``.
 
     Parameters
     ----------
-    directions : number of slicings, at least 1, at equal angles over 180 degrees.
-    slices : slices per slicing, at least 1.
+    directions
+        Number of slicings, at least 1, at equal angles over 180 degrees.
+    slices
+        Slices per slicing, at least 1.
     """
     check_count("directions", directions)
     check_count("slices", slices)

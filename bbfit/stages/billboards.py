@@ -13,7 +13,7 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
 from bbfit.files import read_json, write_bytes, write_json
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.loop import Step, fit, fit_inputs
 from bbfit.reporting.plots import Cost, loss_plot, pareto_plot
 from bbfit.stages.stage import OnProgress, Stage
@@ -49,10 +49,10 @@ def budget_stage(
     return stage
 
 
-def read_choice(folder: Path) -> tuple[FitConfig, bool]:
+def read_choice(folder: Path) -> tuple[ResolvedFit, bool]:
     """The configuration that a finished budget stage chose, and whether it reached the target PSNR (true without a target)."""
     content = read_json("budget", folder / "pareto.json")
-    return FitConfig(**content["config"]), content["met"]
+    return ResolvedFit(**content["config"]), content["met"]
 
 
 def fit_stage(

@@ -84,14 +84,14 @@ def report_stage(
     facts
         The fields of :class:`~bbfit.reporting.html.RunFacts` that come from the record of the run.
     """
-    pareto = folder / "pareto.png" if any(facts["asked"].get("budget", {}).values()) else None
+    pareto = folder / "pareto.png" if any(facts["options"].get("budget", {}).values()) else None
 
     def work(on_progress: OnProgress) -> None:
         on_progress("report", 0, 1)
         losses = [float(row["loss"]) for row in csv.DictReader((folder / "loss.csv").read_text().splitlines())]
         picture = pareto.read_bytes() if pareto else None
         readable = replace(model.config, textures="webp", fallback=False, mip_files=False)  # browsers read WebP
-        known = RunFacts(**facts, losses=losses, pareto=picture, cut_up=bool(model.config.split))
+        known = RunFacts(**facts, losses=losses, pareto=picture)
         page = report_page(report, model, views.test, known, glb_bytes(model.cards, readable))
         write_bytes(folder / "report.html", page.encode())
         on_progress("report", 1, 1)

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from bbfit.checks import InputError, check_file, fail
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.sweep.config import SweepConfig
 
 VARIANT = "variant"
@@ -26,8 +26,8 @@ class Cell:
 
     labels: Mapping[str, str]
     """The variant, if the grid has any, and a value for each axis. No two cells have the same labels."""
-    config: FitConfig
-    """The resolved configuration."""
+    config: ResolvedFit
+    """The configuration."""
 
 
 @dataclass(frozen=True)

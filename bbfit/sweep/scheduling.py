@@ -101,7 +101,7 @@ def run_sweep(
     if stages.budget.given:
         fail("budget", "a sweep runs the configurations of its grid", "omit the budget")
     grid = Grid.load(config.grid).narrowed(config)
-    cells = grid.cells(stages.fit if config.steps is None else replace(stages.fit, steps=config.steps))
+    cells = grid.cells(stages.fit)
     all_sources = sources(species if species or trees or views else grid.trees, trees, views, stages.grow.species_file)
     sweep = _Sweep(output_folder("out", out), all_sources, cells, config, stages)
     workers: Workers = LocalWorkers(config.workers, config.retries) if config.ray is None else RayWorkers(config)
@@ -258,7 +258,8 @@ class _Sweep:
         self._waiting[key].append((source, number))
         if len(self._waiting[key]) > 1:
             return
-        inputs = {"views": (tree.views.folder,)} | ({"tree": tree.mesh.files} if fit.placement == "clusters" and tree.mesh else {})
+        folder = source.views or self._folder_of(source) / "views"
+        inputs = {"views": (folder,)} | ({"tree": tree.mesh.files} if fit.placement == "clusters" and tree.mesh else {})
         self._pending[key] = _PendingResult(key, identity(request))
         workers.submit(Task(key, fit_tree, inputs, self._folder / "runs" / key, (RunConfig(fit=fit, export=export),)))
 
@@ -273,7 +274,7 @@ class _Sweep:
             SweepRow(
                 tree=source.name,
                 labels=cell.labels,
-                steps=cell.config.steps or 0,
+                steps=cell.config.steps,
                 facts=outcome.facts,
                 reason=outcome.reason,
                 seconds=outcome.seconds,

@@ -23,25 +23,31 @@ def grow(
     leaves: float = 1.0,
     max_vertices: int = VERTEX_LIMIT,
 ) -> trimesh.Scene:
-    """Grow a tree after Weber and Penn 1995 (:mod:`bbfit.trees.weber_penn`); the same arguments give the same tree.
+    """Grow a tree after Weber and Penn 1995 (``weber_penn``); the same arguments give the same tree.
 
     Parameters
     ----------
-    species : a name from :func:`~bbfit.trees.species.known_species`, or the result of :func:`~bbfit.trees.species.load_species`.
-    seed : at least 0; another seed gives another tree of the same species.
-    detail : factor on the rings along stems and on the corners of each ring, in [0.1, 10]; it changes neither the stems nor the leaves.
-    leaves : share of the leaves that grow, in [0, 1]; they are enlarged to keep the total area.
-    max_vertices : largest number of vertices.
+    species
+        A name from ``known_species``, or the result of ``load_species``.
+    seed
+        At least 0; another seed gives another tree of the same species.
+    detail
+        Factor on the rings along stems and on the corners of each ring, in [0.1, 10]; it changes neither the stems nor the leaves.
+    leaves
+        Share of the leaves that grow, in [0, 1]; they are enlarged to keep the total area.
+    max_vertices
+        Largest number of vertices.
 
     Returns
     -------
-    One mesh for the bark and one for each leaf tone, with unit normals, texture coordinates and plain materials. Y is up, lengths are
-    in meters, and the foot of the trunk is at the origin. Leaf materials are double-sided.
+    trimesh.Scene
+        One mesh for the bark and one for each leaf tone, with unit normals, texture coordinates and plain materials. Y is up, lengths are
+        in meters, and the foot of the trunk is at the origin. Leaf materials are double-sided.
 
     Raises
     ------
     InputError
-        for an unknown species, a value out of range, or a tree of too many vertices.
+        For an unknown species, a value out of range, or a tree of too many vertices.
     """
     config = GrowConfig(seed=seed, detail=detail, leaves=leaves, max_vertices=max_vertices)
     figures = load_species(species) if isinstance(species, str) else species

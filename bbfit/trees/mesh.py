@@ -48,7 +48,7 @@ class _Lines:
 
 
 def count_vertices(skeleton: Skeleton, detail: float) -> int:
-    """Number of vertices that :func:`tree_parts` returns."""
+    """Number of vertices that ``tree_parts`` returns."""
     total = leaf_vertices(skeleton.species, len(skeleton.leaves.parent))
     for stems in skeleton.levels:
         for node, alike in enumerate(np.bincount(stems.first).tolist()):
@@ -71,8 +71,10 @@ def tree_parts(skeleton: Skeleton, seed: int, *, detail: float) -> list[Part]:
 
     Parameters
     ----------
-    seed : for the leaf tones.
-    detail : factor on the rings of a stem and the corners of a ring, more than 0.
+    seed
+        For the leaf tones.
+    detail
+        Factor on the rings of a stem and the corners of a ring, more than 0.
     """
     lines: list[_Lines] = []
     bark = _Bark()

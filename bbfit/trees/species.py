@@ -36,7 +36,7 @@ class Species:
     Raises
     ------
     InputError
-        for a value out of its range, or of the wrong type; the message starts with the file's key.
+        For a value out of its range, or of the wrong type; the message starts with the file's key.
     """
 
     name: str
@@ -205,7 +205,7 @@ _MOST_COLORS = 16
 
 
 def figure_keys() -> dict[str, Field[Any]]:
-    """Map each key of a species file to its field of :class:`Species`, in the order of the fields."""
+    """Map each key of a species file to its field of ``Species``, in the order of the fields."""
     keys = {}
     for field in fields(Species):
         if field.name != "name":
@@ -269,8 +269,8 @@ def load_species(name: str | None, path: str | Path | None = None) -> Species:
     Raises
     ------
     InputError
-        if the name is unknown; if the file is missing, empty, not JSON or of another format; if parameters are missing, unknown or
-        invalid, which the message names.
+        If the name is unknown; if the file is missing, empty, not JSON or of another format; if parameters are missing, unknown or invalid,
+        which the message names.
     """
     if name is not None and not isinstance(name, str):
         raise InputTypeError(f"species: expected a name, got {name!r}")

@@ -70,15 +70,16 @@ def write_tree(scene: trimesh.Scene, path: str | Path) -> list[Path]:
 
     Returns
     -------
-    The files written, the model first.
+    list[Path]
+        The files written, the model first.
 
     Raises
     ------
     InputError
-        if the path has another ending; if the scene has no triangles, a geometry without texture coordinates or PBR material, or is too
+        If the path has another ending; if the scene has no triangles, a geometry without texture coordinates or PBR material, or is too
         large for a GLB; if the disk is full or the folder cannot be written to. No partial file is left.
     MissingFileError
-        if the folder does not exist.
+        If the folder does not exist.
     """
     path = check_model_path("tree", path)
     _check(scene)

@@ -82,9 +82,12 @@ def grow_skeleton(species: Species, seed: int, count: Count, *, leaves: float = 
 
     Parameters
     ----------
-    seed : any whole number of at least 0.
-    count : called before memory for a level's stems, or for the leaves, is allocated.
-    leaves : section 4.5's quality: share of the leaves that grow, 0 to 1; they are enlarged to keep the total area.
+    seed
+        Any whole number of at least 0.
+    count
+        Called before memory for a level's stems, or for the leaves, is allocated.
+    leaves
+        Section 4.5's quality: share of the leaves that grow, 0 to 1; they are enlarged to keep the total area.
     """
     levels: list[Stems] = []
     for level in range(species.levels):

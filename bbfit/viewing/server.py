@@ -77,7 +77,7 @@ class Viewer:
         self._slots = threading.BoundedSemaphore(_MAX_CONNECTIONS)
         self._measuring: threading.Thread | None = None
         self._host = host
-        self._server = listen(host, port, partial(_Server, partial(_Handler, self)))
+        self._server = listen(host, port, partial(_Server, self))
         self.port: int = self._server.server_address[1]
         """The port that it listens on."""
         self.url = f"http://{'127.0.0.1' if host in ('', '0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{self.port}"
@@ -217,10 +217,15 @@ def view(run: str | Path, *, host: str = "127.0.0.1", port: int = 8080, original
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
+    request_queue_size = _MAX_CONNECTIONS
 
-    def __init__(self, handler: Any, address: tuple[str, int], family: socket.AddressFamily) -> None:
-        self.address_family = family
-        super().__init__(address, handler)
+    def __init__(self, viewer: Viewer, address: tuple[str, int], family: socket.AddressFamily) -> None:
+        self.address_family, self._viewer = family, viewer
+        super().__init__(address, partial(_Handler, viewer))
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        """Close connections beyond the limit at once."""
+        return self._viewer.enter()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that goes away is no error."""
@@ -233,14 +238,10 @@ class _Handler(BaseHTTPRequestHandler):
 
     def __init__(self, viewer: Viewer, *arguments: Any) -> None:
         self._viewer = viewer
-        super().__init__(*arguments)
-
-    def handle(self) -> None:
-        if self._viewer.enter():
-            try:
-                super().handle()
-            finally:
-                self._viewer.leave()
+        try:
+            super().__init__(*arguments)
+        finally:
+            viewer.leave()
 
     def do_GET(self) -> None:
         host = self.headers.get_all("Host", [])

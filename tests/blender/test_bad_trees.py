@@ -238,7 +238,7 @@ def test_unusable_panorama_and_device(thing_glb: Path, tmp_path: Path) -> None:
     tree.write_bytes(thing_glb.read_bytes())
     refused(tree, r"hdri: .*sky\.hdr cannot be read; give an \.hdr or \.exr file", ViewsConfig(**SMALL, hdri=tmp_path / "sky.hdr"))
     refused(tree, "hdri: .*none.hdr does not exist", ViewsConfig(**SMALL, hdri=tmp_path / "none.hdr"))
-    refused(tree, "device: this Blender does not support metal; choose another device, or cpu", ViewsConfig(**SMALL, device="metal"))
+    refused(tree, "device: this Blender does not support metal; choose another device, or cpu", ViewsConfig(**SMALL, render_device="metal"))
 
 
 def test_without_blender(thing_glb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,8 +267,8 @@ def test_importing_loads_no_blender() -> None:
         ({"samples": 0}, "samples: expected at least 1"),
         ({"sun_strength": -1.0}, "sun_strength: expected"),
         ({"ambient_strength": float("nan")}, "ambient_strength: expected"),
-        ({"device": "gpu"}, "device: expected one of cpu, cuda"),
-        ({"workers": 0}, "workers: expected at least 1"),
+        ({"render_device": "gpu"}, "render_device: expected one of cpu, cuda"),
+        ({"render_workers": 0}, "render_workers: expected at least 1"),
         ({"seed": -1}, "seed: expected at least 0"),
         ({"axis": "trunk"}, "axis: expected one of auto, origin, center"),
     ],

@@ -76,7 +76,7 @@ def test_whole_frame_is_used(unbroken: Path) -> None:
 @pytest.mark.parametrize("ending", FORMATS)
 def test_every_format_gives_the_same_pictures(things: Path, unbroken: Path, tmp_path: Path, ending: str) -> None:
     """Silhouettes agree to 2/255; colors, where the format has them, to 3/255; a .blend's light, world and scripts have no effect."""
-    out = render_views(things / f"thing{ending}", tmp_path / "views", ViewsConfig(**SMALL | {"workers": 1}))
+    out = render_views(things / f"thing{ending}", tmp_path / "views", ViewsConfig(**SMALL | {"render_workers": 1}))
     got, expected = pictures(out), pictures(unbroken)
     assert abs(got[..., 3] - expected[..., 3]).max() <= 2
     tree = read_json("views", out / "views.json")["tree"]

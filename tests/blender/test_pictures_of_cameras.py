@@ -105,7 +105,7 @@ def test_finished_pictures_are_kept_and_missing_or_damaged_ones_rendered(
     paths[0].unlink()
     paths[2].write_bytes(paths[2].read_bytes()[:-20])
     told.clear()
-    again = replace(CONFIG, workers=2)  # and those settings that pictures do not depend on
+    again = replace(CONFIG, render_workers=2)  # and those settings that pictures do not depend on
     assert render_pictures(thing_glb, front(3), tmp_path, again, on_progress=lambda *at: told.append(at)) == paths
     assert told == [(1, 3), (2, 3), (3, 3)]
     for path, (_, picture) in zip(paths, before, strict=True):

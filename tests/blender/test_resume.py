@@ -118,9 +118,9 @@ def test_finished_folder_needs_no_blender(thing_glb: Path, unbroken: Path) -> No
 
 
 def test_two_workers_make_no_difference(thing_glb: Path, unbroken: Path, tmp_path: Path) -> None:
-    out = render_views(thing_glb, tmp_path / "views", ViewsConfig(**SMALL | {"workers": 2}))
+    out = render_views(thing_glb, tmp_path / "views", ViewsConfig(**SMALL | {"render_workers": 2}))
     assert_same_pictures(out, unbroken)
-    render_views(thing_glb, out, ViewsConfig(**SMALL | {"workers": 3, "device": "cuda"}))  # all stands, so none is asked for
+    render_views(thing_glb, out, ViewsConfig(**SMALL | {"render_workers": 3, "render_device": "cuda"}))  # all stands, so none is asked for
 
 
 @pytest.mark.parametrize(

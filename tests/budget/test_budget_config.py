@@ -69,7 +69,7 @@ def test_amounts_that_cannot_be(name: str, written: int | str, says: str) -> Non
         ({"target_psnr": 100.5}, "target_psnr: .*got 100.5"),
         ({"target_psnr": float("nan")}, "target_psnr: .*got nan"),
         ({"target_psnr": float("inf")}, "target_psnr: .*got inf"),
-        ({"target_psnr": 30.0, "auto": True}, "auto: .*target PSNR both say when to stop; leave one of them out"),
+        ({"target_psnr": 30.0, "auto": True}, "auto: .*target PSNR both decide when to stop; leave one of them out"),
     ],
 )
 def test_limits_that_cannot_be(fields: dict[str, object], says: str) -> None:

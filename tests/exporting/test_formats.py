@@ -143,13 +143,13 @@ def test_ktx2_is_shipped_where_it_can_be(crossed: BillboardCloud, tmp_path: Path
     """Without its encoder the file is what it would be in PNG, and the configuration tells what to install."""
     config = ExportConfig(textures="auto")
     (path,) = export(crossed, tmp_path / "model.glb", config)
-    assert "KHR_texture_basisu" in tree_of(path)[0]["extensionsUsed"] and config.missed is None
+    assert "KHR_texture_basisu" in tree_of(path)[0]["extensionsUsed"] and config.missing_encoder is None
     (png,) = export(crossed, tmp_path / "png.glb", replace(config, textures="png"))
     monkeypatch.setitem(sys.modules, "alktx2", None)
     (without,) = export(crossed, tmp_path / "without.glb", config)
     assert without.read_bytes() == png.read_bytes()
-    assert config.missed is not None and "bbfit[ktx2]" in config.missed
-    assert ExportConfig().missed is None
+    assert config.missing_encoder is not None and "bbfit[ktx2]" in config.missing_encoder
+    assert ExportConfig().missing_encoder is None
 
 
 def test_a_glb_taken_apart_and_joined_is_the_same(crossed: BillboardCloud, tmp_path: Path) -> None:

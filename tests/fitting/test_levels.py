@@ -26,9 +26,7 @@ def viewset(pictures: Tensor, cameras: Camera | None = None) -> ViewSet:
     if cameras is None:
         pose, intrinsics = torch.eye(4, dtype=torch.float64), pinhole_intrinsics(40, width, height)
         cameras = Camera(pose.repeat(views, 1, 1), intrinsics.repeat(views, 1, 1), width, height)
-    paths = tuple(Path(str(index)) for index in range(views))
-    cache = type("Pictures", (), {"get": lambda self, path: pictures[int(path.name)]})()
-    return ViewSet(paths, cameras, cache)
+    return ViewSet.from_arrays(pictures, cameras)
 
 
 def noise(views: int, height: int, width: int) -> Tensor:

@@ -36,8 +36,7 @@ DATA = Path(__file__).resolve().parents[2] / "data"
 
 def viewset(pictures: Tensor, cameras: Camera) -> ViewSet:
     """Views that lie in memory, uint8 [V, H, W, 4], straight alpha."""
-    cache = type("Pictures", (), {"get": lambda self, path: pictures[int(path.name)]})()
-    return ViewSet(tuple(Path(str(index)) for index in range(len(pictures))), cameras, cache)
+    return ViewSet.from_arrays(pictures, cameras)
 
 
 def ring_around_origin(count: int, width: int, height: int, *, elevation: float = 0.0) -> Camera:

@@ -14,8 +14,7 @@ from torch import Tensor
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
-from bbfit.operators.drawing import fused
-from bbfit.operators.drawing.fused import differentiate, render_fused
+from bbfit.operators.drawing.fused import differentiate, render_fused, render_projection
 from bbfit.operators.drawing.projection import Projection, project
 from bbfit.operators.drawing.reference import render_reference
 from bbfit.operators.image_loss.fused import PixelLoss
@@ -57,10 +56,15 @@ def error(ours: Tensor, exact: Tensor) -> float:
     return float((ours - exact).norm() / exact.norm())
 
 
-def errors(cloud: BillboardCloud, camera: Camera) -> dict[str, float]:
+def launched(**launch: int) -> Callable[[BillboardCloud, Camera], Tensor]:
+    """The fused renderer with another way of launching its kernels, by fields of the projection."""
+    return lambda cloud, camera: render_projection(cloud.texels, replace(project(cloud, camera), **launch))
+
+
+def errors(cloud: BillboardCloud, camera: Camera, renderer: Callable[[BillboardCloud, Camera], Tensor] = render_fused) -> dict[str, float]:
     """Relative L2 of the picture and of every gradient, none above ALLOWED."""
     exact = drawn(render_reference, cloud.to(torch.float64), camera)
-    ours = drawn(render_fused, cloud.to(torch.float32), camera)
+    ours = drawn(renderer, cloud.to(torch.float32), camera)
     assert ours["image"].shape == exact["image"].shape and ours["image"].dtype == torch.float32
     found = {name: error(ours[name], exact[name]) for name in NAMES}
     assert max(found.values()) <= ALLOWED, found
@@ -232,17 +236,17 @@ def test_the_same_bytes_with_any_number_of_threads() -> None:
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("seed", range(3))
-def test_bands_of_rows_lose_nothing(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bands_of_rows_lose_nothing(seed: int) -> None:
     """Pictures cut as finely as their planes allow, on four threads: no addition to a texel of two bands is lost."""
-    monkeypatch.setattr(fused, "LEAST_PIXELS", 1)
     torch.set_num_threads(4)
     cloud, _ = random_scene(seed, 3, orthographic=False)
     corners = 2 * CORNERS
     camera = Orbit(5, (30.0,)).frame(corners, target=torch.zeros(3).double(), width=45, height=150, fov_x_degrees=None if seed == 1 else 40)
     assert (project(cloud, camera).rows_apart < 35).any()
-    results = [drawn(render_fused, cloud.to(torch.float32), camera) for _ in range(3)]
+    finely = launched(least_pixels=1)
+    results = [drawn(finely, cloud.to(torch.float32), camera) for _ in range(3)]
     assert all(torch.equal(results[0][name], other[name]) for other in results[1:] for name in NAMES)
-    errors(cloud, camera)
+    errors(cloud, camera, finely)
 
 
 def test_the_gradient_in_the_placement_costs_the_texels_nothing() -> None:
@@ -343,10 +347,8 @@ def test_auto_takes_the_reference_for_float64_and_the_kernels_otherwise() -> Non
 
 
 @pytest.mark.parametrize("count", [1, 3, 17])
-def test_a_thread_a_pixel_gives_the_same(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thread_a_pixel_gives_the_same(count: int) -> None:
     """The launch that a GPU gets, on the CPU: what differs between the two is then only the compiler and atomic addition."""
-    monkeypatch.setattr(fused, "_lanes", lambda device: 1)
-    monkeypatch.setattr(fused, "_run", lambda projection, device: 1)
     for seed in range(5):
         for orthographic in (False, True):
-            assert max(errors(*random_scene(seed, count, orthographic=orthographic)).values()) < ALLOWED
+            assert max(errors(*random_scene(seed, count, orthographic=orthographic), launched(lanes=1)).values()) < ALLOWED

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, replace
 from itertools import pairwise
 
@@ -14,8 +13,7 @@ from torch import Tensor
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.orbit import Orbit
-from bbfit.operators.drawing import fused
-from bbfit.operators.drawing.fused import differentiate
+from bbfit.operators.drawing.fused import schedule
 from bbfit.operators.drawing.projection import Projection, project
 
 
@@ -161,52 +159,27 @@ Pieces = list[tuple[int, int, int, int]]
 """A view, how many, and a band of rows, each."""
 
 
-@pytest.fixture
-def phases(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Pieces]]:
-    """The pieces that were launched at once, in order; two threads."""
-    recorded: list[Pieces] = []
-    original, before = fused.in_parallel, torch.get_num_threads()
-
-    def watched(launch: Callable[..., None], pieces: Iterable[tuple[int, int, int, int]]) -> None:
-        recorded.append(list(pieces))
-        original(launch, recorded[-1])
-
-    monkeypatch.setattr(fused, "in_parallel", watched)
-    torch.set_num_threads(2)
-    yield recorded
-    torch.set_num_threads(before)
+CPU = torch.device("cpu")
 
 
-def accumulate(cloud: BillboardCloud, projection: Projection) -> None:
-    """A backward pass over every pixel."""
-    texels = cloud.texels.float()
-    of_image = torch.ones(len(projection), projection.height, projection.width, 4)
-    differentiate(texels, projection, torch.zeros_like(texels), image_gradient=of_image)
-
-
-def test_the_backward_pass_of_an_ordinary_view_runs_on_all_cores(phases: list[Pieces]) -> None:
+def test_the_backward_pass_of_an_ordinary_view_runs_on_all_cores() -> None:
     projection = project(upright(512), ring(CORNERS, 512, 512))
     for v in range(len(projection)):
-        phases.clear()
-        accumulate(upright(512), projection.take(torch.tensor([v])))
+        phases = schedule(projection.take(torch.tensor([v])), CPU)
         bands = sorted((begin, end) for phase in phases for _, _, begin, end in phase)
         assert bands[0][0] == 0 and bands[-1][1] == 512 and all(end == begin for (_, end), (begin, _) in pairwise(bands))
         assert all(piece[:2] == (0, 1) for phase in phases for piece in phase)
         assert all(len(phase) >= 2 for phase in phases)
 
 
-def test_every_row_of_every_view_is_launched_once(phases: list[Pieces], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_row_of_every_view_is_launched_once() -> None:
     """Views that are not worth cutting up go together, next to others that are cut up, or part by part where each part has its texels."""
     cloud, camera = upright(64), ring(CORNERS, 64, 64)
-    wide = replace(project(cloud, camera), rows_apart=torch.tensor([7, 64, 64], dtype=torch.int32))
-    monkeypatch.setattr(fused, "LEAST_PIXELS", 1)
+    wide = replace(project(cloud, camera), rows_apart=torch.tensor([7, 64, 64], dtype=torch.int32), least_pixels=1)
     for order, expected in (([0, 1, 2], 3), ([1, 2, 0], 3), ([1, 0, 2], 4), ([0, 0, 1], 5), ([1, 2, 1], 1)):
-        phases.clear()
-        accumulate(cloud, wide.take(torch.tensor(order)))
+        phases = schedule(wide.take(torch.tensor(order)), CPU)
         assert launched(phases, 3) == [[(0, 64)]] * 3 and len(phases) == expected
-    phases.clear()
-    accumulate(cloud, wide.grouped(2))
-    assert phases == [[(0, 3, 0, 64), (3, 3, 0, 64)]]
+    assert schedule(wide.grouped(2), CPU) == [[(0, 3, 0, 64), (3, 3, 0, 64)]]
 
 
 def launched(phases: list[Pieces], views: int) -> list[list[tuple[int, int]]]:
@@ -220,15 +193,13 @@ def launched(phases: list[Pieces], views: int) -> list[list[tuple[int, int]]]:
     return rows
 
 
-def test_bands_that_run_at_once_touch_different_texels(phases: list[Pieces], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fused, "LEAST_PIXELS", 1)
+def test_bands_that_run_at_once_touch_different_texels() -> None:
     parallel = 0
     for cloud, camera in scenes(10):
         for v in range(len(camera.batch())):
-            phases.clear()
-            accumulate(cloud, project(cloud, camera.batch()[v : v + 1]))
             texel, row = touched(cloud, camera.batch()[v : v + 1])[0].unbind(-1)
-            for phase in phases:
+            projection = replace(project(cloud, camera.batch()[v : v + 1]), least_pixels=1)
+            for phase in schedule(projection, CPU):
                 seen = [set(texel[(row >= begin) & (row < end)].tolist()) for _, _, begin, end in phase]
                 assert len(set().union(*seen)) == sum(map(len, seen))
                 parallel += len(phase) > 1

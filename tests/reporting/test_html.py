@@ -116,15 +116,15 @@ def drawn(page: Page) -> tuple[NDArray[np.float64], Camera]:
 def test_the_page_loads_without_complaint_and_shows_what_is_there(visit: Visit, result: RunResult) -> None:
     def act(page: Page) -> None:
         headings = page.evaluate("[...document.querySelectorAll('h2')].map(heading => heading.textContent)")
-        assert headings == ["From every side", "The model", "Numbers", "The billboards", "From afar", "The fit", "What was asked"]
+        assert headings == ["From every side", "The model", "Numbers", "The billboards", "From a distance", "The fit", "Options"]
         assert page.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
         key = page.evaluate("document.querySelector('.key').textContent")
         mean = result.report.mean.over_white
         for figure in (f"{mean.psnr:.2f} dB", f"{mean.ssim:.3f}", f"{mean.flip:.3f}", "8", f"{result.report.bytes.model:,}"):
             assert figure in key
         assert page.locator("#billboards figure").count() == 2
-        asked = page.evaluate("document.getElementById('asked').textContent")
-        assert "fit.billboards" in asked and "fit.steps" in asked and "scikit-image" in asked
+        options = page.evaluate("document.getElementById('options').textContent")
+        assert "fit.billboards" in options and "fit.steps" in options and "scikit-image" in options
 
     visit(act)
 

@@ -87,19 +87,19 @@ def test_a_sweep_on_a_cluster_is_the_sweep_on_one_machine(cluster: Cluster, tmp_
     node = cluster.add_node(num_cpus=1)
     (tmp_path / "oak").mkdir()
     write_views(tmp_path / "oak", crossing_billboards(), count=6)
-    config = {"steps": 12, "loss": ("l2",), "billboards": (2, 3), "variants": ("base", "double")}
+    config = {"loss": ("l2",), "billboards": (2, 3), "variants": ("base", "double")}
 
     def kill(stage: str, done: int, total: int, note: str = "") -> None:
         if stage == "runs" and done == 1 and node in cluster.list_all_nodes():
             cluster.remove_node(node, allow_graceful=False)
 
-    on_ray = SweepConfig(ray=cluster.address, **config)
-    there = run_sweep(tmp_path / "ray", on_ray, views=[tmp_path / "oak"], on_progress=kill)
+    short, on_ray = RunConfig(fit=FitConfig(steps=12)), SweepConfig(ray=cluster.address, **config)
+    there = run_sweep(tmp_path / "ray", on_ray, short, views=[tmp_path / "oak"], on_progress=kill)
     assert node not in cluster.list_all_nodes() and [row.reason for row in there.rows] == [None] * 4
     results = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "ray" / "results").iterdir()}
-    assert run_sweep(tmp_path / "ray", on_ray, views=[tmp_path / "oak"]).kept == 4
+    assert run_sweep(tmp_path / "ray", on_ray, short, views=[tmp_path / "oak"]).kept == 4
     assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "ray" / "results").iterdir()} == results
-    here = run_sweep(tmp_path / "here", SweepConfig(workers=1, **config), views=[tmp_path / "oak"])
+    here = run_sweep(tmp_path / "here", SweepConfig(workers=1, **config), short, views=[tmp_path / "oak"])
     for one, other in zip(there.rows, here.rows, strict=True):
         assert one.folder == other.folder and one.facts and other.facts
         assert one.facts["report"]["over_white"] == other.facts["report"]["over_white"]
@@ -113,8 +113,8 @@ def test_trees_are_rendered_on_the_cluster_and_their_views_come_back(cluster: Cl
     assert cluster.address
     views = ViewsConfig(count=4, size=48, samples=1, denoise=False)
     grown = GrowConfig(detail=0.1, leaves=0.02)
-    stages = RunConfig(grow=grown, views=views, fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0))
-    config = SweepConfig(grid="default", steps=4, ray=cluster.address)
+    stages = RunConfig(grow=grown, views=views, fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0, steps=4))
+    config = SweepConfig(grid="default", ray=cluster.address)
 
     def sweep() -> SweepResult:
         return run_sweep(tmp_path, config, stages, species=["acer"], trees=[TREE])

@@ -24,8 +24,9 @@ from bbfit.trees.config import GrowConfig
 from bbfit.trees.species import figures_file
 
 TREE = Path(__file__).resolve().parents[2] / "data" / "tree.glb"
-QUICK = SweepConfig(steps=12, workers=2, loss=("l1", "l2"), billboards=(2, 3), variants=("base", "double"))
+QUICK = SweepConfig(workers=2, loss=("l1", "l2"), billboards=(2, 3), variants=("base", "double"))
 """Eight runs a tree."""
+SHORT = RunConfig(fit=FitConfig(steps=12))
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def two_trees(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def done(two_trees: list[Path], tmp_path_factory: pytest.TempPathFactory) -> SweepResult:
-    return run_sweep(tmp_path_factory.mktemp("sweep") / "out", QUICK, views=two_trees)
+    return run_sweep(tmp_path_factory.mktemp("sweep") / "out", QUICK, SHORT, views=two_trees)
 
 
 def copied(done: SweepResult, folder: Path) -> Path:
@@ -93,11 +94,13 @@ def test_nothing_is_done_twice(done: SweepResult, two_trees: list[Path], tmp_pat
     """Nor with another grid that has runs in common, nor for the same views in another place."""
     folder = copied(done, tmp_path)
     before, told = times(folder), list[tuple[str, int, int]]()
-    again = run_sweep(folder, QUICK, views=two_trees, on_progress=lambda stage, now, total, note="": told.append((stage, now, total)))
+    again = run_sweep(
+        folder, QUICK, SHORT, views=two_trees, on_progress=lambda stage, now, total, note="": told.append((stage, now, total))
+    )
     assert again.kept == 16 and times(folder) == before and [psnr(row) for row in again.rows] == [psnr(row) for row in done.rows]
     assert told == [("trees", 2, 2), ("runs", 16, 16)]
     moved = Path(shutil.copytree(two_trees[0], tmp_path / "ash"))
-    more = run_sweep(folder, SweepConfig(steps=12, workers=2, loss=("l2",), billboards=(3, 4), variants=("base",)), views=[moved])
+    more = run_sweep(folder, SweepConfig(workers=2, loss=("l2",), billboards=(3, 4), variants=("base",)), SHORT, views=[moved])
     assert more.kept == 1 and {name: time for name, time in times(folder).items() if name in before} == before and len(times(folder)) == 17
     assert psnr(more.rows[0]) == psnr(next(row for row in done.rows if tuple(row.labels.values()) == ("base", "l2", "3")))
 
@@ -107,10 +110,10 @@ def test_what_is_damaged_or_depends_on_something_else_is_made_anew(done: SweepRe
     results = sorted((folder / "results").iterdir())
     results[0].write_text("{")
     results[1].write_text('{"outcome": {"facts": 3}}')
-    assert run_sweep(folder, QUICK, views=two_trees).kept == 14
+    assert run_sweep(folder, QUICK, SHORT, views=two_trees).kept == 14
     results[2].unlink()
-    assert run_sweep(folder, QUICK, views=two_trees).kept == 15
-    other = run_sweep(folder, QUICK, RunConfig(fit=FitConfig(seed=1)), views=two_trees[:1])
+    assert run_sweep(folder, QUICK, SHORT, views=two_trees).kept == 15
+    other = run_sweep(folder, QUICK, RunConfig(fit=FitConfig(seed=1, steps=12)), views=two_trees[:1])
     assert other.kept == 0 and psnr(other.rows[0]) != psnr(done.rows[0])
 
 
@@ -133,7 +136,7 @@ if __name__ == "__main__":
 """)
     assert subprocess.run([sys.executable, str(script), *map(str, two_trees)]).returncode == -signal.SIGKILL
     before = times(folder)
-    result = run_sweep(folder, QUICK, views=two_trees)
+    result = run_sweep(folder, QUICK, SHORT, views=two_trees)
     assert 3 <= result.kept == len(before) < 16 and {name: times(folder)[name] for name in before} == before
     assert [psnr(row) for row in result.rows] == [psnr(row) for row in done.rows]
 
@@ -174,9 +177,10 @@ def test_a_failed_run_stands_until_it_is_to_be_retried(two_trees: list[Path], tm
 def test_trees_are_grown_and_rendered_once(tmp_path: Path) -> None:
     """A species and a tree's file, with views of 48 x 48 pixels by Blender; the second start finds all of them."""
     stages = RunConfig(
-        views=ViewsConfig(count=4, size=48, samples=1, denoise=False), fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0)
+        views=ViewsConfig(count=4, size=48, samples=1, denoise=False),
+        fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0, steps=4),
     )
-    config = SweepConfig(grid="default", workers=1, steps=4)
+    config = SweepConfig(grid="default", workers=1)
     told = list[tuple[str, int, int]]()
 
     def sweep() -> SweepResult:
@@ -213,8 +217,8 @@ def test_species_of_ones_own_file_are_grown(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "own.json").write_text(json.dumps({"sapling": figures}))
         grown = GrowConfig(detail=0.1, leaves=0.02, species_file=tmp_path / folder / "own.json")
-        stages = RunConfig(grow=grown, views=views, fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0))
-        result = run_sweep(tmp_path / "out", SweepConfig(grid="default", workers=1, steps=4), stages, species=["sapling"])
+        stages = RunConfig(grow=grown, views=views, fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0, steps=4))
+        result = run_sweep(tmp_path / "out", SweepConfig(grid="default", workers=1), stages, species=["sapling"])
         assert [(row.tree, row.reason) for row in result.rows] == [("sapling", None)] and result.kept == kept
 
 

@@ -139,10 +139,10 @@ def test_the_level_follows_the_distance(opened: Opened) -> None:
     distance = tab.evaluate("bbfit.viewer.focalLength() / bbfit.viewer.state.tree.levels[1].scale")
 
     def go(meters: float) -> None:
-        tab.do(lambda page: (page.get_by_label("in meters").fill(str(meters)), page.keyboard.press("Enter"), page.keyboard.press("Tab")))
+        tab.do(lambda page: (page.get_by_label("in meters").fill(str(meters)), page.keyboard.press("Enter")))
 
     go(0.9 * distance)
-    np.testing.assert_array_equal(tab.picture("left"), tab.picture("right"))
+    assert abs(tab.picture("left") - tab.picture("right")).max() <= 24  # where lines of the ground are thinner than a pixel
     assert tab.text("#right header").startswith("original")
     go(1.1 * distance)
     assert abs(tab.picture("left") - tab.picture("right")).max() > 24

@@ -1,1 +1,0 @@
-"""Adam for texels."""

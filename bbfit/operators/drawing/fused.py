@@ -19,12 +19,10 @@ from bbfit.operators.drawing.projection import Projection, project
 from bbfit.operators.drawing.sampling_kernels import BLOCK
 from bbfit.operators.image_loss.fused import PixelLoss
 from bbfit.operators.image_loss.kernels import LOSSES
-from bbfit.operators.launching import LEAST_PIXELS, in_parallel, pieces_of, warp_array
+from bbfit.operators.launching import in_parallel, pieces_of, warp_array
 
 # Most bands of rows that a picture is cut into. Independent of the number of threads, which must not change the order of sums.
 MOST_BANDS = 32
-# Pixels that a CPU thread processes at a time, in vector registers.
-LANES = 16
 
 
 def render_fused(cloud: BillboardCloud, camera: Camera) -> Tensor:
@@ -38,12 +36,16 @@ def render_fused(cloud: BillboardCloud, camera: Camera) -> Tensor:
     Tensor
         Premultiplied RGBA, float32 [V, H, W, 4] ([H, W, 4] for a single camera).
     """
-    projection, texels = project(cloud, camera), cloud.texels.to(torch.float32)
-    if cloud.alpha.kind == "hash":
-        image = draw(texels.detach().contiguous(), projection)
-    else:
-        image = _Drawing.apply(texels, projection.to_texel, projection)
+    image = render_projection(cloud.texels, project(cloud, camera))
     return image if camera.batched else image[0]
+
+
+def render_projection(texels: Tensor, projection: Projection) -> Tensor:
+    """:func:`render_fused` of a projected cloud with texels [P, 4]: premultiplied RGBA, float32 [V, H, W, 4]."""
+    texels = texels.to(torch.float32)
+    if projection.alpha.kind == "hash":
+        return draw(texels.detach().contiguous(), projection)
+    return _Drawing.apply(texels, projection.to_texel, projection)
 
 
 class _Drawing(torch.autograd.Function):
@@ -72,23 +74,10 @@ def occupancy(texels: Tensor) -> Tensor:
 
 
 def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None, out: Tensor | None = None) -> Tensor:
-    """Draw projected billboards.
+    """Draw texels, float32 [P, 4], contiguous: premultiplied RGBA, float32 [V, H, W, 4].
 
-    Parameters
-    ----------
-    texels : Tensor
-        Straight RGBA, float32 [P, 4], contiguous.
-    projection : Projection
-        N billboards in V views.
-    occupied : Tensor, optional
-        :func:`occupancy` of the texels; computed if omitted.
-    out : Tensor, optional
-        Memory for the picture, contiguous; it is overwritten completely.
-
-    Returns
-    -------
-    Tensor
-        Premultiplied RGBA, float32 [V, H, W, 4].
+    ``occupied`` is the :func:`occupancy` of the texels, computed if omitted. ``out`` is memory for the picture, contiguous; it is
+    overwritten completely.
     """
     views, height, width = len(projection), projection.height, projection.width
     image = torch.empty(views, height, width, 4, dtype=torch.float32, device=texels.device) if out is None else out
@@ -96,7 +85,7 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None,
         return image.zero_()
     occupied = occupancy(texels.detach()) if occupied is None else occupied
     run, device = _run(projection, texels.device), wp.device_from_torch(texels.device)
-    kernel, packed = kernels(_capacity(projection.count), _lanes(texels.device)).draw, _packed_planes(projection)
+    kernel, packed = kernels(_capacity(projection.count), _lanes(projection, texels.device)).draw, _packed_planes(projection)
     kernel.module.load(device)  # or every thread would compile it
     arguments = [run, width, int(projection.orthographic), projection.count, _test(projection.alpha), _planes(packed)]
     arguments += [warp_array(texels, wp.vec4), warp_array(occupied, wp.uint8)]
@@ -105,7 +94,7 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None,
     def launch(begin: int, end: int) -> None:
         wp.launch(kernel, (views, end - begin, -(-width // run)), [begin, *arguments], outputs, device=device)
 
-    in_parallel(launch, [(0, height)] if texels.is_cuda else pieces_of(height, -(-LEAST_PIXELS // (width * views)), MOST_BANDS))
+    in_parallel(launch, [(0, height)] if texels.is_cuda else pieces_of(height, -(-projection.least_pixels // (width * views)), MOST_BANDS))
     return image
 
 
@@ -123,11 +112,7 @@ def differentiate(
 
     Parameters
     ----------
-    texels : Tensor
-        Straight RGBA, float32 [P, 4], contiguous.
-    projection : Projection
-        N billboards in V views.
-    texel_gradient : Tensor
+    texels, texel_gradient : Tensor
         Float32 [P, 4], contiguous.
     image_gradient : Tensor, optional
         Gradient of a loss in the picture, float32 [V, H, W, 4], contiguous.
@@ -169,7 +154,7 @@ def differentiate(
             loss.weight if loss else 0.0,
         ]
         outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices, wp.vec3d)]
-        kernel, pieces = kernels(_capacity(count), _lanes(device)).differentiate, -(-width // run)
+        kernel, pieces = kernels(_capacity(count), _lanes(projection, device)).differentiate, -(-width // run)
 
         on = wp.device_from_torch(device)
         kernel.module.load(on)  # or every thread would compile it
@@ -183,10 +168,10 @@ def differentiate(
 
 
 def schedule(projection: Projection, device: torch.device) -> list[list[tuple[int, int, int, int]]]:
-    """Phases of pieces that run at the same time; a piece is a first view, a number of views, and a band of rows.
+    """Phases of a backward pass, whose pieces run at the same time; a piece is a first view, a number of views, and a band of rows.
 
     On a CPU bands of equal parity touch different texels: no two threads add to the same texel, and every sum has one order. CUDA adds
-    atomically. Small pictures are not cut.
+    atomically. Pictures are not cut into bands of fewer than ``projection.least_pixels``.
     """
     views, height, width = len(projection), projection.height, projection.width
     if device.type == "cuda":
@@ -196,7 +181,7 @@ def schedule(projection: Projection, device: torch.device) -> list[list[tuple[in
         return [[(group * share, share, 0, height) for group in range(projection.groups)]]
     phases = list[list[tuple[int, int, int, int]]]()
     for view, apart in enumerate(projection.rows_apart.tolist()):
-        bands = pieces_of(height, max(apart, -(-LEAST_PIXELS // width)), MOST_BANDS)
+        bands = pieces_of(height, max(apart, -(-projection.least_pixels // width)), MOST_BANDS)
         if len(bands) > 3:
             phases += [[(view, 1, *band) for band in bands[parity::2]] for parity in (0, 1)]
         elif phases and len(phases[-1]) == 1:  # views that are not cut form one piece
@@ -218,14 +203,14 @@ def _capacity(count: int) -> int:
     return max(4, 1 << (count - 1).bit_length())
 
 
-def _lanes(device: torch.device) -> int:
+def _lanes(projection: Projection, device: torch.device) -> int:
     """Pixels that a thread processes at a time."""
-    return 1 if device.type == "cuda" else LANES
+    return 1 if device.type == "cuda" else projection.lanes
 
 
 def _run(projection: Projection, device: torch.device) -> int:
     """Pixels of a row that a thread processes in all."""
-    return 1 if device.type == "cuda" else projection.width
+    return 1 if _lanes(projection, device) == 1 else projection.width
 
 
 def _packed_planes(projection: Projection) -> Tensor:

@@ -43,6 +43,10 @@ class Projection:
     """Alpha mode."""
     groups: int = 1
     """Number of consecutive, equally large parts of the views that read disjoint texels."""
+    least_pixels: int = 1 << 14
+    """Least pixels in a band of rows for a CPU thread."""
+    lanes: int = 16
+    """Pixels that a CPU thread processes at a time, in vector registers; with 1 it processes a single pixel in all, as on CUDA."""
 
     def __len__(self) -> int:
         return len(self.boxes)

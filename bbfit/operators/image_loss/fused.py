@@ -42,21 +42,9 @@ def image_loss_fused(render: Tensor, target: Tensor, kind: Loss, ssim_weight: fl
 
 
 def add_structure(render: Tensor, target: Tensor, ssim_weight: float, sharpness_weight: float, out: Tensor) -> Tensor | float:
-    """The weighted terms for structure and sharpness of an image loss, and their gradient.
+    """The weighted terms for structure and sharpness of :func:`image_loss_fused`, a float64 scalar.
 
-    Parameters
-    ----------
-    render, target : Tensor
-        Premultiplied RGBA in [0, 1], float32 [V, H, W, 4], contiguous.
-    ssim_weight, sharpness_weight : float
-        As in :func:`~bbfit.operators.image_loss.reference.image_loss_reference`.
-    out : Tensor
-        Memory for the gradient in ``render``, float32 [V, H, W, 4], contiguous; it is overwritten completely.
-
-    Returns
-    -------
-    Tensor or float
-        A float64 scalar.
+    ``out`` is memory for their gradient in ``render``; it is overwritten completely. All pictures are float32 [V, H, W, 4], contiguous.
     """
     lost: Tensor | float = 0.0
     if ssim_weight:
@@ -69,21 +57,9 @@ def add_structure(render: Tensor, target: Tensor, ssim_weight: float, sharpness_
 
 
 def unpacked(packed: Tensor, straight: bool, out: Tensor | None = None) -> Tensor:
-    """8-bit RGBA as premultiplied floats.
+    """8-bit RGBA, straight or premultiplied, uint8 [V, H, W, 4], contiguous, as premultiplied RGBA in [0, 1], float32.
 
-    Parameters
-    ----------
-    packed : Tensor
-        uint8 [V, H, W, 4], contiguous.
-    straight : bool
-        Whether its alpha is straight; premultiplied otherwise.
-    out : Tensor, optional
-        Memory for the result, contiguous; it is overwritten completely.
-
-    Returns
-    -------
-    Tensor
-        Premultiplied RGBA in [0, 1], float32 [V, H, W, 4].
+    ``out`` is memory for the result, contiguous; it is overwritten completely.
     """
     image = torch.empty(packed.shape, dtype=torch.float32, device=packed.device) if out is None else out
     run, device = 1 if packed.is_cuda else 1 << 10, wp.device_from_torch(packed.device)

@@ -64,7 +64,7 @@
   }
   drawModel();
 
-  // The wheel and a finger scroll the page until the model is asked for, and again once it is out of sight.
+  // The wheel and a finger scroll the page until the reader clicks the model, and again once it is out of sight.
   const turn = document.getElementById("turn");
   turn.addEventListener("click", () => { turn.hidden = true; });
   new IntersectionObserver((seen) => { if (!seen[0].isIntersecting) turn.hidden = false; }).observe(turn.parentElement);

@@ -15,7 +15,10 @@
   let state = { serial: -1, tree: null }, tree = null, status = "", error = "";
   let field = null, plantedFor = "", loading = 0, dirty = true, toMeasure = 0, before = null, fitted = false, mode = "billboards";
   const orbit = bbfit.createOrbit(THREE, canvas, () => { dirty = true; });
-  for (const name of ["pointerdown", "wheel"]) canvas.addEventListener(name, () => { fitted = false; });
+  for (const name of ["pointerdown", "wheel"]) canvas.addEventListener(name, () => {
+    fitted = false;
+    document.activeElement.blur();
+  });
 
   const median = (list) => [...list].sort((a, b) => a - b)[list.length >> 1];
   const remember = (list, value) => { list.push(value); if (list.length > KEPT_TIMES) list.shift(); };
@@ -241,7 +244,7 @@
     if (controls.alpha.value === "hash") notes.push("glTF has no hash: the file says BLEND and names HASH in its extras, and viewers blend.");
     if (controls.alpha.value !== "mask" && !isSplit()) notes.push("Here texels that are at least half opaque hide what is behind them; the rest is blended in any order.");
     $("alpha-note").textContent = notes.join(" ");
-    if (document.activeElement !== controls.slider) controls.slider.value = stepOf(orbit.distance);
+    controls.slider.value = stepOf(orbit.distance);
     if (document.activeElement !== controls.meters) controls.meters.value = Number(orbit.distance.toPrecision(4));
     $("size").textContent = `At ${meters(distance)} the tree is ${count(Math.round(scale * height()))} pixels tall.`;
     $("levels").replaceChildren(...tree.levels.map(({ name, scale: least }, index) => {
@@ -334,12 +337,12 @@
     if (event.target === controls.show) applyMode();
     measure();
   });
-  form.addEventListener("submit", (event) => {
-    event.preventDefault();
+  controls.plant.addEventListener("click", () => {
     if (tree === null) return;
     controls.show.value = "field";
     if (mode === "field") plant(false); else applyMode();
   });
+  form.addEventListener("submit", (event) => event.preventDefault());
 
   // For tests and scripts that drive the page.
   bbfit.viewer = {
