@@ -21,10 +21,7 @@ _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 def check_model_path(name: str, path: str | Path) -> Path:
     """Require one of the endings ``SUFFIXES`` and an existing folder; return the path as a ``Path``.
 
-    Raises
-    ------
-    InputError or MissingFileError
-        That call the file ``name``.
+    Raises ``InputError`` or ``MissingFileError`` with a message that calls the file ``name``.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:

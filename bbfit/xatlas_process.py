@@ -29,22 +29,9 @@ _PACKINGS = 24
 
 
 def packed(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pack rectangles without overlap.
+    """Pack rectangles of given widths and heights, at least 2, without overlap: int64 [R, 2] to their corners, from 0 on, int64 [R, 2].
 
-    Parameters
-    ----------
-    cells
-        Widths and heights, at least 2, int64 [R, 2].
-
-    Returns
-    -------
-    NDArray[np.int64]
-        Corners of the rectangles, from 0 on, int64 [R, 2].
-
-    Raises
-    ------
-    CalledProcessError
-        If the process fails; its messages have gone to this process's standard error.
+    Raises ``CalledProcessError`` if the process fails, after its messages have gone to this process's standard error.
     """
     boxes = np.array(_answer("_pack", cells.tolist()), dtype=np.int64)
     assert boxes.shape == (len(cells), 4) and np.array_equal(boxes[:, :2] + cells, boxes[:, 2:]), "xatlas scaled or split the atlas"
@@ -54,29 +41,11 @@ def packed(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 def unfolded(
     points: NDArray[np.float64], faces: NDArray[np.int64], texels: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Cut a mesh into charts and pack them on a square texture.
+    """Cut a mesh of vertices in meters, [P, 3], and triangles, [F, 3], into charts, and pack them on a texture of ``texels`` x ``texels``.
 
-    All charts have nearly the same number of texels per meter. The same mesh gives the same charts.
-
-    Parameters
-    ----------
-    points, faces
-        Vertices in meters, [P, 3], and triangles, [F, 3].
-    texels
-        Width and height of the texture; there must be room for a margin around each chart.
-
-    Returns
-    -------
-    tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
-        The given vertex of each new vertex, [Q]; triangles of new vertices in the given order, [F, 3]; texture coordinates in [0, 1], [Q,
-        2]. Vertices without triangles are left out.
-
-    Raises
-    ------
-    InputError
-        If the texture has no room for the margins of the charts.
-    CalledProcessError
-        If the process fails; its messages have gone to this process's standard error.
+    All charts have nearly the same number of texels per meter. The same mesh gives the same charts. Vertices without triangles are
+    left out. The result is the given vertex of each new vertex, [Q]; triangles of new vertices in the given order, [F, 3]; and texture
+    coordinates in [0, 1], [Q, 2]. Raises ``InputError`` if there is no room for a margin around each chart, and the error of :func:`packed`.
     """
     charts = _answer("_unfold", {"points": points.tolist(), "faces": faces.tolist(), "texels": texels})
     if charts is None:

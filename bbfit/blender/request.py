@@ -62,13 +62,7 @@ class ViewsRequest:
 
     @staticmethod
     def of(tree: TreeFile, config: ViewsConfig) -> ViewsRequest:
-        """The request for views of a tree before rendering.
-
-        Raises
-        ------
-        MissingFileError
-            If the panorama of the configuration does not exist.
-        """
+        """The request for views of a tree before rendering. Raises ``MissingFileError`` if the configuration's panorama does not exist."""
         if config.hdri is not None:
             config = replace(config, hdri=check_file("hdri", config.hdri))
         known = RenderedTree(tree.path.name, tree.digest, tree.bytes, tree.up_axis)
@@ -78,10 +72,7 @@ class ViewsRequest:
     def load(path: Path) -> ViewsRequest | None:
         """Read a request. The result is ``None`` if bbfit did not write the file. Values of an unexpected type count as unknown.
 
-        Raises
-        ------
-        InputError
-            If the file is not valid JSON.
+        Raises ``InputError`` if the file is not valid JSON.
         """
         content = read_json("views", path)
         if not isinstance(content, dict) or not isinstance(content.get("tree"), dict):
@@ -107,24 +98,9 @@ class ViewsRequest:
         write_json(path, content)
 
     def check_same(self, folder: Path, file: str) -> ViewsRequest | None:
-        """Compare the request with an earlier one, which must be for the same pictures.
+        """The earlier request in ``file`` of a folder of pictures. ``None`` if the file does not exist.
 
-        Parameters
-        ----------
-        folder
-            The folder of the pictures.
-        file
-            The name of the request's file in it.
-
-        Returns
-        -------
-        ViewsRequest or None
-            The earlier request. ``None`` if the file does not exist.
-
-        Raises
-        ------
-        InputError
-            If the earlier request differs. The message names the first difference.
+        Raises ``InputError`` with the first difference if the earlier request was for other pictures.
         """
         path, hint = folder / file, f"choose another output folder, or remove {folder} to render again"
         if not path.is_file():

@@ -52,23 +52,14 @@ class _Part:
 
 
 def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: int | None = None) -> DecimatedTree:
-    """Reduce a tree to a number of vertices, or of bytes of its GLB.
+    """Reduce a .glb, .gltf or .obj to at least 4 ``vertices``, or to a GLB of ``size`` bytes, textures and materials included.
 
     Parts of different materials stay separate and share the budget by their triangles. Vertices that lie in the same place with the same
     texture coordinates are welded first. Normals are left out: surfaces are flat.
 
-    Parameters
-    ----------
-    tree
-        .glb, .gltf or .obj.
-    vertices
-        At least 4.
-    size
-        bytes, textures and materials included.
-
     Raises
     ------
-    MissingFileError or InputError
+    MissingFileError, InputError
         If the file cannot be used, the package fast-simplification is missing, both limits or neither are given, or the limit cannot be
         reached.
     """

@@ -83,17 +83,9 @@ class Record:
         return all((file := self.folder / path).is_file() and digest_file(file) == digest for path, digest in entry["outputs"].items())
 
     def run(self, stage: Stage, on_progress: OnProgress = silent) -> bool:
-        """Run a stage and record it, or skip it if its results are current.
+        """Run a stage and record it, or skip it if its results are current. Returns whether the stage was run.
 
-        Returns
-        -------
-        bool
-            Whether the stage was run.
-
-        Raises
-        ------
-        InputError, OSError
-            If the work raises it. The record then stays as it was.
+        Raises ``InputError`` or ``OSError`` if the work does. The record then stays as it was.
         """
         key = stage.key  # before the work, during which an input file may change
         if self._is_current(stage.name, key):

@@ -115,17 +115,8 @@ def sources(
 ) -> list[Source]:
     """The trees of a sweep with unique names: that of the species, the file or the folder, with the parent folder's if they coincide.
 
-    Parameters
-    ----------
-    species, trees, views
-        Species to grow, files of trees, and folders of views.
-    species_file
-        A file with more species.
-
-    Raises
-    ------
-    MissingFileError, InputError
-        If there are no trees, one does not exist, or two have the same name.
+    ``trees`` are files, ``views`` are folders, and ``species_file`` contains more species. Raises ``MissingFileError`` or ``InputError`` if
+    there are no trees, one does not exist, or two have the same name.
     """
     result = [Source(load_species(name, species_file).name, species=name) for name in species]
     on_disk = [(path, Source(path.stem, tree=check_file("tree", path))) for path in map(Path, trees)]

@@ -78,16 +78,10 @@ class _Buds:
 
 
 def grow_skeleton(species: Species, seed: int, count: Count, *, leaves: float = 1.0) -> Skeleton:
-    """Grow a tree; the same seed gives the same tree.
+    """Grow a tree; the same seed of at least 0 gives the same tree.
 
-    Parameters
-    ----------
-    seed
-        Any whole number of at least 0.
-    count
-        Called before memory for a level's stems, or for the leaves, is allocated.
-    leaves
-        Section 4.5's quality: share of the leaves that grow, 0 to 1; they are enlarged to keep the total area.
+    ``count`` is called before memory for a level's stems, or for the leaves, is allocated. ``leaves`` is section 4.5's quality: the share
+    of the leaves that grow, 0 to 1; they are enlarged to keep the total area.
     """
     levels: list[Stems] = []
     for level in range(species.levels):
