@@ -56,7 +56,7 @@ Seed = Annotated[int, Range(0)]
 
 
 def check_fields(config: Any) -> None:
-    """Raise an :class:`InputError` that starts with the field's name if a field of a dataclass does not hold what its annotation allows.
+    """Require that every field of a dataclass holds what its annotation allows. The message of the error starts with the field's name.
 
     A ``Literal`` has to hold one of its values, a ``bool`` True or False, and a number with a :class:`Range` one within it. ``None`` is
     allowed where the annotation allows it. Items of a tuple are checked one by one. Other types are not checked.

@@ -72,7 +72,7 @@ def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], metadata: Map
 def output_folder(name: str, path: str | Path) -> Path:
     """Create an output folder if it does not exist, remove temporary files of killed processes from it, and return it.
 
-    Raises ``InputError``, which names the option ``name``, if a part of ``path`` is a file or the folder cannot be written to.
+    If ``path`` or a part of it is a file, or the folder cannot be written to, this raises ``InputError`` with the option's ``name``.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():

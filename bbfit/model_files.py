@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bbfit.checks import check_folder, fail
+from bbfit.provenance import installed_version
 
 if TYPE_CHECKING:
     import trimesh
@@ -52,7 +52,4 @@ def glb_of_scene(scene: trimesh.Scene, complete: Callable[[dict[str, Any]], None
 
 def generator() -> str:
     """The name and version of this program, as files name what made them."""
-    try:
-        return f"bbfit {version('bbfit')}"
-    except PackageNotFoundError:  # used from a folder that was never installed
-        return "bbfit"
+    return f"bbfit {installed_version('bbfit') or ''}".rstrip()

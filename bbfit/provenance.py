@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -79,3 +80,11 @@ def digest_files(files: Iterable[Path], folder: Path) -> str:
     """SHA-256 over the contents of files and their paths relative to ``folder``. A single file has the digest of its contents alone."""
     digests = [(Path(os.path.relpath(file, folder)).as_posix(), digest_file(file)) for file in files]
     return digests[0][1] if len(digests) == 1 else sha256(json.dumps(digests).encode()).hexdigest()
+
+
+def installed_version(package: str) -> str | None:
+    """The version of an installed package, or ``None`` if it is not installed, such as bbfit in a source folder."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

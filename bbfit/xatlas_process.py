@@ -43,9 +43,9 @@ def unfolded(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Cut a mesh of vertices in meters, [P, 3], and triangles, [F, 3], into charts, and pack them on a texture of ``texels`` x ``texels``.
 
-    All charts have nearly the same number of texels per meter. The same mesh gives the same charts. Vertices without triangles are
-    left out. The result is the given vertex of each new vertex, [Q]; triangles of new vertices in the given order, [F, 3]; and texture
-    coordinates in [0, 1], [Q, 2]. Raises ``InputError`` if there is no room for a margin around each chart, and the error of :func:`packed`.
+    All charts have nearly the same number of texels per meter. The same mesh gives the same charts. Vertices without triangles are dropped.
+    The result is the given vertex of each new vertex, [Q]; triangles of new vertices in the given order, [F, 3]; and texture coordinates
+    in [0, 1], [Q, 2]. Raises ``InputError`` if there is no room for a margin around each chart, and the error of :func:`packed`.
     """
     charts = _answer("_unfold", {"points": points.tolist(), "faces": faces.tolist(), "texels": texels})
     if charts is None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import check_file, fail
 from bbfit.files import read_json, write_json
-from bbfit.provenance import VERSIONS, identity
+from bbfit.provenance import VERSIONS, identity, installed_version
 from bbfit.tree_files.tree_file import TreeFile
 
 
@@ -66,7 +65,7 @@ class ViewsRequest:
         if config.hdri is not None:
             config = replace(config, hdri=check_file("hdri", config.hdri))
         known = RenderedTree(tree.path.name, tree.digest, tree.bytes, tree.up_axis)
-        return ViewsRequest(identity(config), known, bbfit=_version())
+        return ViewsRequest(identity(config), known, bbfit=installed_version("bbfit") or "unknown")
 
     @staticmethod
     def load(path: Path) -> ViewsRequest | None:
@@ -125,10 +124,3 @@ def _shown(value: Any) -> str:
     if isinstance(value, dict):
         return str(value.get("name"))
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-def _version() -> str:
-    try:
-        return version("bbfit")
-    except PackageNotFoundError:  # run from a source folder that is not installed
-        return "unknown"

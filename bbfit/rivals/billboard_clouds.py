@@ -99,9 +99,9 @@ def billboard_cloud(
 
 
 def choose_planes(triangles: Array, count: int, *, areas: Array | None = None, share: float = 0.95) -> PlaneChoice:
-    """Choose N >= 1 planes at most that hold a share of the triangles' area within the smallest epsilon that the bisection finds.
+    """Choose at most N >= 1 planes that hold a share of the triangles' area within the smallest epsilon that the bisection finds.
 
-    The triangles' corners are [T, 3, 3] in meters, their weights ``areas`` [T] (by default the true areas), and ``share`` is in (0, 1].
+    The triangles' corners are [T, 3, 3] in meters, their weights ``areas`` [T] (by default their areas), and ``share`` is in (0, 1].
     Raises ``InputError`` if there are no triangles, or all have zero area.
     """
     check_count("billboards", count)

@@ -82,14 +82,8 @@ def boundary_gradient(
 ) -> Tensor:
     """Gradient of a loss by the points of a mesh, [points, 3], through the motion of silhouettes: an integral along them, by sampling.
 
-    Parameters
-    ----------
-    slope
-        Derivative of the loss by the premultiplied RGBA of each pixel of the one camera, [H·W, 4].
-    colors
-        Returns what rays of given origins and directions see, as ``RayCaster.colors``.
-    random, density
-        The generator of the samples, and their number per pixel.
+    ``slope`` is the derivative of the loss by the premultiplied RGBA of each pixel of the one camera, [H·W, 4]. ``colors`` returns what
+    rays of given origins and directions see (``RayCaster.colors``). ``density`` is the number of samples per pixel.
     """
     points = points.detach().requires_grad_()
     ends = camera.project(points.double())[surface.silhouette(points.detach(), camera)]  # [K, 2, 2]

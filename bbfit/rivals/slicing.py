@@ -81,7 +81,7 @@ def slicing(
     folder: str | Path | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Slicings:
-    """Slice a tree along ``directions`` >= 1 at equal angles over 180 degrees, each with ``slices`` >= 1.
+    """Slice a tree into ``slices`` >= 1 slices along each of ``directions`` >= 1 directions at equal angles over 180 degrees.
 
     Empty slices are left out. With ``config.two_sided`` slices have back textures, unlike in the paper. For everything else see ``bake``.
     """
