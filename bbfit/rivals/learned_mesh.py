@@ -145,21 +145,9 @@ def refine_mesh(
     Inverse Rendering of Geometry"), texels by Adam (Kingma and Ba 2015). Threads add up gradients in any order, so that two runs with
     one seed differ slightly.
 
-    Parameters
-    ----------
-    steps
-        Views drawn; the first half of them at half of the size.
-    size
-        Larger side of the pictures drawn, in pixels; the views' own at most.
-    seed
-        Chooses the order of the views and the places of the samples.
-    on_step
-        Called after each step with the number of steps done and the step's loss.
-
-    Raises
-    ------
-    InputError
-        If an argument is out of range, or Mitsuba or LLVM is missing.
+    The pictures drawn have a larger side of ``size`` pixels, the views' own at most, and half of it in the first half of the steps. The
+    seed chooses the order of the views and the places of the samples. ``on_step`` is called after each step with the number of steps
+    done and the step's loss. Raises ``InputError`` if an argument is out of range, or Mitsuba or LLVM is missing.
     """
     _check_plan(steps, size, seed)
     threads = torch.get_num_threads()
