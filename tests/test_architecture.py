@@ -25,7 +25,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in MODULES}
 GROUPS = (
     ("checks",),
     ("provenance",),
-    ("files", "glb", "model_files", "xatlas_process"),
+    ("files", "glb", "model_files"),
     ("geometry",),
     ("layout",),
     ("images",),
@@ -56,7 +56,7 @@ def relative(path: Path) -> str:
 ONLY_IN = {
     "bpy": {f"blender/{name}.py" for name in ("worker", "worker_scene", "worker_glb")},
     "cv2": {"images.py", "fitting/bounds.py"},
-    "xatlas": {"xatlas_process.py"},
+    "xatlas": {"exporting/packing.py"},
     "warp": {
         "operators/launching.py",
         "operators/drawing/projector.py",
@@ -327,7 +327,7 @@ def text_files() -> Iterator[Path]:
             built = {"node_modules", "__pycache__", ".ipynb_checkpoints"} & set(path.parts)
             if path.is_file() and path.suffix in endings and not built:
                 yield path
-    yield from (path for path in sorted(ROOT.iterdir()) if path.is_file() and path.suffix in endings)
+    yield from (path for path in sorted(ROOT.iterdir()) if path.is_file() and path.suffix in endings and path.name != ".git")
 
 
 def test_no_file_names_a_path_of_one_machine() -> None:

@@ -134,7 +134,8 @@ def kill(stage, done, total, note=""):
         os.kill(os.getpid(), signal.SIGKILL)
 
 if __name__ == "__main__":
-    run_sweep(Path({str(folder)!r}), {QUICK!r}, RunConfig(fit=FitConfig(steps=12)), views=[Path(name) for name in sys.argv[1:]], on_progress=kill)
+    short, views = RunConfig(fit=FitConfig(steps=12)), [Path(name) for name in sys.argv[1:]]
+    run_sweep(Path({str(folder)!r}), {QUICK!r}, short, views=views, on_progress=kill)
 """)
     assert subprocess.run([sys.executable, str(script), *map(str, two_trees)]).returncode == -signal.SIGKILL
     before = times(folder)
