@@ -128,11 +128,13 @@ class Camera:
 
         Parameters
         ----------
-        points : [P, 3] in meters.
+        points
+            World points in meters, [P, 3].
 
         Returns
         -------
-        [V, P, 2] or [P, 2] pixel coordinates; NaN for points at or behind a pinhole camera.
+        Tensor
+            [V, P, 2] or [P, 2] pixel coordinates; NaN for points at or behind a pinhole camera.
         """
         homogeneous = torch.cat([points, torch.ones_like(points[:, :1])], -1)
         projected = homogeneous @ self.world_to_pixel.mT
@@ -161,16 +163,9 @@ def _intrinsics(focal: float, width: int, height: int) -> Tensor:
 
 
 def look_at(position: Tensor, target: Tensor) -> Tensor:
-    """World-to-camera transforms of cameras that look at a point with the world's Y up.
+    """World-to-camera transforms, [V, 4, 4], of cameras at [V, 3] that look at a target, [3] or [V, 3], with the world's Y up, in meters.
 
-    Parameters
-    ----------
-    position : [V, 3] camera centers in meters.
-    target : [3] or [V, 3] points looked at.
-
-    Returns
-    -------
-    [V, 4, 4]. A camera straight above or below its target takes the world's -Z as the image's up direction.
+    A camera straight above or below its target takes the world's -Z as the image's up direction.
     """
     forward = torch.nn.functional.normalize(target - position, dim=-1)
     up = torch.zeros_like(forward)
@@ -208,10 +203,7 @@ def _flip_yz(like: Tensor) -> Tensor:
 def convergence_point(camera: Camera) -> Tensor:
     """The point nearest to all optical axes in the least-squares sense, [3]: what a ring of cameras looks at.
 
-    Raises
-    ------
-    InputError
-        if the axes are parallel, so that no such point is determined.
+    Raises ``InputError`` if the axes are parallel, so that no such point is determined.
     """
     camera = camera.batch()
     direction = camera.forward

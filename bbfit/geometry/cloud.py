@@ -140,7 +140,7 @@ class BillboardCloud:
         Raises
         ------
         MissingFileError, InputError
-            if the file is missing, empty, not a billboard cloud or damaged.
+            If the file is missing, empty, not a billboard cloud or damaged.
         """
         from safetensors import SafetensorError, safe_open
 
@@ -173,16 +173,12 @@ def even_upright(
     sides: str = "one",
     gap: float = 0.0,
 ) -> BillboardCloud:
-    """N upright billboards at k·180°/N through a vertical axis, with transparent textures (thesis, section 4.2 and figures 2 and 4).
+    """N >= 1 upright billboards at k·180°/N through a vertical axis, with transparent textures (thesis, section 4.2 and figures 2 and 4).
 
-    Parameters
-    ----------
-    count : N >= 1.
-    axis : [3] point that all rectangles are centered on horizontally and vertically.
-    half_extents : [2] or [N, 2] in meters.
-    texture_sizes : [2] or [N, 2] height and width in texels.
-    sides : ``"one"``, ``"two"`` (front and back texture), or ``"pair"``: two one-sided rectangles ``gap`` meters apart along the
-        normal, both always drawn (thesis, section 6.4). A pair stands next to each other: entries 2k (front) and 2k + 1 (back).
+    ``axis`` is the point, [3], that all rectangles are centered on horizontally and vertically. ``half_extents`` in meters and
+    ``texture_sizes`` (height and width in texels) are [2] or [N, 2]. ``sides`` is ``"one"``, ``"two"`` (front and back texture), or
+    ``"pair"``: two one-sided rectangles ``gap`` meters apart along the normal, both always drawn (thesis, section 6.4). A pair stands next
+    to each other: entries 2k (front) and 2k + 1 (back).
     """
     check_count("billboards", count)
     check_choice("sides", sides, ("one", "two", "pair"))
