@@ -13,7 +13,7 @@ from bbfit.operators.adam.kernels import texel_block, update_blocks
 from bbfit.operators.adam.reference import EPSILON
 from bbfit.operators.drawing.fused import occupancy
 from bbfit.operators.drawing.sampling_kernels import BLOCK
-from bbfit.operators.launching import in_parallel, pieces_of, warp_array
+from bbfit.operators.launching import launch, warp_array
 
 # A first moment that has decayed to this share moves a texel by less than 1e-5 of a step in all.
 _FORGOTTEN = 1.4e-6
@@ -73,28 +73,10 @@ class AdamFused:
         """
         beta1, beta2 = betas
         run = 1 if self.texels.is_cuda else RUN
-        arguments = [
-            run,
-            step,
-            rate / (1 - beta1**step),
-            beta1,
-            beta2,
-            (1 - beta2**step) ** -0.5,
-            EPSILON,
-            rest_after(beta1),
-            binarization,
-            alpha_rate,
-            *(
-                warp_array(tensor.view(-1, 4 * BLOCK), texel_block)
-                for tensor in (self.texels, self.gradient, self.first_moment, self.second_moment)
-            ),
-            warp_array(self.last, wp.int32),
-            warp_array(self.occupied, wp.uint8),
-        ]
-        runs, device = -(-len(self.last) // run), wp.device_from_torch(self.texels.device)
-        update_blocks.module.load(device)  # or every thread would compile it
-
-        def launch(begin: int, end: int) -> None:
-            wp.launch(update_blocks, end - begin, [begin * run, *arguments], device=device)
-
-        in_parallel(launch, [(0, runs)] if self.texels.is_cuda else pieces_of(runs, LEAST_RUNS))
+        rate, correction = rate / (1 - beta1**step), (1 - beta2**step) ** -0.5
+        numbers = [run, step, rate, beta1, beta2, correction, EPSILON, rest_after(beta1), binarization, alpha_rate]
+        blocks = (self.texels, self.gradient, self.first_moment, self.second_moment)
+        arrays = [warp_array(tensor.view(-1, 4 * BLOCK), texel_block) for tensor in blocks]
+        arrays += [warp_array(self.last, wp.int32), warp_array(self.occupied, wp.uint8)]
+        on = wp.device_from_torch(self.texels.device)
+        launch(update_blocks, -(-len(self.last) // run), LEAST_RUNS, [*numbers, *arrays], on=on)
