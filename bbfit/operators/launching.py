@@ -93,8 +93,16 @@ def pieces_of(count: int, least: int, most: int | None = None) -> list[tuple[int
 
 
 def warp_array(tensor: Tensor, dtype: Any) -> Any:
-    """A Warp view of the memory of a contiguous tensor, which must outlive it."""
+    """A Warp view of the memory of a contiguous tensor, which it keeps alive."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def struct_array(tensor: Tensor, kind: Any) -> Any:
+    """A Warp view of a contiguous tensor whose last dimension is the memory of a struct. It keeps the tensor alive."""
+    device, shape = wp.device_from_torch(tensor.device), tuple(tensor.shape[:-1])
+    array = wp.array(ptr=tensor.data_ptr(), shape=shape, dtype=kind, device=device)
+    array._tensor = tensor  # as wp.from_torch does
+    return array
 
 
 def differentiable(value: Tensor, picture: Tensor, gradient: Tensor) -> Tensor:

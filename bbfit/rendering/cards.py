@@ -87,10 +87,10 @@ def draw_cards(cards: Cards, camera: Camera) -> Tensor:
 
     Parameters
     ----------
-    cards : Cards
+    cards
         Polygons, their atlas and their mip levels, which need not reach down to one texel. Without levels the atlas is filtered bilinearly
         at every distance (sampler LINEAR).
-    camera : Camera
+    camera
         One camera or V cameras.
 
     Returns
@@ -111,19 +111,9 @@ def draw_cards(cards: Cards, camera: Camera) -> Tensor:
 
 
 def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> MipChain:
-    """Concatenate mip levels.
+    """Concatenate mip levels, uint8 [h, w, C] each, level 0 first, which has the given shape.
 
-    Parameters
-    ----------
-    chain : Sequence[NDArray]
-        uint8 [h, w, C] each, level 0 first.
-    shape : tuple[int, ...]
-        Shape of level 0.
-
-    Raises
-    ------
-    InputError
-        If a level is not uint8 or not half as large as the level before, rounded down.
+    Raises InputError if there is no level, or a level is not uint8 or not half as large as the level before, rounded down.
     """
     if not chain:
         fail("chain", "has no levels", "level 0 is the atlas's picture")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from bbfit.operators.adam.kernels import texel_block, update_blocks
-from bbfit.operators.adam.reference import EPSILON
+from bbfit.operators.adam.reference import EPSILON, AdamReference
 from bbfit.operators.drawing.fused import occupancy
 from bbfit.operators.drawing.sampling_kernels import BLOCK
 from bbfit.operators.launching import launch, warp_array
@@ -27,17 +28,10 @@ def rest_after(beta1: float) -> int:
 
 
 @dataclass(frozen=True)
-class AdamFused:
-    """Texels and Adam's moments, padded to whole blocks, all of which :meth:`update` changes in place."""
+class AdamFused(AdamReference):
+    """As the reference, with all tensors in float32 and padded to P' texels, a multiple of
+    :data:`~bbfit.operators.drawing.sampling_kernels.BLOCK`."""
 
-    texels: Tensor
-    """Float32 [P', 4], P' a multiple of :data:`~bbfit.operators.drawing.sampling_kernels.BLOCK`."""
-    gradient: Tensor
-    """To add to before every update, which clears it, [P', 4]."""
-    first_moment: Tensor
-    """[P', 4]."""
-    second_moment: Tensor
-    """[P', 4]."""
     last: Tensor
     """Step in which each block last had a gradient, int32 [P' / BLOCK]."""
     occupied: Tensor
@@ -54,17 +48,16 @@ class AdamFused:
     def start(texels: Tensor) -> AdamFused:
         """The state before the first step, which takes over the memory of ``texels`` [P', 4], as :meth:`padded` returns them."""
         never = torch.full((len(texels) // BLOCK,), -(1 << 30), dtype=torch.int32, device=texels.device)
-        zeros = [torch.zeros_like(texels) for _ in range(3)]
-        return AdamFused(texels, zeros[0], zeros[1], zeros[2], never, occupancy(texels))
+        return AdamFused(*vars(AdamReference.start(texels)).values(), never, occupancy(texels))
 
     def tensors(self) -> dict[str, Tensor]:
-        """What :meth:`restored` needs to continue; the gradient is zero between steps."""
-        return {"texels": self.texels, "first_moment": self.first_moment, "second_moment": self.second_moment, "last": self.last}
+        """As of the reference, and the last steps with a gradient."""
+        return {**super().tensors(), "last": self.last}
 
-    def restored(self, tensors: dict[str, Tensor]) -> AdamFused:
+    def restored(self, tensors: dict[str, Tensor]) -> Self:
         """The state that :meth:`tensors` returned."""
-        kept = {name: tensor.to(self.texels.device) for name, tensor in tensors.items()}
-        return replace(AdamFused.start(kept["texels"]), **kept)
+        state = super().restored(tensors)
+        return replace(state, occupied=occupancy(state.texels))
 
     def update(self, step: int, rate: float, betas: tuple[float, float], binarization: float = 0.0, alpha_rate: float = 1.0) -> None:
         """As :meth:`bbfit.operators.adam.reference.AdamReference.update`, up to rounding and :func:`rest_after`.

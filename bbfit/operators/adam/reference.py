@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -44,24 +45,23 @@ class AdamReference:
         """What :meth:`restored` needs to continue; the gradient is zero between steps."""
         return {"texels": self.texels, "first_moment": self.first_moment, "second_moment": self.second_moment}
 
-    def restored(self, tensors: dict[str, Tensor]) -> AdamReference:
+    def restored(self, tensors: dict[str, Tensor]) -> Self:
         """The state that :meth:`tensors` returned."""
-        return replace(self.start(self.texels), **{name: tensor.to(self.texels.device) for name, tensor in tensors.items()})
+        kept = {name: tensor.to(self.texels.device) for name, tensor in tensors.items()}
+        return replace(self, gradient=torch.zeros_like(kept["texels"]), **kept)
 
     def update(self, step: int, rate: float, betas: tuple[float, float], binarization: float = 0.0, alpha_rate: float = 1.0) -> None:
         """Take a step of Adam (Kingma and Ba 2015, algorithm 1) and clamp texels to [0, 1].
 
         Parameters
         ----------
-        step : int
+        step
             Number of the step, from 1.
-        rate : float
-            Learning rate.
-        betas : tuple[float, float]
-            Decay of the two moments in a step.
-        binarization : float
+        rate, betas
+            Learning rate, and decay of the two moments in a step.
+        binarization
             Factor of :func:`binarization_loss`, whose gradient is added.
-        alpha_rate : float
+        alpha_rate
             Factor of the change of alpha.
         """
         leaf = self.texels.detach().requires_grad_()

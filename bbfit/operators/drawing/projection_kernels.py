@@ -76,12 +76,12 @@ def texel_to_world(r: Rectangle, width: wp.float64, height: wp.float64) -> mat43
 @wp.kernel
 def project_planes(
     chosen: wp.array(dtype=wp.int32),
-    width: int,
-    height: int,
-    orthographic: int,
     lenses: wp.array(dtype=Lens),
     rectangles: wp.array(dtype=Rectangle),
     textures: wp.array(dtype=wp.vec4i),
+    width: int,
+    height: int,
+    orthographic: int,
     planes: wp.array2d(dtype=Plane),
     to_texel: wp.array2d(dtype=wp.mat33d),
     rows_apart: wp.array(dtype=wp.int32),

@@ -15,7 +15,6 @@ The function :func:`add_pixel_loss` is called for every pixel of a picture by th
 """
 
 # mypy: ignore-errors
-# ruff: noqa: UP018 - int(0) declares a variable of a kernel, 0 a constant.
 
 import warp as wp
 
@@ -68,16 +67,14 @@ def unpack(first: int, run: int, packed: wp.array(dtype=wp.int32), straight: int
     """Write 8-bit RGBA [P] as premultiplied floats; launched over runs of pixels, from run ``first`` on."""
     tid, _ = wp.tid()
     begin = (first + tid) * run
-    i = int(begin)
-    while i < wp.min(begin + run, packed.shape[0]):
+    for i in range(begin, wp.min(begin + run, packed.shape[0])):
         image[i] = premultiplied(packed[i], straight)
-        i += 1
 
 
 @wp.kernel
 def compare(loss: int, weight: float, render: Pixels, target: Pixels, gradient: Pixels, losses: wp.array(dtype=wp.float32)):
     """Write the loss of every pixel [P] and add its derivative, times ``weight``, to ``gradient`` [P]; launched over pixels."""
     i = wp.tid()
-    total, g = add_pixel_loss(render[i] - target[i], loss, weight, float(0.0), gradient[i])
+    total, g = add_pixel_loss(render[i] - target[i], loss, weight, 0.0, gradient[i])
     losses[i] = total
     gradient[i] = g
