@@ -55,23 +55,29 @@ def measure(first_row: int, run: int, rows: int, render: Pictures, target: Pictu
     row = (first_row + tid) % rows
     bottom = wp.min(row * BLOCK + BLOCK, render.shape[1])
     total = float(0.0)
-    for block in range(piece * run, wp.min(piece * run + run, excess.shape[2])):
+    block = piece * run
+    while block < wp.min(piece * run + run, excess.shape[2]):
         right = wp.min(block * BLOCK + BLOCK, render.shape[2])
         across = wp.vec3()
         down = wp.vec3()
-        for y in range(row * BLOCK, bottom):
-            for x in range(block * BLOCK, right):
+        y = row * BLOCK
+        while y < bottom:
+            x = block * BLOCK
+            while x < right:
                 a = over_white(render[view, y, x])
                 b = over_white(target[view, y, x])
                 if x + 1 < render.shape[2]:
                     across += wp.abs(over_white(render[view, y, x + 1]) - a) - wp.abs(over_white(target[view, y, x + 1]) - b)
                 if y + 1 < render.shape[1]:
                     down += wp.abs(over_white(render[view, y + 1, x]) - a) - wp.abs(over_white(target[view, y + 1, x]) - b)
+                x += 1
+            y += 1
         across *= 1.0 / float(BLOCK * BLOCK)
         down *= 1.0 / float(BLOCK * BLOCK)
         excess[view, row, block, 0] = across
         excess[view, row, block, 1] = down
         total += wp.dot(across, across) + wp.dot(down, down)
+        block += 1
     wp.atomic_add(sums, view, row, total)
 
 
@@ -84,7 +90,8 @@ def differentiate(first_row: int, run: int, height: int, weight: float, render: 
     tid, piece = wp.tid()
     view = (first_row + tid) // height
     y = (first_row + tid) % height
-    for x in range(piece * run, wp.min(piece * run + run, render.shape[2])):
+    x = piece * run
+    while x < wp.min(piece * run + run, render.shape[2]):
         here = over_white(render[view, y, x])
         g = wp.vec3()
         if x + 1 < render.shape[2]:
@@ -97,3 +104,4 @@ def differentiate(first_row: int, run: int, height: int, weight: float, render: 
             g += wp.cw_mul(excess[view, (y - 1) // BLOCK, x // BLOCK, 1], signs(here - over_white(render[view, y - 1, x])))
         g *= weight
         gradient[view, y, x] += wp.vec4(g[0], g[1], g[2], -(g[0] + g[1] + g[2]))
+        x += 1

@@ -130,14 +130,6 @@ def kernels(pixels: int = 1) -> SimpleNamespace:
             blurred[3, row + 1, x] = lower_dd
 
     @wp.func
-    def blur_row(maps: wp.array3d(dtype=vector), m: int, row: int, x: int):
-        """Blur a row of map ``m`` for the windows that begin at x."""
-        mean = vector()
-        for k in range(TAPS):
-            mean += UPPER[k] * maps[m, row, x + k]
-        return mean
-
-    @wp.func
     def compare(
         begin: int, end: int, thread: int, threads: int, row: int,
         blurred: wp.array3d(dtype=vector), fresh: wp.array(dtype=vector), slopes: wp.array3d(dtype=vector),
@@ -146,10 +138,15 @@ def kernels(pixels: int = 1) -> SimpleNamespace:
         total = vector()
         for i in range(thread, (end - begin + step - 1) // step, threads):
             x = wp.min(begin + step * i, end - step)
-            mean_s = blur_row(blurred, 0, row, x)
-            mean_d = blur_row(blurred, 1, row, x)
-            mean_ss = blur_row(blurred, 2, row, x)
-            mean_dd = blur_row(blurred, 3, row, x)
+            mean_s = vector()
+            mean_d = vector()
+            mean_ss = vector()
+            mean_dd = vector()
+            for k in range(TAPS):
+                mean_s += UPPER[k] * blurred[0, row, x + k]
+                mean_d += UPPER[k] * blurred[1, row, x + k]
+                mean_ss += UPPER[k] * blurred[2, row, x + k]
+                mean_dd += UPPER[k] * blurred[3, row, x + k]
             square_s = wp.cw_mul(mean_s, mean_s)
             square_d = wp.cw_mul(mean_d, mean_d)
             variance_s = mean_ss - square_s + c2
@@ -186,10 +183,17 @@ def kernels(pixels: int = 1) -> SimpleNamespace:
         """Adjoint of the blur along a row: a blur of the row with REACH zeros on both sides. Row -1 gives zero."""
         for i in range(thread, (end - begin + step - 1) // step, threads):
             x = wp.min(begin + step * i, end - step)
-            for m in range(3):
-                spread[m, to_row, x] = vector()
-                if row >= 0:
-                    spread[m, to_row, x] = blur_row(slopes, m, row, x)
+            of_s = vector()
+            of_ss = vector()
+            of_dd = vector()
+            if row >= 0:
+                for k in range(TAPS):
+                    of_s += UPPER[k] * slopes[0, row, x + k]
+                    of_ss += UPPER[k] * slopes[1, row, x + k]
+                    of_dd += UPPER[k] * slopes[2, row, x + k]
+            spread[0, to_row, x] = of_s
+            spread[1, to_row, x] = of_ss
+            spread[2, to_row, x] = of_dd
 
     @wp.func
     def spread_columns(
