@@ -60,10 +60,7 @@ class AdamFused(AdamReference):
         return replace(state, occupied=occupancy(state.texels))
 
     def update(self, step: int, rate: float, betas: tuple[float, float], binarization: float = 0.0, alpha_rate: float = 1.0) -> None:
-        """As :meth:`bbfit.operators.adam.reference.AdamReference.update`, up to rounding and :func:`rest_after`.
-
-        Binarization does not wake blocks that rest.
-        """
+        """As of the reference, up to rounding and :func:`rest_after`; binarization does not wake blocks that rest."""
         beta1, beta2 = betas
         run = 1 if self.texels.is_cuda else RUN
         rate, correction = rate / (1 - beta1**step), (1 - beta2**step) ** -0.5

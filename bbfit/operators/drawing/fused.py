@@ -69,10 +69,9 @@ def occupancy(texels: Tensor) -> Tensor:
 
 
 def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None, out: Tensor | None = None) -> Tensor:
-    """Draw texels, float32 [P, 4], contiguous: premultiplied RGBA, float32 [V, H, W, 4].
+    """Draw texels, float32 [P, 4], contiguous: premultiplied RGBA, float32 [V, H, W, 4], into ``out``, contiguous, if given.
 
-    ``occupied`` is the :func:`occupancy` of the texels, computed if omitted. ``out`` is memory for the picture, contiguous; it is
-    overwritten completely.
+    ``occupied`` is the :func:`occupancy` of the texels, computed if omitted.
     """
     views, height, width = len(projection), projection.height, projection.width
     image = torch.empty(views, height, width, 4, dtype=torch.float32, device=texels.device) if out is None else out
@@ -99,25 +98,15 @@ def differentiate(
     occupied: Tensor | None = None,
     placement: bool = False,
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Backward pass of :func:`draw`, which adds the gradient in texels to ``texel_gradient``.
+    """Backward pass of :func:`draw` for texels [P, 4], which adds their gradient to ``texel_gradient``; both float32, contiguous.
 
-    Parameters
-    ----------
-    texels, texel_gradient
-        Float32 [P, 4], contiguous.
-    image_gradient
-        Gradient of a loss in the picture, float32 [V, H, W, 4], contiguous.
-    loss
-        A loss of the picture that is computed on the way and whose gradient is added to ``image_gradient``.
-    occupied
-        :func:`occupancy` of the texels; computed if omitted.
-    placement
-        Whether to compute the gradient in ``projection.to_texel``.
+    The picture's gradient is ``image_gradient``, float32 [V, H, W, 4], contiguous, plus that of ``loss``, which is computed on the way.
+    ``occupied`` is the :func:`occupancy` of the texels, computed if omitted.
 
     Returns
     -------
     tuple[Tensor or None, Tensor or None]
-        The sum of ``loss`` over each view's pixels, float64 [V], if there is a loss; the gradient in the homographies, float64
+        The sum of ``loss`` over each view's pixels, float64 [V], if there is a loss; the gradient in ``projection.to_texel``, float64
         [V, N, 3, 3], if ``placement``.
     """
     views, height, count, device = len(projection), projection.height, projection.count, texels.device
@@ -180,7 +169,7 @@ def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -
 
 
 def _test(mode: AlphaMode) -> Any:
-    """An alpha mode for a kernel: the cutoff (0: blend, -1: hash), the hardness (0: a step) and the slope of the gradient."""
+    """An alpha mode as :func:`~bbfit.operators.drawing.sampling_kernels.opacity` expects it."""
     if mode.kind != "mask":
         return wp.vec3(0.0 if mode.kind == "blend" else -1.0, 0.0, 0.0)
     return wp.vec3(mode.cutoff, 0.0 if math.isinf(mode.hardness) else mode.hardness, min(mode.hardness, STEEPEST))

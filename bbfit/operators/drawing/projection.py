@@ -89,17 +89,9 @@ def project(cloud: BillboardCloud, camera: Camera) -> Projection:
     table = texture_table(cloud)
     first = table[:, 0] + torch.where(signed_distance(cloud, cameras).detach() >= 0, 0, table[:, 3])
     boxes, rows_apart = _extents(to_pixel.detach(), cloud.texture_sizes, visible, height, width)
-    return Projection(
-        to_texel.to(torch.float32),
-        nearness.detach().to(torch.float32),
-        torch.cat([first[..., None], table[:, 1:3].expand(*first.shape, 2)], -1),
-        boxes,
-        rows_apart,
-        width,
-        height,
-        cameras.orthographic,
-        cloud.alpha,
-    )
+    textures = torch.cat([first[..., None], table[:, 1:3].expand(*first.shape, 2)], -1)
+    matrices, nearness = to_texel.to(torch.float32), nearness.detach().to(torch.float32)
+    return Projection(matrices, nearness, textures, boxes, rows_apart, width, height, cameras.orthographic, cloud.alpha)
 
 
 def texture_table(cloud: BillboardCloud) -> Tensor:

@@ -18,10 +18,8 @@ from bbfit.operators.launching import struct_array
 
 
 class Projector:
-    """Projects billboards whose placement changes into some of V views at a time.
-
-    The same as :func:`bbfit.operators.drawing.projection.project`, up to the rounding of float64.
-    """
+    """Projects billboards whose placement changes into some of V views at a time, as
+    :func:`bbfit.operators.drawing.projection.project` does, up to the rounding of float64."""
 
     def __init__(self, cloud: BillboardCloud, cameras: Camera) -> None:
         cameras = cameras.batch().to(torch.float64)

@@ -41,10 +41,8 @@ def image_loss_fused(render: Tensor, target: Tensor, kind: Loss, ssim_weight: fl
 
 
 def add_structure(render: Tensor, target: Tensor, ssim_weight: float, sharpness_weight: float, out: Tensor) -> Tensor | float:
-    """The weighted terms for structure and sharpness of :func:`image_loss_fused`, a float64 scalar.
-
-    ``out`` is memory for their gradient in ``render``; it is overwritten completely. All pictures are float32 [V, H, W, 4], contiguous.
-    """
+    """The weighted terms for structure and sharpness of :func:`image_loss_fused`, a float64 scalar; ``out`` becomes their gradient in
+    ``render``. All pictures are float32 [V, H, W, 4], contiguous."""
     lost: Tensor | float = 0.0
     if ssim_weight:
         lost = ssim_weight * (1 - ssim_and_gradient(render, target, -ssim_weight, out)[0])
@@ -56,10 +54,7 @@ def add_structure(render: Tensor, target: Tensor, ssim_weight: float, sharpness_
 
 
 def unpacked(packed: Tensor, straight: bool, out: Tensor | None = None) -> Tensor:
-    """8-bit RGBA, straight or premultiplied, uint8 [V, H, W, 4], contiguous, as premultiplied RGBA in [0, 1], float32.
-
-    ``out`` is memory for the result, contiguous; it is overwritten completely.
-    """
+    """8-bit RGBA, straight or premultiplied, uint8 [V, H, W, 4], as premultiplied RGBA, float32, in ``out`` if given; all contiguous."""
     image = torch.empty(packed.shape, dtype=torch.float32, device=packed.device) if out is None else out
     run, on = 1 if packed.is_cuda else 1 << 10, wp.device_from_torch(packed.device)
     arguments = [run, warp_array(packed.view(torch.int32).flatten(), wp.int32), int(straight)]

@@ -10,22 +10,17 @@ from bbfit.operators.ssim.reference import ssim_reference
 
 
 def image_loss_reference(render: Tensor, target: Tensor, kind: Loss, ssim_weight: float, sharpness_weight: float = 0.0) -> Tensor:
-    """The mean of :func:`pixel_loss_reference` plus weighted terms for structure and sharpness.
+    """Loss of a render, a scalar that is differentiable in both pictures.
 
     Parameters
     ----------
     render, target
         Premultiplied RGBA in [0, 1], [V, H, W, 4].
     kind
-        Loss of a pixel.
+        Loss of a pixel (:func:`pixel_loss_reference`), whose mean is taken.
     ssim_weight, sharpness_weight
         Factors of 1 - SSIM (:func:`~bbfit.operators.ssim.reference.ssim_reference`) and of
-        :func:`~bbfit.operators.sharpness.reference.sharpness_reference`.
-
-    Returns
-    -------
-    Tensor
-        A scalar, differentiable in both pictures.
+        :func:`~bbfit.operators.sharpness.reference.sharpness_reference`, which are added.
     """
     loss = pixel_loss_reference(render, target, kind).mean()
     if ssim_weight:

@@ -46,10 +46,8 @@ def signs(d: wp.vec3) -> wp.vec3:
 
 @wp.kernel
 def measure(first_row: int, run: int, rows: int, render: Pictures, target: Pictures, excess: Excess, sums: wp.array2d(dtype=wp.float32)):
-    """Write e_B for rows and columns to ``excess`` [V, H', W', 2]; add its squares to ``sums`` [V, H'].
-
-    Launched over the rows of blocks of all views, from ``first_row`` on, and runs of blocks.
-    """
+    """Write e_B for rows and columns to ``excess`` [V, H', W', 2]; add its squares to ``sums`` [V, H']; launched over rows and runs of
+    blocks."""
     tid, piece = wp.tid()
     view = (first_row + tid) // rows
     row = (first_row + tid) % rows
@@ -83,10 +81,8 @@ def measure(first_row: int, run: int, rows: int, render: Pictures, target: Pictu
 
 @wp.kernel
 def differentiate(first_row: int, run: int, height: int, weight: float, render: Pictures, excess: Excess, gradient: Pictures):
-    """Add ``weight``, which is a multiple of 2 / (N n), times the bracket of the backward pass to ``gradient``.
-
-    Launched over the rows of all views, from ``first_row`` on, and runs of pixels.
-    """
+    """Add ``weight``, a multiple of 2 / (N n), times the bracket of the backward pass to ``gradient``; launched over rows and runs of
+    pixels."""
     tid, piece = wp.tid()
     view = (first_row + tid) // height
     y = (first_row + tid) % height
