@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
 
 import torch
 import warp as wp
@@ -48,16 +47,16 @@ class AdamFused(AdamReference):
     def start(texels: Tensor) -> AdamFused:
         """The state before the first step, which takes over the memory of ``texels`` [P', 4], as :meth:`padded` returns them."""
         never = torch.full((len(texels) // BLOCK,), -(1 << 30), dtype=torch.int32, device=texels.device)
-        return AdamFused(*vars(AdamReference.start(texels)).values(), never, occupancy(texels))
+        return AdamFused(texels, *(torch.zeros_like(texels) for _ in range(3)), last=never, occupied=occupancy(texels))
 
     def tensors(self) -> dict[str, Tensor]:
         """As of the reference, and the last steps with a gradient."""
         return {**super().tensors(), "last": self.last}
 
-    def restored(self, tensors: dict[str, Tensor]) -> Self:
+    def restored(self, tensors: dict[str, Tensor]) -> AdamFused:
         """The state that :meth:`tensors` returned."""
-        state = super().restored(tensors)
-        return replace(state, occupied=occupancy(state.texels))
+        kept = {name: tensor.to(self.texels.device) for name, tensor in tensors.items()}
+        return replace(AdamFused.start(kept["texels"]), **kept)
 
     def update(self, step: int, rate: float, betas: tuple[float, float], binarization: float = 0.0, alpha_rate: float = 1.0) -> None:
         """As of the reference, up to rounding and :func:`rest_after`; binarization does not wake blocks that rest."""

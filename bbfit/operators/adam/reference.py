@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Self
 
 import torch
 from torch import Tensor
@@ -45,10 +44,9 @@ class AdamReference:
         """What :meth:`restored` needs to continue; the gradient is zero between steps."""
         return {"texels": self.texels, "first_moment": self.first_moment, "second_moment": self.second_moment}
 
-    def restored(self, tensors: dict[str, Tensor]) -> Self:
+    def restored(self, tensors: dict[str, Tensor]) -> AdamReference:
         """The state that :meth:`tensors` returned."""
-        kept = {name: tensor.to(self.texels.device) for name, tensor in tensors.items()}
-        return replace(self, gradient=torch.zeros_like(kept["texels"]), **kept)
+        return replace(self.start(self.texels), **{name: tensor.to(self.texels.device) for name, tensor in tensors.items()})
 
     def update(self, step: int, rate: float, betas: tuple[float, float], binarization: float = 0.0, alpha_rate: float = 1.0) -> None:
         """Take a step of Adam (Kingma and Ba 2015, algorithm 1) and clamp texels to [0, 1].

@@ -31,10 +31,11 @@ def add_sharpness_gradient(render: Tensor, target: Tensor, weight: float, gradie
     pictures = [warp_array(picture, wp.vec4) for picture in (render, target, gradient)]
     blocks, totals = warp_array(excess, wp.vec3), warp_array(sums, wp.float32)
     terms = views * rows * columns * 3
-    arguments = ([rows, *pictures[:2]], [height, weight * 2 / terms / BLOCK**2, pictures[0], blocks])
-    outputs = ([blocks, totals], [pictures[2]])
-    sizes = ((rows, columns, width * BLOCK), (height, width, width))
-    for kernel, inputs, written, (down, along, pixels) in zip((measure, differentiate), arguments, outputs, sizes, strict=True):
+    factor = weight * 2 / terms / BLOCK**2
+    for kernel, (down, along, pixels), inputs, written in (
+        (measure, (rows, columns, width * BLOCK), [rows, *pictures[:2]], [blocks, totals]),
+        (differentiate, (height, width, width), [height, factor, pictures[0], blocks], [pictures[2]]),
+    ):
         run = 1 if on.is_cuda else along
         launch(kernel, views * down, -(-LEAST_PIXELS // pixels), [run, *inputs], written, across=-(-along // run), on=on)
     return sums.sum(dtype=torch.float64) / terms
