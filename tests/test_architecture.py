@@ -25,7 +25,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in MODULES}
 GROUPS = (
     ("checks",),
     ("provenance",),
-    ("files", "glb", "model_files", "xatlas_process"),
+    ("files", "glb", "model_files"),
     ("geometry",),
     ("layout",),
     ("images",),
@@ -56,7 +56,7 @@ def relative(path: Path) -> str:
 ONLY_IN = {
     "bpy": {f"blender/{name}.py" for name in ("worker", "worker_scene", "worker_glb")},
     "cv2": {"images.py", "fitting/bounds.py"},
-    "xatlas": {"xatlas_process.py"},
+    "xatlas": {"exporting/packing.py"},
     "warp": {
         "operators/launching.py",
         "operators/drawing/projector.py",

@@ -302,7 +302,7 @@ def test_sweep_shows_its_runs_and_what_failed(views_folder: Path, tmp_path: Path
     bad = tmp_path / "bad.ply"
     bad.write_bytes(b"no tree")
     grid = tmp_path / "grid.yaml"
-    grid.write_text("axes: {seed: [0, 1]}")
+    grid.write_text("fit: {billboards: 2}\naxes: {seed: [0, 1]}")
     options = [
         "--grid",
         str(grid),
@@ -310,8 +310,6 @@ def test_sweep_shows_its_runs_and_what_failed(views_folder: Path, tmp_path: Path
         "3",
         "--workers",
         "1",
-        "--billboards",
-        "2",
         "--candidates",
         "1",
         "--refinement-rounds",

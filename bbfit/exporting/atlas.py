@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from bbfit.exporting.packing import packed
 from bbfit.geometry.cards import Atlas
 from bbfit.images import bleed_color
-from bbfit.xatlas_process import packed
 
 # Side of the blocks in which graphics cards compress textures, in texels.
 BLOCK = 4

@@ -1,4 +1,4 @@
-"""A closed triangle mesh whose vertices and RGBA texture are learned from the views.
+"""A rival to billboards: a closed triangle mesh whose vertices and RGBA texture are learned from the views.
 
 In the spirit of "Appearance-Driven Automatic 3D Model Simplification" (Hasselgren et al. 2021, with opacity in the texture, as for its
 foliage) and "Extracting Triangular 3D Models, Materials, and Lighting From Images" (Munkberg et al. 2022), without their
@@ -23,11 +23,11 @@ from torch.nn import functional
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.geometry.camera import Camera
 from bbfit.images import bleed_color, to_bytes
+from bbfit.rivals.mesh_charts import unfold
 from bbfit.rivals.mesh_hull import hull_surface
 from bbfit.rivals.mesh_rays import RayCaster, pixel_rays
 from bbfit.rivals.mesh_silhouettes import Surface, boundary_gradient
 from bbfit.views import ViewSet
-from bbfit.xatlas_process import unfolded
 
 DRAW_GRID = 4
 """Samples along a pixel's side when a mesh is drawn: 16 a pixel, at the centers of a regular grid's cells."""
@@ -149,11 +149,11 @@ def refine_mesh(
 ) -> LearnedMesh:
     """Move a mesh's vertices and paint its texture so that it looks like the views; triangles and texture coordinates stay.
 
-    Each step draws one view and descends on the mean squared error of its premultiplied RGBA. Its gradient has two parts: the
-    interior, by automatic differentiation of each sample, and the silhouettes, by sampling points on them (Li et al. 2018, "Differentiable
+    Each step draws one view and descends on the mean squared error of its premultiplied RGBA. Its gradient has two parts: that of what
+    each sample sees, by automatic differentiation, and that of the silhouettes, by sampling points on them (Li et al. 2018, "Differentiable
     Monte Carlo Ray Tracing through Edge Sampling"). Vertices descend along smoothed gradients (Nicolet et al. 2021, "Large Steps in
-    Inverse Rendering of Geometry"), texels by Adam (Kingma and Ba 2015). Threads add up gradients in any order, so that two runs with
-    one seed differ slightly.
+    Inverse Rendering of Geometry"), texels by Adam (Kingma and Ba 2015). Threads add up gradients in any order, so that two runs of one
+    seed are alike but not equal.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ def _target(views: ViewSet, index: int, size: int) -> tuple[Camera, Tensor]:
 
 
 def _within(points: NDArray[np.float64], triangles: NDArray[np.int64], vertices: int, texels: int) -> LearnedMesh:
-    """The finest simplification (Garland and Heckbert 1997) of a surface within a number of vertices, by bisection."""
+    """The finest simplification (Garland and Heckbert 1997) of a surface that keeps to a number of vertices, found by halving."""
     try:
         import fast_simplification
     except ImportError:
@@ -256,7 +256,7 @@ def _within(points: NDArray[np.float64], triangles: NDArray[np.int64], vertices:
     while low <= high:
         middle = (low + high) // 2
         places, faces = fast_simplification.simplify(points.astype(np.float32), triangles, target_count=middle)
-        source, corners, uvs = unfolded(places.astype(np.float64), faces.astype(np.int64), texels)
+        source, corners, uvs = unfold(places.astype(np.float64), faces.astype(np.int64), texels)
         if len(source) <= vertices:
             low, best = middle + 1, (places[source], corners, uvs)
         else:

@@ -1,4 +1,4 @@
-"""xatlas in a process of its own; test_atlas.py and test_learned_mesh.py show that nothing overlaps."""
+"""Packing by xatlas in a process of its own; that nothing overlaps is shown on the atlases in test_atlas.py."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bbfit.xatlas_process import packed
+from bbfit.exporting.packing import packed
 
 CELLS = np.array([[3, 3], [4, 5], [2, 9], [40, 2]])
 
