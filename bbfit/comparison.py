@@ -21,7 +21,7 @@ from bbfit.exporting.lod import glb_counts
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
-from bbfit.fitting.initialize import pixels_a_meter
+from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, read_rgba, to_bytes, unpremultiply, write_png
 from bbfit.pipeline import RunConfig, run
@@ -142,7 +142,7 @@ class _Comparison:
     ) -> None:
         self._tree, self._views, self._record, self._config, self._stages = tree, views, record, config, stages
         self._folder, self._on_progress = record.folder, on_progress
-        self._bake = BakeConfig(float(pixels_a_meter(views.train.cameras)), views=stages.views)
+        self._bake = BakeConfig(float(pixels_per_meter(views.train.cameras)), views=stages.views)
         self._size: int | None = None
         count, many, crossed = config.billboards, config.many, config.crossed
         self._systems: dict[str, tuple[str, Callable[[Path], _SystemResult]]] = {

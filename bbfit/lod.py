@@ -13,7 +13,7 @@ from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
-from bbfit.fitting.initialize import pixels_a_meter
+from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.pipeline import RunConfig, RunResult, run
 from bbfit.provenance import digest_file
 from bbfit.reporting.plots import lod_picture
@@ -157,7 +157,7 @@ def _original(record: Record, tree: TreeFile, config: LodConfig, on_progress: On
 
 def _switches(views: ViewDataset, runs: list[RunResult], config: LodConfig) -> list[_Switch]:
     """The switch of each run. The first one has an infinite scale if it is the finest level."""
-    view_scale = float(pixels_a_meter(views.train.cameras))
+    view_scale = float(pixels_per_meter(views.train.cameras))
     switches = list[_Switch]()
     for fitted in runs:
         error, held_out_error = (worst_silhouette(fitted.cloud, split) / view_scale for split in (views.train, views.test))
@@ -172,7 +172,7 @@ def _levels(
     views: ViewDataset, models: list[bytes], fits: list[RunResult | None], switches: list[_Switch], config: LodConfig, name: str
 ) -> tuple[LodLevel, ...]:
     """The measurements of the levels."""
-    view_scale = float(pixels_a_meter(views.train.cameras))
+    view_scale = float(pixels_per_meter(views.train.cameras))
     assert views.request and views.request.tree.bounds
     low, high = views.request.tree.bounds
     height, radius = high[1] - low[1], math.dist(low, high) / 2

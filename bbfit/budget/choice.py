@@ -152,10 +152,7 @@ def lookup(trials: Sequence[Trial]) -> Callable[[FitConfig], Trial | None]:
 def within_bytes(cloud: BillboardCloud, max_bytes: int | None, export: ExportConfig) -> BillboardCloud:
     """Shrink the textures of a cloud until the exported model has at most ``max_bytes`` bytes; ``None`` is no limit.
 
-    Raises
-    ------
-    InputError
-        If the model is larger even with one texel per texture.
+    Raises InputError if the model is larger even with one texel per texture.
     """
     while max_bytes is not None and (size := model_bytes(cloud, export)) > max_bytes:
         if int(cloud.texture_sizes.amax()) == 1:

@@ -69,13 +69,7 @@ def _flattened(default: Any, name: str, taken: set[str]) -> Any:
 
 
 def refuse_dotted(arguments: Sequence[str]) -> None:
-    """Refuse the prefixed options of earlier versions.
-
-    Raises
-    ------
-    InputError
-        naming the option to use instead.
-    """
+    """Refuse the prefixed options of earlier versions: raise an InputError that names the option to use instead."""
     for argument in arguments:
         if (dotted := _DOTTED.match(argument)) and dotted[2] != "seed":
             option = f"--{dotted[1]}.{dotted[2]}"

@@ -33,19 +33,8 @@ def facing_cosines(camera: Camera, normals: Tensor, target: Tensor) -> Tensor:
 def facing_view_bounds(planes: BillboardCloud, views: ViewSet, *, pairs: bool) -> Tensor:
     """Bound every billboard by the silhouette in the view that it faces best (thesis, section 6.3).
 
-    Parameters
-    ----------
-    planes
-        Billboards through a common center, of any extent.
-    views
-        Views of the tree.
-    pairs
-        Whether odd entries are the backs of pairs, which face the opposite direction.
-
-    Returns
-    -------
-    Tensor
-        Left, right, bottom and top along the billboard's axes from its center, in meters, [N, 4].
+    The billboards, of any extent, have a common center. With ``pairs``, odd ones are the backs of pairs, which face the opposite direction.
+    Returns left, right, bottom and top along the billboard's axes from its center, in meters, [N, 4].
     """
     cosines = facing_cosines(views.cameras, planes.normals, planes.centers[0])
     if pairs:
@@ -161,16 +150,8 @@ def _bounds_on_plane(planes: BillboardCloud, n: int, camera: Camera, pixels: Ten
 def smallest_rectangle(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Find the smallest rectangle around points in a plane, [P, 2].
 
-    The rectangle is rotated, by 45 degrees at most, only if that makes it at least a fifth smaller.
-
-    Returns
-    -------
-    center
-        [2].
-    axis
-        Unit vector along the width, [2].
-    half_extents
-        Half width and half height, [2].
+    It is rotated, by 45 degrees at most, only if that makes it at least a fifth smaller. Returns its center, [2], the unit vector along its
+    width, [2], and its half width and half height, [2].
     """
     low, high = points.amin(0), points.amax(0)
     upright = torch.tensor([1.0, 0.0], dtype=points.dtype)

@@ -44,22 +44,10 @@ def view_projection(camera: Camera) -> Tensor:
 
 
 def cluster_planes(points: Tensor, count: int, projection: Tensor, *, upright: bool, generator: torch.Generator) -> Planes:
-    """Cluster points onto planes, from random initial planes.
+    """Cluster points, float64 [P, 3], onto ``count`` planes, at least one, from random initial planes.
 
-    Two steps alternate: assign each point to the plane that displaces it least, and fit each plane to its points.
-
-    Parameters
-    ----------
-    points
-        Float64 [P, 3].
-    count
-        Number of planes K, at least 1.
-    projection
-        :func:`view_projection` of the cameras, [3, 3].
-    upright
-        Whether all planes contain the vertical.
-    generator
-        Source of the initial planes.
+    Two steps alternate: assign each point to the plane that displaces it least, and fit each plane to its points. ``projection`` is the
+    :func:`view_projection` of the cameras. With ``upright``, all planes contain the vertical.
     """
     normals = torch.randn(count, 3, dtype=points.dtype, generator=generator)
     if upright:
@@ -70,21 +58,10 @@ def cluster_planes(points: Tensor, count: int, projection: Tensor, *, upright: b
 
 
 def split_planes(points: Tensor, axes: Tensor, projection: Tensor, *, upright: bool) -> Planes:
-    """Cluster points onto two planes.
+    """Cluster points, float64 [P, 3], onto two planes.
 
-    For each axis, the clustering starts from the two halves of the points below and above the median along that axis. The clustering that
-    displaces the points least is returned.
-
-    Parameters
-    ----------
-    points
-        Float64 [P, 3].
-    axes
-        Directions, [A, 3].
-    projection
-        :func:`view_projection` of the cameras, [3, 3].
-    upright
-        Whether both planes contain the vertical.
+    For each of A directions, [A, 3], the clustering starts from the two halves of the points below and above the median along it. The
+    clustering that displaces the points least is returned. ``projection`` and ``upright`` are those of :func:`cluster_planes`.
     """
     results = []
     for axis in axes.to(points):
@@ -134,21 +111,8 @@ def moments(points: Tensor, labels: Tensor, count: int) -> Tensor:
 def best_planes(sums: Tensor, *, upright: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Fit a plane to each cluster by least squares: the normal is the direction of least variance (Pearson 1901).
 
-    Parameters
-    ----------
-    sums
-        :func:`moments` of the clusters, [K, 4, 4].
-    upright
-        Whether all planes contain the vertical.
-
-    Returns
-    -------
-    normals
-        Unit vectors, [K, 3].
-    offsets
-        Meters, [K].
-    squares
-        Sums of squared distances, [K].
+    ``sums`` are the :func:`moments` of K clusters. With ``upright``, all planes contain the vertical. Returns the unit normals, [K, 3], the
+    offsets in meters, [K], and the sums of squared distances, [K].
     """
     means = sums[:, :3, 3] / sums[:, 3, 3:].clamp_min(1)
     scatter = sums[:, :3, :3] - means[:, :, None] * sums[:, None, :3, 3]
@@ -162,35 +126,16 @@ def best_planes(sums: Tensor, *, upright: bool) -> tuple[Tensor, Tensor, Tensor]
     return normals, (normals * means).sum(-1), values[:, 0].clamp_min(0)
 
 
-def rectangles(points: Tensor, planes: Planes, texels_a_meter: float, margin: float, *, two_sided: bool) -> BillboardCloud:
-    """Place the smallest rectangle that contains the points of each plane.
+def rectangles(points: Tensor, planes: Planes, texels_per_meter: float, margin: float, *, two_sided: bool) -> BillboardCloud:
+    """Place the smallest rectangle that contains the points, float64 [P, 3], of each of K planes, plus a margin in meters on every side.
 
-    A rectangle is upright unless a rotated one is a fifth smaller.
-
-    Parameters
-    ----------
-    points
-        Float64 [P, 3].
-    planes
-        K planes and the assignment of the points.
-    texels_a_meter
-        Texels per meter along each side.
-    margin
-        Meters to add on every side.
-    two_sided
-        Whether each rectangle has a back texture.
-
-    Returns
-    -------
-    BillboardCloud
-        K billboards, float64, with transparent textures.
+    A rectangle is upright unless a rotated one is a fifth smaller. Returns K billboards, float64, with transparent textures of
+    ``texels_per_meter`` along each side. Two-sided ones have a back texture.
     """
     parts = []
     for k, (normal, offset) in enumerate(zip(planes.normals, planes.offsets, strict=True)):
         members = points[planes.labels == k]
-        up = torch.tensor([0.0, 1.0, 0.0], dtype=points.dtype)
-        if float(normal[1].abs()) > 0.999:
-            up = torch.tensor([0.0, 0.0, -1.0], dtype=points.dtype)
+        up = torch.tensor([0.0, 0.0, -1.0] if float(normal[1].abs()) > 0.999 else [0.0, 1.0, 0.0], dtype=points.dtype)
         right = torch.nn.functional.normalize(torch.linalg.cross(up, normal), dim=0)
         up = torch.linalg.cross(normal, right)
         flat = torch.stack([members @ right, members @ up], -1) if len(members) else torch.zeros(1, 2, dtype=points.dtype)
@@ -200,25 +145,14 @@ def rectangles(points: Tensor, planes: Planes, texels_a_meter: float, margin: fl
     centers, rights, ups, halves = (torch.stack(part) for part in zip(*parts, strict=True))
     sizes, sides = torch.ones(len(centers), 2, dtype=torch.int64), torch.full((len(centers),), two_sided)
     cloud = BillboardCloud(centers, rights, ups, halves, sizes, sides, torch.zeros(len(centers) * (1 + two_sided), 4))
-    return sized(cloud, texels_a_meter)
+    return sized(cloud, texels_per_meter)
 
 
 def splatted(cloud: BillboardCloud, points: Tensor, colors: Tensor, labels: Tensor) -> BillboardCloud:
-    """Splat the points of each billboard into its texture.
+    """Splat points, [P, 3], with straight RGB, [P, 3], into the textures of N billboards at the indices ``labels``, int64 [P].
 
     The color of a texel is the mean color of its points. Its alpha is 1 - exp(-n / m), the expected coverage of randomly placed surface,
     where n is the number of points in the texel and m the mean of n over the texels of the billboard that contain points.
-
-    Parameters
-    ----------
-    cloud
-        N billboards.
-    points
-        [P, 3].
-    colors
-        Straight RGB, [P, 3].
-    labels
-        Billboard of every point, int64 [P].
     """
     textures = []
     for k, (h, w) in enumerate(cloud.texture_sizes.tolist()):

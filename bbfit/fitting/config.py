@@ -173,12 +173,9 @@ class FitConfig:
 
 
 class ResolvedFit(FitConfig):
-    """A :class:`FitConfig` with every choice made: of its fields only ``max_texels`` may be None.
+    """A :class:`FitConfig` in which only ``max_texels`` may be ``None``.
 
-    Raises
-    ------
-    InputError
-        if a value is missing, or values contradict each other.
+    Raises InputError if a value is missing, or values contradict each other.
     """
 
     alpha: AlphaKind

@@ -34,10 +34,7 @@ class FusedPass:
     def differentiate(self, state: AdamFused, chosen: Sequence[int], alpha: AlphaMode, moves: bool) -> tuple[Tensor, Tensor | None]:
         """Add the gradient in the texels to ``state.gradient``, for the chosen views drawn in an alpha mode.
 
-        Returns
-        -------
-        tuple[Tensor, Tensor or None]
-            The loss, a scalar, and the gradient in the movement's parameters, [N, 8], if the billboards move.
+        Returns the loss, a scalar, and the gradient in the movement's parameters, [N, 8], if the billboards move.
         """
         config, device, movement, projector, groups = self._config, state.texels.device, self._movement, self._projector, self._groups
         if movement is not None and projector is not None:

@@ -26,30 +26,27 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
     of a camera that faces them (thesis, sections 4.2 and 6.3).
     """
     camera, resolved = views.cameras, config.resolve()
-    axis, focal = convergence_point(camera), pixels_a_meter(camera)
+    axis, focal = convergence_point(camera), pixels_per_meter(camera)
     density = resolved.texel_density * float(focal)
     size = torch.tensor([camera.height, camera.width])
-    sides = resolved.sides
     planes = even_upright(
         resolved.billboards,
         axis=axis,
         half_extents=size.flip(0) / focal / 2,
         texture_sizes=_at_least_one(size * resolved.texel_density),
-        sides=sides,
+        sides=resolved.sides,
         gap=PAIR_GAP * float(camera.width / focal / 2),
     )
-    if resolved.bounds != "viewport":
-        if resolved.bounds == "thesis":
-            bounds = facing_view_bounds(planes, views, pairs=sides == "pair")
-        else:
-            bounds = silhouette_bounds(planes, views)
-        planes = bounded(planes, bounds, density, resolved.max_texels)
+    if resolved.bounds == "thesis":
+        planes = bounded(planes, facing_view_bounds(planes, views, pairs=resolved.sides == "pair"), density, resolved.max_texels)
+    elif resolved.bounds == "silhouette":
+        planes = bounded(planes, silhouette_bounds(planes, views), density, resolved.max_texels)
     elif resolved.max_texels is not None:
         planes = sized(planes, density, resolved.max_texels)
     return random_textures(planes.to(torch.float32), planes.texture_sizes, resolved.seed)
 
 
-def pixels_a_meter(camera: Camera) -> Tensor:
+def pixels_per_meter(camera: Camera) -> Tensor:
     """Compute the pixels per meter at the tree's axis, perpendicular to the viewing direction, a scalar."""
     focal = camera.intrinsics[:, 0, 0].mean()
     return focal if camera.orthographic else focal / (camera.position - convergence_point(camera)).norm(dim=-1).mean()
@@ -63,7 +60,7 @@ def tree_radius(views: ViewSet) -> float:
         weights = weights / weights.sum(-1, keepdim=True)
         pixel = torch.arange(weights.shape[1], dtype=torch.float64)
         variance += dimensions * float(((weights * pixel.square()).sum(-1) - (weights * pixel).sum(-1).square()).mean())
-    return math.sqrt(variance) / float(pixels_a_meter(views.cameras))
+    return math.sqrt(variance) / float(pixels_per_meter(views.cameras))
 
 
 def random_textures(cloud: BillboardCloud, sizes: Tensor, seed: int) -> BillboardCloud:
@@ -73,53 +70,33 @@ def random_textures(cloud: BillboardCloud, sizes: Tensor, seed: int) -> Billboar
     return replace(cloud, texture_sizes=sizes, texels=texels)
 
 
-def bounded(planes: BillboardCloud, bounds: Tensor, texels_a_meter: float, max_texels: int | None = None) -> BillboardCloud:
-    """Resize billboards to bounds and allocate their textures as :func:`sized` does.
+def bounded(planes: BillboardCloud, bounds: Tensor, texels_per_meter: float, max_texels: int | None = None) -> BillboardCloud:
+    """Resize N billboards to bounds, [N, 4], and allocate their textures as :func:`sized` does.
 
-    Parameters
-    ----------
-    planes
-        N billboards.
-    bounds
-        Left, right, bottom and top along the billboards' axes from their centers, in meters, [N, 4].
-    texels_a_meter
-        Texels per meter along each side.
-    max_texels
-        Most texels of all billboards together.
+    The bounds are left, right, bottom and top along the billboards' axes from their centers, in meters.
     """
     left, right, bottom, top = bounds.unbind(-1)
     middle, sides = torch.stack([left + right, bottom + top], -1) / 2, torch.stack([right - left, top - bottom], -1)
     centers = planes.centers + middle[:, :1] * planes.rights + middle[:, 1:] * planes.ups
-    return sized(replace(planes, centers=centers, half_extents=sides / 2), texels_a_meter, max_texels)
+    return sized(replace(planes, centers=centers, half_extents=sides / 2), texels_per_meter, max_texels)
 
 
-def sized(cloud: BillboardCloud, texels_a_meter: float, max_texels: int | None = None) -> BillboardCloud:
+def sized(cloud: BillboardCloud, texels_per_meter: float, max_texels: int | None = None) -> BillboardCloud:
     """Give billboards transparent textures with square texels, and round the rectangles up to whole texels.
 
-    Parameters
-    ----------
-    cloud
-        N billboards.
-    texels_a_meter
-        Texels per meter along each side. It is lowered if ``max_texels`` requires it.
-    max_texels
-        Most texels of all billboards together.
-
-    Raises
-    ------
-    InputError
-        If there are more textures than ``max_texels`` allows texels.
+    The texels per meter along each side are lowered if ``max_texels``, the most texels of all billboards together, requires it. Raises
+    InputError if there are more textures than ``max_texels`` allows texels.
     """
     sides = 1 + cloud.two_sided.long()
     if max_texels is not None and max_texels < int(sides.sum()):
         fail("max_texels", f"{max_texels} are too few for {int(sides.sum())} textures", "allow more")
     while True:
-        sizes = _at_least_one(2 * cloud.half_extents * texels_a_meter).flip(-1)
+        sizes = _at_least_one(2 * cloud.half_extents * texels_per_meter).flip(-1)
         count = int((sizes.prod(-1) * sides).sum())
         if max_texels is None or count <= max_texels:
             break
-        texels_a_meter *= min(0.995, math.sqrt(max_texels / count))
-    half_extents = sizes.flip(-1).to(cloud.half_extents) / texels_a_meter / 2
+        texels_per_meter *= min(0.995, math.sqrt(max_texels / count))
+    half_extents = sizes.flip(-1).to(cloud.half_extents) / texels_per_meter / 2
     return replace(cloud, half_extents=half_extents, texture_sizes=sizes, texels=cloud.texels.new_zeros(1, 4).expand(count, 4))
 
 

@@ -37,7 +37,6 @@ class Targets:
         if halvings == 0:
             return Targets(views.cameras, views, None)
         width, height = (max(1, round(side / 2**halvings)) for side in (views.cameras.width, views.cameras.height))
-
         shrunk = torch.empty(len(views), height, width, 4, dtype=torch.uint8)
 
         def shrink(index: int) -> None:
@@ -46,8 +45,7 @@ class Targets:
             shrunk[index] = interpolate(picture.permute(2, 0, 1)[None], (height, width), mode="area")[0].permute(1, 2, 0).round()
 
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # each thread has memory of its own
-            for _ in pool.map(shrink, range(len(views))):
-                pass
+            list(pool.map(shrink, range(len(views))))
         return Targets(views.cameras.resized(width, height), views, shrunk)
 
     def packed(self, indices: Sequence[int]) -> Tensor:
@@ -79,23 +77,10 @@ def _resized(texture: Tensor, size: list[int]) -> Tensor:
 
 
 def resampled(cloud: BillboardCloud, onto: BillboardCloud, sizes: Tensor) -> BillboardCloud:
-    """Resample the textures of a cloud onto other rectangles in the same planes.
+    """Resample the textures of N billboards to new heights and widths, int64 [N, 2], onto other rectangles in the same planes.
 
-    The filter is that of :func:`resize_textures`. A texture continues beyond its border as transparent texels of the border's color.
-
-    Parameters
-    ----------
-    cloud
-        N billboards with textures.
-    onto
-        The rectangles to resample onto. Their axes are those of ``cloud``; their centers and extents may differ.
-    sizes
-        New texture heights and widths, int64 [N, 2].
-
-    Returns
-    -------
-    BillboardCloud
-        ``onto`` with the new textures.
+    The rectangles of ``onto`` have the axes of ``cloud``; their centers and extents may differ. The filter is that of
+    :func:`resize_textures`. A texture continues beyond its border as transparent texels of the border's color.
     """
     if torch.equal(cloud.centers, onto.centers) and torch.equal(cloud.half_extents, onto.half_extents):
         return resize_textures(cloud, sizes)

@@ -19,7 +19,7 @@ from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
 from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.coverage import matched_coverage
-from bbfit.fitting.initialize import bounded, pixels_a_meter, random_textures, sized, start_cloud, tree_radius
+from bbfit.fitting.initialize import bounded, pixels_per_meter, random_textures, sized, start_cloud, tree_radius
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.points import hull_points, mesh_points
@@ -143,7 +143,7 @@ def fit(
     started -= state.seconds
 
     start, fitted, losses = state.start, state.placement, state.losses
-    density, radius = config.texel_density * float(pixels_a_meter(views.train.cameras)), tree_radius(views.train)
+    density, radius = config.texel_density * float(pixels_per_meter(views.train.cameras)), tree_radius(views.train)
     for level in (levels := resolution_levels(config, views.train.cameras)):
         if len(losses) > level.end:
             continue  # the checkpoint is from a later level
@@ -194,7 +194,7 @@ def _initial_state(
         return _FitState([], start_cloud(views.train, config), None, {}, 0.0)
     points = hull_points(views.train, seed=config.seed) if tree is None else mesh_points(tree, views.train, seed=config.seed)
     placement = find_placement(views.train, points, config, on_place)
-    density = config.texel_density * float(pixels_a_meter(views.train.cameras))
+    density = config.texel_density * float(pixels_per_meter(views.train.cameras))
     return _FitState([], sized(placement, density, config.max_texels), placement, {}, 0.0)
 
 

@@ -19,15 +19,8 @@ _EXTENT_RATE = 0.3
 class Movement:
     """The movement of N billboards from their initial placement, as eight parameters each, and the state of Adam over them.
 
-    Three parameters are a translation, in multiples of ``reach``. Three are a rotation vector about the billboard's center, in radians.
-    Two are the logarithms of the growth of its half extents, in units of 0.3. Their gradients come from the homographies.
-
-    Parameters
-    ----------
-    cloud
-        The initial placement.
-    reach
-        Length of a unit of translation, in meters.
+    Three parameters are a translation, in multiples of ``reach`` meters. Three are a rotation vector about the billboard's center, in
+    radians. Two are the logarithms of the growth of its half extents, in units of 0.3. Their gradients come from the homographies.
     """
 
     def __init__(self, cloud: BillboardCloud, reach: float) -> None:
@@ -69,20 +62,7 @@ class Movement:
         return torch.cat([cloud.centers + moved[:, :3], *rotated, cloud.half_extents * moved[:, 6:].exp()], -1)
 
     def pull_back(self, placement: Tensor, gradient: Tensor) -> Tensor:
-        """Transform the gradient of a placement to the gradient of :attr:`parameters`.
-
-        Parameters
-        ----------
-        placement
-            The current result of :meth:`placement`, [N, 11].
-        gradient
-            Gradient of the placement, [N, 11].
-
-        Returns
-        -------
-        Tensor
-            [N, 8].
-        """
+        """Transform the gradient of the current :meth:`placement`, both [N, 11], to the gradient of :attr:`parameters`, [N, 8]."""
         center_gradient, right_gradient, up_gradient, extent_gradient = gradient.split((3, 3, 3, 2), -1)
         _, rights, ups, half_extents = placement.split((3, 3, 3, 2), -1)
         vectors = self.parameters[:, 3:6] * self._units[3:6]

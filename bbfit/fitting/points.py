@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from bbfit.checks import fail
-from bbfit.fitting.initialize import pixels_a_meter
+from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, convergence_point
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewSet
@@ -25,30 +25,10 @@ _HULL_SIDE = 256
 
 
 def mesh_points(tree: TreeFile, views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
-    """Sample points on the triangles of a tree's mesh, uniformly by area.
+    """Sample ``count`` points on the triangles of a tree's mesh, uniformly by area, float64 [P, 3] in the world of the views.
 
-    Parameters
-    ----------
-    tree
-        A tree whose triangles can be read without Blender.
-    views
-        Views of the same tree, which verify that the mesh lies where the views show the tree.
-    count
-        Number of points P.
-    seed
-        Seed of the sampling.
-
-    Returns
-    -------
-    Tensor
-        Points in the world of the views, float64 [P, 3].
-
-    Raises
-    ------
-    MissingFileError
-        If the file is missing.
-    InputError
-        If the file cannot be read, has no triangles, or is not of the tree that the views show.
+    The views verify that the mesh, which must be readable without Blender, lies where they show the tree. Raises MissingFileError if the
+    file is missing, and InputError if it cannot be read, has no triangles, or is not of the tree that the views show.
     """
     import trimesh
 
@@ -67,28 +47,10 @@ def mesh_points(tree: TreeFile, views: ViewSet, *, count: int = COUNT, seed: int
 
 
 def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0, batch: int = 1 << 18) -> Tensor:
-    """Sample points uniformly in the visual hull (Laurentini 1994), the space that no view shows as background.
+    """Sample at most ``count`` points uniformly in the visual hull of the views, float64 [P, 3].
 
-    Parameters
-    ----------
-    views
-        Views of the tree.
-    count
-        Most points P.
-    seed
-        Seed of the sampling.
-    batch
-        Number of random points to carve at a time.
-
-    Returns
-    -------
-    Tensor
-        Float64 [P, 3].
-
-    Raises
-    ------
-    InputError
-        If the silhouettes have no point in common, because the cameras or the pictures are wrong.
+    The visual hull (Laurentini 1994) is the space that no view shows as background. The views carve ``batch`` random points at a time.
+    Raises InputError if the silhouettes have no point in common, because the cameras or the pictures are wrong.
     """
     cameras = views.cameras
     halvings = max(0, int(math.log2(min(cameras.width, cameras.height) / _HULL_SIDE)))
@@ -97,7 +59,7 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0, batch: int
     # Space outside a picture is background too, unless the border of the picture cuts off the tree.
     cropped = [bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()) for mask in masks]
     cameras = cameras.resized(masks[0].shape[1], masks[0].shape[0])
-    center, extent = convergence_point(cameras), max(cameras.width, cameras.height) / float(pixels_a_meter(cameras))
+    center, extent = convergence_point(cameras), max(cameras.width, cameras.height) / float(pixels_per_meter(cameras))
     low, high = center - extent / 2, center + extent / 2
     generator, batches = torch.Generator().manual_seed(seed), list[Tensor]()
     for _ in range(_ROUNDS):
@@ -117,19 +79,9 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0, batch: int
 
 
 def point_colors(pixels: list[tuple[Tensor, Tensor]], pictures: Tensor) -> Tensor:
-    """Average the colors of points over the views, without regard to occlusion.
+    """Average the colors of P points over the views, without regard to occlusion, to straight RGB, float32 [P, 3].
 
-    Parameters
-    ----------
-    pixels
-        :func:`pixels_of` the points in each view.
-    pictures
-        Premultiplied RGBA, [V, H, W, 4].
-
-    Returns
-    -------
-    Tensor
-        Straight RGB, float32 [P, 3].
+    ``pixels`` are the :func:`pixels_of` the points in each view. ``pictures`` are premultiplied RGBA, [V, H, W, 4].
     """
     total = torch.zeros(len(pixels[0][0]), 4)
     for (index, inside), picture in zip(pixels, pictures, strict=True):
@@ -138,21 +90,9 @@ def point_colors(pixels: list[tuple[Tensor, Tensor]], pictures: Tensor) -> Tenso
 
 
 def pixels_of(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Project points to the pixels of a single camera.
+    """Project points, [P, 3], to the pixels of a single camera.
 
-    Parameters
-    ----------
-    points
-        [P, 3].
-    camera
-        A single camera.
-
-    Returns
-    -------
-    index
-        Index of the pixel, row by row, int32 [P]; 0 for points outside the picture.
-    inside
-        Whether the point is inside the picture, bool [P].
+    Returns the indices of the pixels, row by row, int32 [P], 0 outside the picture, and whether each point is inside it, bool [P].
     """
     x, y = camera.project(points).nan_to_num(nan=-1).round().clamp(-1, max(camera.width, camera.height)).int().unbind(-1)
     inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)

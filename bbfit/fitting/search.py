@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, splatted, split_planes, view_projection
 from bbfit.fitting.config import ResolvedFit
-from bbfit.fitting.initialize import pixels_a_meter, tree_radius
+from bbfit.fitting.initialize import pixels_per_meter, tree_radius
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.points import pixels_of, point_colors
@@ -62,32 +62,17 @@ def find_placement(
 ) -> BillboardCloud:
     """Search for the placement of billboards that explains the training views best at a low resolution.
 
-    Each of ``restarts`` searches clusters the points from ``candidates`` random starts and fits each clustering, placement and textures,
-    for a few steps. The best 30 % continue for more steps. A search then adds the last quarter of the billboards to the best clouds, by
-    splitting a billboard or by placing one where the loss is largest.
+    Each of ``restarts`` searches clusters the points on the tree, float64 [P, 3], from ``candidates`` random starts and fits each
+    clustering, placement and textures, for a few steps. The best 30 % continue for more steps. A search then adds the last quarter of the
+    billboards to the best clouds, by splitting a billboard or by placing one where the loss is largest.
 
     ``refinement_rounds`` rounds then refine the cloud with the least loss. Each round compares four changes. Two move a billboard whose
     removal raises the loss little to where the loss is largest. One removes such a billboard and splits another. One merges two billboards
     whose points lie almost on one plane and places the spare one where the loss is largest. A round keeps the best change only if it lowers
     the loss.
 
-    Parameters
-    ----------
-    views
-        Training views.
-    points
-        Points on the tree, float64 [P, 3].
-    config
-        A resolved configuration.
-    on_progress
-        Called after every step with the work done and the total work, in steps of one candidate.
-    effort
-        Length of the parts of the search.
-
-    Returns
-    -------
-    BillboardCloud
-        The placed billboards with fitted textures, float32 on the CPU. The texel density is that of pictures of about :data:`SIDE` pixels.
+    ``on_progress`` is called after every step with the work done and the total work, in steps of one candidate. The result is float32 on
+    the CPU and has fitted textures, with the texel density of pictures of about :data:`SIDE` pixels.
     """
     return _Search(views, points, config, on_progress or (lambda done, total: None), effort).best()
 
@@ -101,7 +86,7 @@ class _Search:
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))
         cameras = self._targets.cameras
-        self._density = float(pixels_a_meter(cameras)) * config.texel_density
+        self._density = float(pixels_per_meter(cameras)) * config.texel_density
         self._projection = view_projection(cameras)
         self._pixels = [pixels_of(points, cameras[index]) for index in range(len(cameras))]
         self._all_upright = config.orientation == "upright"

@@ -31,22 +31,11 @@ def alpha_rate(alpha: AlphaMode) -> float:
 
 
 class Stepper:
-    """Optimizer of a cloud's texels and, if it has a movement, of the placement.
+    """Optimizer of a cloud's texels, from its own on their device, and, if it has a movement, of the placement.
 
-    ``config.backend`` selects the operators: ``reference`` runs torch and autograd, any other backend the Warp kernels.
-
-    Parameters
-    ----------
-    cloud : BillboardCloud
-        Its texels, on their device, are the start.
-    targets : Targets
-        Views to compare with.
-    config : ResolvedFit
-        The configuration.
-    movement : Movement, optional
-        Placement to optimize; every step changes it.
-    groups : int
-        Number of equal parts of the billboards that are fitted side by side, each as if it were alone; their losses are added.
+    ``config.backend`` selects the operators: ``reference`` runs torch and autograd, any other backend the Warp kernels. Every step compares
+    renders with views of ``targets`` and changes ``movement``. ``groups`` equal parts of the billboards are fitted side by side, each as if
+    it were alone; their losses are added.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ _TENSORS = ("centers", "rights", "ups", "half_extents", "depths")
 class BakeConfig:
     """Resolution and lighting of the baked textures."""
 
-    texels_a_meter: float
+    texels_per_meter: float
     """Texels per meter along the sides of every rectangle."""
     two_sided: bool = False
     """Whether a rectangle has a back texture, rendered from behind; otherwise both sides show the front's texture."""
@@ -45,7 +45,7 @@ class BakeConfig:
     """Light, samples, denoising, device, workers and seed, which should equal those of the compared views; other options are not used."""
 
     def __post_init__(self) -> None:
-        check_range("texels_a_meter", self.texels_a_meter, 0, math.inf, open_low=True)
+        check_range("texels_per_meter", self.texels_per_meter, 0, math.inf, open_low=True)
 
 
 @dataclass(frozen=True)
@@ -125,11 +125,11 @@ def bake(
     if not len(slabs):
         fail("slabs", "there is none to bake")
     # Texels from a rectangle's center to its sides; the center lies on the corner of a texel.
-    reach = _whole_texels(slabs.half_extents * config.texels_a_meter) + int(FILTER_REACH)
+    reach = _whole_texels(slabs.half_extents * config.texels_per_meter) + int(FILTER_REACH)
     size = 2 * int(reach.max())
-    cameras, clips = _facing(slabs, size, config.texels_a_meter)
+    cameras, clips = _facing(slabs, size, config.texels_per_meter)
     if config.two_sided:
-        back, behind = _facing(_turned(slabs), size, config.texels_a_meter)
+        back, behind = _facing(_turned(slabs), size, config.texels_per_meter)
         cameras = Camera(torch.cat([cameras.world_to_camera, back.world_to_camera]), cameras.intrinsics.repeat(2, 1, 1), size, size, True)
         clips += behind
     paths = render_pictures(tree, cameras, folder, config.views, clips=clips, on_progress=on_progress)
@@ -173,16 +173,16 @@ def _turned(slabs: Slabs) -> Slabs:
     return Slabs(slabs.centers, -slabs.rights, slabs.ups, slabs.half_extents, -slabs.depths.flip(-1))
 
 
-def _facing(slabs: Slabs, size: int, texels_a_meter: float) -> tuple[Camera, list[tuple[float, float]]]:
+def _facing(slabs: Slabs, size: int, texels_per_meter: float) -> tuple[Camera, list[tuple[float, float]]]:
     """Parallel cameras in front of rectangles, with square pictures about their centers, and clip distances of the slabs."""
     slabs = Slabs(*(getattr(slabs, name).double() for name in _TENSORS))
     normals = torch.linalg.cross(slabs.rights, slabs.ups)
     rotation = torch.stack([slabs.rights, -slabs.ups, -normals], -2)
-    distance = slabs.depths[:, 1] + size / texels_a_meter  # of the camera from the plane: far enough for a nearest distance above 0
+    distance = slabs.depths[:, 1] + size / texels_per_meter  # of the camera from the plane: far enough for a nearest distance above 0
     transform = torch.eye(4, dtype=torch.float64).repeat(len(slabs), 1, 1)
     transform[:, :3, :3] = rotation
     transform[:, :3, 3:] = -(rotation @ (slabs.centers + distance[:, None] * normals)[..., None])
-    intrinsics = orthographic_intrinsics(size / texels_a_meter, size, size).repeat(len(slabs), 1, 1)
+    intrinsics = orthographic_intrinsics(size / texels_per_meter, size, size).repeat(len(slabs), 1, 1)
     near, far = distance - slabs.depths[:, 1], distance - slabs.depths[:, 0]
     return Camera(transform, intrinsics, size, size, True), list(zip(near.tolist(), far.tolist(), strict=True))
 
@@ -221,7 +221,7 @@ def _assembled(slabs: Slabs, shown: list[tuple[int, Tensor, Tensor]], config: Ba
     kept = [n for n, _, _ in shown]
     rights, ups = slabs.rights[kept], slabs.ups[kept]
     edges = torch.stack([edges for _, _, edges in shown]) if shown else torch.zeros(0, 4, dtype=torch.float64)
-    left, right, top, bottom = (edges / config.texels_a_meter).split(1, -1)
+    left, right, top, bottom = (edges / config.texels_per_meter).split(1, -1)
     centers = slabs.centers[kept] + (left + right) / 2 * rights - (top + bottom) / 2 * ups
     sizes = [list(texture.shape[1:3]) for _, texture, _ in shown]
     texels = [texture.reshape(-1, 4) for _, texture, _ in shown]

@@ -17,25 +17,10 @@ Server = TypeVar("Server")
 
 
 def listen(host: str, port: int, start: Callable[[tuple[str, int], socket.AddressFamily], Server]) -> Server:
-    """Start a server on the first free port from ``port`` on.
+    """Start a server with ``start`` on the first free port of up to 100 from ``port`` on, 0 to 65535; 0 is any free port.
 
-    Parameters
-    ----------
-    host : str
-        A name or an address of this machine.
-    port : int
-        The first of up to 100 ports to try, 0 to 65535; 0 is any free port.
-    start : callable
-        Binds a server to an address and a port. It raises ``OSError`` if it cannot.
-
-    Returns
-    -------
-    The server that ``start`` made.
-
-    Raises
-    ------
-    InputError
-        If the host does not belong to this machine, the port is out of range or needs other rights, or all ports are taken.
+    ``host`` is a name or an address of this machine. ``start`` binds a server to an address and a port, or raises ``OSError``. Raises
+    InputError if the host does not belong to this machine, the port is out of range or needs other rights, or all ports are taken.
     """
     check_count("port", port, 0)
     if port > 65535:
@@ -57,20 +42,12 @@ def listen(host: str, port: int, start: Callable[[tuple[str, int], socket.Addres
 
 
 def is_own_request(server_host: str, port: int, host: str | None, origin: str | None) -> bool:
-    """Whether a request comes from the viewer's own page, and not from a page of another site.
+    """Whether a request's ``Host`` and ``Origin`` headers show that it comes from the viewer's own page, and not from another site's.
 
     A page of another site can reach a server on this machine in two ways. It can send requests across origins, which carry its own
     ``Origin``. Or its domain can change its address to this machine's (DNS rebinding), and then ``Host`` names that domain. So ``Host`` has
-    to be an IP address, ``localhost`` or the host that the server was started with, and ``Origin``, if there is one, the same server.
-
-    Parameters
-    ----------
-    server_host : str
-        The host that the server was started with.
-    port : int
-        The port that it listens on.
-    host, origin : str or None
-        The request's ``Host`` and ``Origin`` headers.
+    to be an IP address, ``localhost`` or ``server_host``, the host that the server was started with, with the port that it listens on; and
+    ``Origin``, if there is one, has to be the same server.
     """
     try:
         parts = urlsplit(f"//{host}")

@@ -16,26 +16,11 @@ _SPACING, _SHIFT, _SCALES = 1.05, 0.35, (0.7, 1.3)
 
 
 def plant(count: int, bounds: NDArray[np.float64], *, seed: int = 0) -> NDArray[np.float32]:
-    """Plant trees on the ground, on a jittered grid, each turned and scaled at random.
+    """Plant trees, 1 to :data:`MAX_TREES`, on the ground, on a jittered grid, each turned and scaled at random.
 
-    Parameters
-    ----------
-    count : int
-        Number of trees, 1 to :data:`MAX_TREES`.
-    bounds : array
-        The tree's lowest and highest corner in meters, [2, 3]. The ground is at its lowest height.
-    seed : int
-        Seed of the places, turns and scales. The same seed gives the same field.
-
-    Returns
-    -------
-    The trees, [N, 5]: the position of the tree's origin (x, y, z) in meters, its rotation about +Y in radians, and its scale. The first
-    tree is in the middle and is neither shifted, turned nor scaled.
-
-    Raises
-    ------
-    InputError
-        If the count is out of range.
+    ``bounds`` are the tree's lowest and highest corner in meters, [2, 3]; the ground is at its lowest height. The same seed gives the same
+    field. Returns the trees, [N, 5]: the position of the tree's origin (x, y, z) in meters, its rotation about +Y in radians, and its
+    scale. The first tree is in the middle and is neither shifted, turned nor scaled. Raises InputError if the count is out of range.
     """
     check_count("trees", count)
     check_range("trees", count, 1, MAX_TREES)

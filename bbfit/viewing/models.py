@@ -32,13 +32,7 @@ class ModelCache:
         self._lock = threading.Lock()
 
     def glb(self, index: int, options: ModelOptions) -> bytes:
-        """A cloud as an export would write it, with PNG textures.
-
-        Raises
-        ------
-        IndexError
-            If there is no such cloud.
-        """
+        """A cloud as an export would write it, with PNG textures. Raises IndexError if there is no such cloud."""
         key = index, options
         if key not in self._models:
             with self._lock:

@@ -26,11 +26,6 @@ class Original:
     note: str
     """Why the tree cannot be shown, or how it was converted; empty if the file is sent unchanged."""
 
-    @staticmethod
-    def missing(note: str) -> Original:
-        """An original that cannot be shown, and why."""
-        return Original(None, note)
-
 
 def find_original(candidates: Sequence[Path | None], max_bytes: int = MAX_BYTES) -> Original:
     """The first of some files that exists, as a GLB file.
@@ -41,31 +36,29 @@ def find_original(candidates: Sequence[Path | None], max_bytes: int = MAX_BYTES)
     known = [path for path in candidates if path is not None]
     path = next((path for path in known if path.is_file()), None)
     if path is None:
-        return Original.missing(
-            f"the original no longer exists: {known[0]}" if known else "made from views alone: there is no mesh of the original"
-        )
+        gone = f"the original no longer exists: {known[0]}" if known else "made from views alone: there is no mesh of the original"
+        return Original(None, gone)
     ending = path.suffix.lower()
     if ending not in MESH_SUFFIXES:
-        return Original.missing(f"only Blender reads {path.name}; convert it to .glb to see it here")
+        return Original(None, f"only Blender reads {path.name}; convert it to .glb to see it here")
     try:
         tree = TreeFile.open(path)
-        size = tree.bytes
-        if size > max_bytes:
-            return Original.missing(_too_large(path.name, size, max_bytes))
+        if tree.bytes > max_bytes:
+            return Original(None, _too_large(path.name, tree.bytes, max_bytes))
         if ending == ".glb" and is_self_contained(path):
             return _unchanged(path.read_bytes(), path.name)
         glb = _converted(tree)
     except (InputError, OSError) as error:
-        return Original.missing(f"the original cannot be shown: {error}")
+        return Original(None, f"the original cannot be shown: {error}")
     if len(glb) > max_bytes:
-        return Original.missing(_too_large(f"{path.name} as GLB", len(glb), max_bytes))
+        return Original(None, _too_large(f"{path.name} as GLB", len(glb), max_bytes))
     return Original(glb, f"converted from {path.name}")
 
 
 def _unchanged(glb: bytes, name: str) -> Original:
     packed = sorted(_COMPRESSIONS & set(gltf_parts(glb)[0].get("extensionsRequired", ())))
     if packed:
-        return Original.missing(f"{name} is compressed with {' and '.join(packed)}, which the viewer cannot read")
+        return Original(None, f"{name} is compressed with {' and '.join(packed)}, which the viewer cannot read")
     return Original(glb, "")
 
 

@@ -56,17 +56,7 @@ class _Shown:
 class Viewer:
     """A viewer that listens until it is closed; a context manager.
 
-    Parameters
-    ----------
-    host : str
-        The host to listen on.
-    port : int
-        The first port to try; 0 is any free one.
-
-    Raises
-    ------
-    InputError
-        If it cannot listen there.
+    It takes the first free port of the host from ``port`` on; 0 is any free one. Raises InputError if it cannot listen there.
     """
 
     def __init__(self, *, host: str = "127.0.0.1", port: int = 8080) -> None:
@@ -74,7 +64,6 @@ class Viewer:
         self._shown: _Shown | None = None
         self._previous: _Shown | None = None  # a page may still load its models
         self._status, self._serial = "", 0
-        self._slots = threading.BoundedSemaphore(_MAX_CONNECTIONS)
         self._measuring: threading.Thread | None = None
         self._host = host
         self._server = listen(host, port, partial(_Server, self))
@@ -133,14 +122,6 @@ class Viewer:
         """Whether a request with these headers may come from the viewer's own page."""
         return is_own_request(self._host, self.port, host, origin)
 
-    def enter(self) -> bool:
-        """Take one of the places for connections, if one is free; :meth:`leave` gives it back."""
-        return self._slots.acquire(blocking=False)
-
-    def leave(self) -> None:
-        """Give the place of a connection back."""
-        self._slots.release()
-
     def content(self, path: str) -> tuple[str, bytes] | None:
         """The media type and the bytes at a path, ``None`` if there is nothing."""
         if path in _FILES:
@@ -191,18 +172,19 @@ def view(run: str | Path, *, host: str = "127.0.0.1", port: int = 8080, original
 
     Parameters
     ----------
-    run : str or Path
+    run
         The folder of ``bbfit run``, ``bbfit fit`` or ``bbfit lod``.
-    host : str
+    host
         The address to listen on. Whoever can reach it can see the page. ``0.0.0.0`` is all addresses of this machine.
-    port : int
+    port
         The first port to try; 0 is any free one.
-    original_bytes : int
+    original_bytes
         The largest size of the original's file that is sent to browsers.
 
     Returns
     -------
-    The viewer. It listens until its ``close`` is called or the process ends; its ``url`` is the page's address.
+    Viewer
+        It listens until its ``close`` is called or the process ends; its ``url`` is the page's address.
 
     Raises
     ------
@@ -220,12 +202,12 @@ class _Server(ThreadingHTTPServer):
     request_queue_size = _MAX_CONNECTIONS
 
     def __init__(self, viewer: Viewer, address: tuple[str, int], family: socket.AddressFamily) -> None:
-        self.address_family, self._viewer = family, viewer
+        self.address_family, self.slots = family, threading.BoundedSemaphore(_MAX_CONNECTIONS)
         super().__init__(address, partial(_Handler, viewer))
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         """Close connections beyond the limit at once."""
-        return self._viewer.enter()
+        return self.slots.acquire(blocking=False)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that goes away is no error."""
@@ -236,12 +218,12 @@ class _Server(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     timeout = _TIMEOUT
 
-    def __init__(self, viewer: Viewer, *arguments: Any) -> None:
+    def __init__(self, viewer: Viewer, request: Any, client_address: Any, server: _Server) -> None:
         self._viewer = viewer
         try:
-            super().__init__(*arguments)
+            super().__init__(request, client_address, server)
         finally:
-            viewer.leave()
+            server.slots.release()
 
     def do_GET(self) -> None:
         host = self.headers.get_all("Host", [])

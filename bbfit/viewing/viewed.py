@@ -68,23 +68,10 @@ class ViewedTree:
 
 
 def open_results(folder: str | Path, *, original_bytes: int = MAX_BYTES) -> ViewedTree:
-    """Read the folder of ``bbfit run``, ``bbfit fit`` or ``bbfit lod``.
+    """Read the folder of ``bbfit run``, ``bbfit fit`` or ``bbfit lod``. An original that is gone or cannot be read becomes a note.
 
-    Parameters
-    ----------
-    folder : str or Path
-        The folder.
-    original_bytes : int
-        The largest size of the original's file that is sent to browsers.
-
-    Returns
-    -------
-    The tree. An original that is gone or cannot be read becomes a note.
-
-    Raises
-    ------
-    MissingFileError, InputError
-        If it is no such folder, or is damaged.
+    ``original_bytes`` is the largest size of the original's file that is sent to browsers. Raises MissingFileError or InputError if it is
+    no such folder, or is damaged.
     """
     folder = check_folder("run", folder)
     if (folder / LOD_FILE).is_file():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -36,18 +36,9 @@ class WatchedRun:
 
 
 class Watch:
-    """Keeps a viewer up to date with a run.
+    """Keeps a viewer up to date with a run; the viewer stays open when the watch ends.
 
-    Parameters
-    ----------
-    viewer : Viewer
-        The viewer, which stays open when the watch ends.
-    run : WatchedRun
-        The run.
-    interval : float
-        The least number of seconds between two previews.
-    share : float
-        The largest share of the time that previews may take.
+    At least ``interval`` seconds pass between two previews, which may take at most the fraction ``share`` of the time.
     """
 
     def __init__(self, viewer: Viewer, run: WatchedRun, *, interval: float = 2.0, share: float = 0.04) -> None:
@@ -115,13 +106,6 @@ def preview(cloud: BillboardCloud, alpha: AlphaKind, *, max_texels: int = 200_00
         textures = [
             torch.nn.functional.avg_pool2d(texture.permute(0, 3, 1, 2), 2, ceil_mode=True).permute(0, 2, 3, 1) for texture in textures
         ]
-    return BillboardCloud(
-        centers=cloud.centers,
-        rights=cloud.rights,
-        ups=cloud.ups,
-        half_extents=cloud.half_extents,
-        texture_sizes=torch.tensor([texture.shape[1:3] for texture in textures]),
-        two_sided=cloud.two_sided,
-        texels=torch.cat([unpremultiply(texture).reshape(-1, 4) for texture in textures]),
-        alpha=AlphaMode(alpha, cloud.alpha.cutoff),
-    )
+    sizes = torch.tensor([texture.shape[1:3] for texture in textures])
+    texels = torch.cat([unpremultiply(texture).reshape(-1, 4) for texture in textures])
+    return replace(cloud, texture_sizes=sizes, texels=texels, alpha=AlphaMode(alpha, cloud.alpha.cutoff))

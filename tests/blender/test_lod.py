@@ -76,13 +76,13 @@ def test_levels_take_over_where_their_error_is_within_the_bound(built: LodResult
             for split in (views.train, views.test)
         ]
         assert level.error_meters == pytest.approx(worst[0] / scale, rel=1e-3) and worst[0] > 0
-        pixels_a_meter = focal / level.distance_meters
-        assert level.error_pixels == pytest.approx(level.error_meters * pixels_a_meter)
-        assert level.held_out_error_pixels == pytest.approx(worst[1] / scale * pixels_a_meter, rel=1e-3)
+        pixels_per_meter = focal / level.distance_meters
+        assert level.error_pixels == pytest.approx(level.error_meters * pixels_per_meter)
+        assert level.held_out_error_pixels == pytest.approx(worst[1] / scale * pixels_per_meter, rel=1e-3)
         assert level.error_pixels <= LEVELS.error_pixels + 1e-9
-        assert level.tree_pixels == pytest.approx(height * pixels_a_meter, rel=1e-3) and level.distance_meters >= before.distance_meters
+        assert level.tree_pixels == pytest.approx(height * pixels_per_meter, rel=1e-3) and level.distance_meters >= before.distance_meters
         # The level before it ends where this one begins.
-        assert before.screen_coverage == pytest.approx(np.pi * (radius * pixels_a_meter) ** 2 / (1920 * 1080), rel=1e-3)
+        assert before.screen_coverage == pytest.approx(np.pi * (radius * pixels_per_meter) ** 2 / (1920 * 1080), rel=1e-3)
         before = level
     assert before.screen_coverage == 0
 
@@ -102,9 +102,9 @@ def test_textures_are_as_fine_as_the_screen_shows(built: LodResult) -> None:
         extent = Image.open(io.BytesIO(views[image["bufferView"]])).size
         points, uvs = (array(primitive["attributes"][name]).reshape(level.planes, 4, -1) for name in ("POSITION", "TEXCOORD_0"))
         sides = [np.linalg.norm(np.diff(values, axis=1), axis=-1) for values in (points, uvs * extent)]
-        texels_a_meter = np.median(sides[1] / sides[0])
+        texels_per_meter = np.median(sides[1] / sides[0])
         seen = 1080 / 2 / np.tan(np.radians(25)) / level.distance_meters
-        assert 0.95 < texels_a_meter / seen < 2.05
+        assert 0.95 < texels_per_meter / seen < 2.05
 
 
 def test_what_was_measured_is_written_down(built: LodResult) -> None:

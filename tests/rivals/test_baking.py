@@ -55,7 +55,7 @@ def test_baked_cloud_seen_from_where_it_was_baked_is_the_picture(
         back = read_rgba(tmp_path / f"{n + 2:04}.png") if two_sided else front[:, ::-1]
         size = len(front)
         for side, picture in ((1, front), (-1, back)):
-            drawn = render_reference(cloud.take([n]).to(torch.float64), picture_camera(asked, n, size, coarse.texels_a_meter, side))
+            drawn = render_reference(cloud.take([n]).to(torch.float64), picture_camera(asked, n, size, coarse.texels_per_meter, side))
             expected = premultiply(torch.from_numpy(np.ascontiguousarray(picture)).double() / 255)
             torch.testing.assert_close(drawn, expected, atol=1e-5, rtol=0)
         assert (front != read_rgba(tmp_path / f"{n:04}.png")[:, ::-1]).any()
@@ -67,7 +67,7 @@ def test_rectangle_lies_about_what_it_shows(thing_glb: Path, coarse: BakeConfig)
     low, high = (cloud.centers[0] + sign * torch.cat([cloud.half_extents[0], torch.zeros(1)]) for sign in (-1, 1))
     np.testing.assert_allclose(low, [-0.2, 0.0, 0.0], atol=0.1)
     np.testing.assert_allclose(high, [1.3, 2.0, 0.0], atol=0.1)
-    assert (2 * cloud.half_extents * coarse.texels_a_meter).flip(-1).round().long().tolist() == cloud.texture_sizes.tolist()
+    assert (2 * cloud.half_extents * coarse.texels_per_meter).flip(-1).round().long().tolist() == cloud.texture_sizes.tolist()
     texture = cloud.textures()[0][0]
     assert all((texture[edge][..., 3] > 0).any() for edge in (0, -1)) and all((texture[:, edge, 3] > 0).any() for edge in (0, -1))
 
@@ -124,7 +124,7 @@ def test_rectangle_cuts_off_what_is_beyond_it(thing_glb: Path, coarse: BakeConfi
     low = Slabs(torch.tensor([[0.0, 0.5, 0.0]]).double(), whole.rights, whole.ups, torch.tensor([[0.2, 0.5]]).double(), whole.depths)
     cloud = bake(thing_glb, low, coarse)
     top = float(cloud.centers[0, 1] + cloud.half_extents[0, 1])
-    assert top == pytest.approx(1.0 + 2 / coarse.texels_a_meter, abs=1e-6)
+    assert top == pytest.approx(1.0 + 2 / coarse.texels_per_meter, abs=1e-6)
 
 
 def test_settings_arrive(thing_glb: Path, tmp_path: Path, coarse: BakeConfig) -> None:
@@ -153,7 +153,7 @@ def test_triangles_of_every_kind_of_file_are_in_the_world_of_the_views(thing_glb
 
 
 def test_bad_input_is_refused(thing_glb: Path, coarse: BakeConfig) -> None:
-    with pytest.raises(InputError, match="texels_a_meter"):
+    with pytest.raises(InputError, match="texels_per_meter"):
         BakeConfig(0.0)
     with pytest.raises(InputError, match="least before the greatest"):
         slabs((*FRONT, (1.0, 1.0)))
@@ -161,4 +161,4 @@ def test_bad_input_is_refused(thing_glb: Path, coarse: BakeConfig) -> None:
     with pytest.raises(InputError, match="none to bake"):
         bake(thing_glb, Slabs(*(getattr(asked, name)[:0] for name in ("centers", "rights", "ups", "half_extents", "depths"))), coarse)
     with pytest.raises(InputError, match="16384"):
-        bake(thing_glb, asked, replace(coarse, texels_a_meter=1e5))
+        bake(thing_glb, asked, replace(coarse, texels_per_meter=1e5))

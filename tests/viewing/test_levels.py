@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bbfit.evaluation.silhouettes import worst_silhouette
-from bbfit.fitting.initialize import pixels_a_meter
+from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.viewing.levels import ViewerLevel, field_levels, largest_scale
 from bbfit.views import ViewDataset
@@ -21,9 +21,9 @@ def test_a_cloud_takes_over_where_its_error_is_a_pixel(views_folder: Path, known
     moved = BillboardCloud(**{**vars(known_cloud), "centers": known_cloud.centers + torch.tensor([0.4, 0.0, 0.0])})
     error = worst_silhouette(moved, views)
     assert error > 2
-    assert largest_scale(moved, views) == pytest.approx(float(pixels_a_meter(views.cameras)) / (1.15 * error))
-    assert largest_scale(known_cloud, views) == float(pixels_a_meter(views.cameras))
-    assert largest_scale(moved, views, is_stopped=lambda: True) == float(pixels_a_meter(views.cameras))
+    assert largest_scale(moved, views) == pytest.approx(float(pixels_per_meter(views.cameras)) / (1.15 * error))
+    assert largest_scale(known_cloud, views) == float(pixels_per_meter(views.cameras))
+    assert largest_scale(moved, views, is_stopped=lambda: True) == float(pixels_per_meter(views.cameras))
 
 
 def test_far_trees_of_a_field_have_halved_textures(known_cloud: BillboardCloud) -> None:
