@@ -327,7 +327,7 @@ def text_files() -> Iterator[Path]:
             built = {"node_modules", "__pycache__", ".ipynb_checkpoints"} & set(path.parts)
             if path.is_file() and path.suffix in endings and not built:
                 yield path
-    yield from (path for path in sorted(ROOT.iterdir()) if path.is_file() and path.suffix in endings)
+    yield from (path for path in sorted(ROOT.iterdir()) if path.is_file() and path.suffix in endings and path.name != ".git")
 
 
 def test_no_file_names_a_path_of_one_machine() -> None:

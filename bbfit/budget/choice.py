@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -97,7 +98,7 @@ def choose(
     config: FitConfig,
     budget: BudgetConfig,
     *,
-    tree: TreeFile | None = None,
+    tree: str | Path | TreeFile | None = None,
     export: ExportConfig | None = None,
     known: Callable[[FitConfig], Trial | None] | None = None,
     on_trial: Callable[[list[Trial], int], None] | None = None,
@@ -140,7 +141,8 @@ def choose(
     if len(views.train) < _VALIDATION_EVERY:
         fail("views", f"{len(views.train)} training views are too few for a validation split", f"give at least {_VALIDATION_EVERY}")
     split = replace(views, train=views.train.take([index for index in train if index not in validation]), test=views.train.take(validation))
-    return _Trials(split, config, budget, tree, export or ExportConfig(), known, on_trial).choice()
+    mesh = None if tree is None else TreeFile.open(tree)
+    return _Trials(split, config, budget, mesh, export or ExportConfig(), known, on_trial).choice()
 
 
 def lookup(trials: Sequence[Trial]) -> Callable[[FitConfig], Trial | None]:
