@@ -67,19 +67,26 @@ class Orbit:
 
         Parameters
         ----------
-        points : [P, 3] vertices in meters.
-        target : [3] point that the cameras look at.
-        fov_x_degrees : horizontal field of view in (0, 170]; ``None`` for orthographic cameras.
-        margin : share of the image kept free on each side, in [0, 0.4].
+        points
+            Vertices in meters, [P, 3].
+        target
+            Point that the cameras look at, [3].
+        width, height
+            Size of the images in pixels.
+        fov_x_degrees
+            Horizontal field of view in (0, 170]; ``None`` for orthographic cameras.
+        margin
+            Share of the image kept free on each side, in [0, 0.4].
 
         Returns
         -------
-        :class:`Camera` with V = ``count`` views, float64.
+        Camera
+            V = ``count`` views, float64.
 
         Raises
         ------
         InputError
-            if there are no points, a coordinate is not finite, or all points lie at the target.
+            If there are no points, a coordinate is not finite, or all points lie at the target.
         """
         check_range("margin", margin, 0, 0.4)
         if not len(points) or not np.isfinite(points).all():
