@@ -133,10 +133,7 @@ def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
 def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) -> None:
     """Write ``systems.png``: one held-out view over white, and the picture of each system that was drawn.
 
-    Parameters
-    ----------
-    folder : Path
-        Holds a folder for each system, with its pictures in ``held_out`` under the views' names.
+    ``folder`` holds a folder for each system, with its pictures in ``held_out`` under the views' names.
     """
     from PIL import Image, ImageDraw
 

@@ -1,4 +1,4 @@
-"""The picture of a sweep: how good each configuration is, tree by tree."""
+"""The picture of a sweep: the quality of each configuration, tree by tree."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from bbfit.files import write_bytes
 from bbfit.reporting.sweep_tables import BILLBOARDS, MEASURES, SweepRow, label_names
 
 _MEASURES = (MEASURES[0], MEASURES[2])
-# A loss, or another label, has a line style; everything else has a color.
+# Line styles distinguish losses, colors the other labels.
 _STYLES = ("-", "--", ":", "-.")
 
 
 def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
     """Write a PNG: PSNR over white and FLIP against the number of billboards, a column for each tree and a line for each configuration.
 
-    Labels take the numbers' place on the axis where nothing but labels differs. Where nothing was done nothing is written.
+    If all runs have the same number of billboards, the axis shows the labels instead. Without finished runs no file is written.
     """
     done = [row for row in rows if row.reason is None]
     if not done:
@@ -57,12 +57,12 @@ def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
 
 
 def _key(row: SweepRow, names: Sequence[str], dashed: str | None) -> str:
-    """What gives a run its color."""
+    """The labels that decide the color of a run."""
     return ", ".join(row.labels.get(name, "") for name in names if name != dashed)
 
 
 def _groups(rows: Sequence[SweepRow], names: Sequence[str], dashed: str | None) -> dict[tuple[str, str | None], list[SweepRow]]:
-    """Runs that make a line."""
+    """The runs of each line, by color and line style."""
     found: dict[tuple[str, str | None], list[SweepRow]] = {}
     for row in rows:
         found.setdefault((_key(row, names, dashed), row.labels.get(dashed or "")), []).append(row)
