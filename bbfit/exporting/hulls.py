@@ -67,8 +67,8 @@ def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
     """Replace each card by a convex polygon around its visible part with at most ``vertices`` >= 4 corners.
 
     The polygon contains each point of the card where the bilinearly filtered alpha reaches ``least``, and lies inside the card. ``least``,
-    in [0, 1], is the cutoff of MASK, or 0 for any alpha above 0, as BLEND shows it. The mip levels show more than the texture does: the
-    polygon may cut off up to half a texel of the level in use.
+    in [0, 1], is the cutoff of MASK, or 0 for any alpha above 0, as BLEND shows it. The visible part is larger in
+    mip levels: there the polygon may cut off up to half a texel of the level in use.
 
     The polygon's sides touch the convex hull of the visible part. It is the smallest of all such polygons whose sides have one of about 130
     directions and whose corners lie in the card. Areas add up corner by corner, so the search is for a shortest cycle (after Aggarwal,

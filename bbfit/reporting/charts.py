@@ -61,8 +61,8 @@ def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
     """PSNR, SSIM and FLIP over white of every view against its azimuth, with the worst view of each measure marked.
 
     The id of a point is ``azimuth-MEASURE-INDEX``, with the view's index in ``views``. Lines join views of one elevation, which is written
-    at their end if there are several elevations; with fewer than four views per elevation there are no lines. ``azimuth-cursor-MEASURE`` is
-    a line at 0 degrees, and the mark ``degree`` is the width of one degree. Raises InputError without views.
+    at their end if there are several elevations; with fewer than four views per elevation on average there are no lines.
+    ``azimuth-cursor-MEASURE`` is a line at 0 degrees, and the mark ``degree`` is the width of one degree. Raises InputError without views.
     """
     if not views:
         fail("views", "there is none to draw")

@@ -23,6 +23,7 @@ from bbfit.views import ViewSet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
@@ -106,18 +107,14 @@ def spread_views(angles: NDArray[np.float64], count: int) -> list[int]:
 
 def loss_plot(losses: Sequence[float], path: str | Path, *, label: str = "loss") -> None:
     """Write a PNG with :func:`draw_losses`, completely or not at all."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 5), dpi=120, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     draw_losses(axes, losses, label)
     axes.grid(True, color="#e4e7ea", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
-    buffer = io.BytesIO()
-    canvas.print_png(buffer, metadata={"Software": None})
-    write_bytes(path, buffer.getvalue())
+    write_figure(figure, path)
 
 
 def draw_losses(axes: Axes, losses: Sequence[float], label: str) -> None:
@@ -159,19 +156,24 @@ def pareto_plot(choice: Choice, path: str | Path, *, cost: Cost = "vertices") ->
 
     If the budget limits another ``cost`` than vertices, that gets a second panel.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     costs: list[Cost] = ["vertices"] if cost == "vertices" else ["vertices", cost]
     figure = Figure(figsize=(9 if len(costs) == 1 else 14, 5), dpi=120, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
     for axes, name in zip(figure.subplots(1, len(costs), squeeze=False)[0], costs, strict=True):
         _draw_front(axes, choice, name)
     figure.axes[0].set_ylabel("PSNR over white of validation views, dB")
     figure.axes[0].set_title("Short fits; numbers are billboards", loc="left", fontsize=11)
     figure.axes[0].legend(frameon=False, fontsize=9, loc="lower right")
+    write_figure(figure, path)
+
+
+def write_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure of matplotlib as PNG, completely or not at all."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     buffer = io.BytesIO()
-    canvas.print_png(buffer, metadata={"Software": None})
+    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
     write_bytes(path, buffer.getvalue())
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from bbfit.files import write_bytes
+from bbfit.reporting.plots import write_figure
 from bbfit.reporting.sweep_tables import BILLBOARDS, MEASURES, SweepRow, label_names
 
 _MEASURES = (MEASURES[0], MEASURES[2])
@@ -28,7 +27,7 @@ def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
     dashed = next((name for name in names if name == "loss"), None)
     trees = list(dict.fromkeys(row.tree for row in done))
     counted = len({row.labels.get(BILLBOARDS) for row in done}) > 1
-    figure = Figure(figsize=(1.5 + 3.4 * len(trees), 6.6), layout="constrained")
+    figure = Figure(figsize=(1.5 + 3.4 * len(trees), 6.6), dpi=110, layout="constrained")
     axes = figure.subplots(len(_MEASURES), len(trees), squeeze=False, sharex=True)
     colors = {key: f"C{number}" for number, key in enumerate(dict.fromkeys(_key(row, names, dashed) for row in done))}
     styles = {value: _STYLES[number % 4] for number, value in enumerate(dict.fromkeys(row.labels.get(dashed or "") for row in done))}
@@ -51,9 +50,7 @@ def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
             axis.set_xlabel(BILLBOARDS)
     if counted and any(handles := axes[0][0].get_legend_handles_labels()[1]) and len(handles) > 1:
         figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=110)
-    write_bytes(path, data.getvalue())
+    write_figure(figure, path)
 
 
 def _key(row: SweepRow, names: Sequence[str], dashed: str | None) -> str:
