@@ -142,12 +142,7 @@ def measure(target: Tensor, image: Tensor) -> Measures:
     return Measures(
         OverWhite(metrics.psnr(*white), metrics.ssim(*white), metrics.flip(*white)),
         Rgba(metrics.root_mean_squared_error(*rgba), metrics.psnr(*rgba), metrics.alpha_iou(*rgba)),
-        ThesisScale(
-            thesis_scale.rmse(*rgba),
-            thesis_scale.ssim(*rgba),
-            thesis_scale.psnr(*rgba),
-            thesis_scale.sre(*rgba),
-        ),
+        ThesisScale(thesis_scale.rmse(*rgba), thesis_scale.ssim(*rgba), thesis_scale.psnr(*rgba), thesis_scale.sre(*rgba)),
         metrics.sharpness(*white),
         metrics.brightness(*rgba),
     )

@@ -39,8 +39,8 @@ def mip_chain(atlas: Atlas, cutoff: float | None) -> list[NDArray[np.uint8]]:
     level, there is one factor for the whole picture.
 
     Measured at levels 1 to 4, relative to level 0, for textures of about 230 x 250 texels with coverages of 0.8, 0.5 and 0.1: leaves with
-    soft rims keep their coverage within 0.1 %, random single opaque texels, which have few values of alpha, within 2.6 %. With more than 8
-    x 8 samples these errors are 2.1 % and, at cutoff 0.5, 5.5 %. Fitted trees with coverages of 1 to 32 % keep it within 0.2 %.
+    soft rims keep their coverage within 0.1 %, random single opaque texels, which have few values of alpha, within 2.6 %. With more
+    than 8 x 8 samples these errors are 2.1 % and, at cutoff 0.5, 5.5 %. Fitted trees with coverages of 1 to 32 % keep it within 0.2 %.
     """
     if cutoff is not None:
         check_range("cutoff", cutoff, 0, 1, open_low=True)

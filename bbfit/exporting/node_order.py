@@ -88,8 +88,8 @@ def fit_origins(
 ) -> NDArray[np.float64]:
     """Fit the origins of P cards, [P, 3], such that sorting by depth and sorting by distance both give the order along the rays.
 
-    ``card`` is the card of each hit, [H] (:func:`~bbfit.exporting.visibility.visible_cards`), ``middles`` are the centers of the cards and
-    each of the one or more ``starts`` is a first guess of the origins, [P, 3] in meters, and ``scale`` is the tree's radius in meters.
+    ``card`` is the card of each hit, [H] (:func:`~bbfit.exporting.visibility.visible_cards`). ``middles`` holds the centers of the cards,
+    and ``starts`` one or more guesses of the origins, [P, 3] each. ``scale`` is the tree's radius. All are in meters.
 
     L-BFGS (Byrd et al. 1995) minimizes the wrong share from the best of the starts. Sigmoids of decreasing softness replace the step
     between right and wrong. A penalty keeps origins near the centers of their cards, so that bounds centered on them stay small. The best

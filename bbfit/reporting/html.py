@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from bbfit.evaluation import metrics
-from bbfit.evaluation.report import Cost, Report, ViewScore
+from bbfit.evaluation.report import Report, ViewScore
 from bbfit.evaluation.scoring import held_out
 from bbfit.evaluation.sizes import shrunk
 from bbfit.exporting.encoders import encode_webp
@@ -96,7 +96,7 @@ def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunF
         glb=base64.b64encode(glb).decode(),
         bounds=shown_bounds(cloud, spared=0.005).tolist(),
         layered=layered,
-        costs=_costs(report),
+        costs=[("vertices", report.vertices), ("file, bytes", report.bytes)],
         facts=facts,
         changed=_changed(facts),
         pareto=None if facts.pareto is None else _data("image/png", facts.pareto),
@@ -164,10 +164,6 @@ def _billboards(cloud: BillboardCloud) -> list[dict[str, Any]]:
             }
         )
     return described
-
-
-def _costs(report: Report) -> list[tuple[str, Cost]]:
-    return [("vertices", report.vertices), ("file, bytes", report.bytes)]
 
 
 def _changed(facts: RunFacts) -> list[tuple[str, Any]]:
