@@ -56,15 +56,10 @@ Seed = Annotated[int, Range(0)]
 
 
 def check_fields(config: Any) -> None:
-    """Require that every field of a dataclass holds what its annotation allows.
+    """Require that every field of a dataclass holds what its annotation allows. The message of the error starts with the field's name.
 
     A ``Literal`` has to hold one of its values, a ``bool`` True or False, and a number with a :class:`Range` one within it. ``None`` is
     allowed where the annotation allows it. Items of a tuple are checked one by one. Other types are not checked.
-
-    Raises
-    ------
-    InputError
-        if a value is not allowed; the message starts with the field's name.
     """
     hints = _hints(config.__class__)
     for field in fields(config):

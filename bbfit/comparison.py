@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import torch
@@ -143,10 +143,9 @@ class _Comparison:
         self._tree, self._views, self._record, self._config, self._stages = tree, views, record, config, stages
         self._folder, self._on_progress = record.folder, on_progress
         self._bake = BakeConfig(float(pixels_per_meter(views.train.cameras)), views=stages.views)
-        self._size: int | None = None
         count, many, crossed = config.billboards, config.many, config.crossed
         self._systems: dict[str, tuple[str, Callable[[Path], _SystemResult]]] = {
-            "bbfit": (f"bbfit, {count} billboards, mask", self._bbfit),
+            "bbfit": (f"bbfit, {count} billboards, mask", partial(self._fitted, FitConfig(billboards=count))),
             "bbfit-blend": (f"bbfit, {count} billboards, blend", partial(self._fitted, FitConfig(alpha="blend", billboards=count))),
             "bbfit-many": (f"bbfit, {many} billboards, blend", partial(self._fitted, FitConfig(alpha="blend", billboards=many))),
             "bbfit-bytes": ("bbfit, blend, in bbfit's bytes", self._budgeted),
@@ -202,9 +201,6 @@ class _Comparison:
         on_view = partial(self._on_progress, f"{system} score")
         return mean_measures(score_views(draw_and_save, self._views.test, on_view=on_view))
 
-    def _bbfit(self, folder: Path) -> _SystemResult:
-        return self._fitted(FitConfig(billboards=self._config.billboards), folder)
-
     def _fitted(self, fit: FitConfig, folder: Path) -> _SystemResult:
         """Run bbfit with ``fit``. Fields that ``fit`` does not set come from the shared options."""
         default, shared = FitConfig(), self._stages.fit
@@ -215,7 +211,7 @@ class _Comparison:
     def _budgeted(self, folder: Path) -> _SystemResult:
         """Run bbfit with a budget of as many bytes as the model of the ``bbfit`` system has."""
         fit = replace(self._stages.fit, alpha="blend")
-        return self._run(RunConfig(fit=fit, budget=BudgetConfig(bytes=self._bytes()), export=self._stages.export), folder)
+        return self._run(RunConfig(fit=fit, budget=BudgetConfig(bytes=self._bytes), export=self._stages.export), folder)
 
     def _run(self, stages: RunConfig, folder: Path) -> _SystemResult:
         def report(stage: str, done: int, total: int, note: str = "") -> None:
@@ -263,11 +259,11 @@ class _Comparison:
         return _SystemResult(mesh.glb, mesh.vertices, time.perf_counter() - started, self._rendered(mesh.glb, folder), None, note)
 
     def _decimated_to_size(self, folder: Path) -> _SystemResult:
-        return self._decimated(folder, size=self._bytes())
+        return self._decimated(folder, size=self._bytes)
 
     def _thinned(self, folder: Path) -> _SystemResult:
         """Decimate the tree with enlarged leaves (Cook et al. 2007) to at most the size of the ``bbfit`` system's model."""
-        started, path, limit = time.perf_counter(), folder / "thinned.glb", self._bytes()
+        started, path, limit = time.perf_counter(), folder / "thinned.glb", self._bytes
         assert self._views.request and self._views.request.tree.faces
         triangles = max(1, self._views.request.tree.faces * limit // self._tree.bytes)
         for _ in range(_DECIMATION_ATTEMPTS):
@@ -310,13 +306,12 @@ class _Comparison:
         paths = render_pictures(path, self._views.test.cameras, pictures, self._stages.views, on_progress=self._on(folder, "render"))
         return lambda index: premultiply(torch.from_numpy(read_rgba(paths[index])).double() / 255)
 
+    @cached_property
     def _bytes(self) -> int:
         """The size of the ``bbfit`` system's model."""
-        if self._size is None:
-            size = self.row("bbfit").bytes
-            assert size is not None
-            self._size = size
-        return self._size
+        size = self.row("bbfit").bytes
+        assert size is not None
+        return size
 
     def _on(self, folder: Path, activity: str) -> Callable[[int, int], None]:
         return partial(self._on_progress, f"{folder.name} {activity}")

@@ -19,12 +19,9 @@ PART = ".part"
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write ``data`` to ``path`` atomically. If this fails, an existing file stays as it was.
+    """Write ``data`` to ``path`` atomically. If this fails, an existing file stays as it was, and the temporary file is removed.
 
-    Raises
-    ------
-    InputError
-        If the disk is full, or the folder is missing or not writable. The temporary file is removed.
+    Raises ``InputError`` if the disk is full, or the folder is missing or not writable.
     """
     write_pieces(path, (data,))
 
@@ -53,31 +50,12 @@ def _replace(path: Path, pieces: Iterable[bytes]) -> None:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Write ``value`` as indented JSON atomically, with the errors of :func:`write_bytes`.
-
-    Raises
-    ------
-    ValueError
-        If a number is NaN or infinite.
-    """
+    """Write ``value`` as indented JSON atomically, with the errors of :func:`write_bytes`. NaN and infinity raise ``ValueError``."""
     write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
 def read_json(name: str, path: Path) -> Any:
-    """Read a JSON file.
-
-    Parameters
-    ----------
-    name
-        The name of the input in the error message.
-    path
-        The file.
-
-    Raises
-    ------
-    InputError
-        If the file is not valid JSON.
-    """
+    """Read a JSON file. If it is not valid, the message of the ``InputError`` calls the input ``name``."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:  # very long numbers and very deep lists raise them too
@@ -92,24 +70,9 @@ def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], metadata: Map
 
 
 def output_folder(name: str, path: str | Path) -> Path:
-    """Create an output folder if it does not exist, and remove temporary files of killed processes from it.
+    """Create an output folder if it does not exist, remove temporary files of killed processes from it, and return it.
 
-    Parameters
-    ----------
-    name
-        The name of the option in the error message.
-    path
-        The folder.
-
-    Returns
-    -------
-    Path
-        The folder.
-
-    Raises
-    ------
-    InputError
-        If ``path`` or a part of it is a file, or if the folder cannot be written to.
+    If ``path`` or a part of it is a file, or the folder cannot be written to, this raises ``InputError`` with the option's ``name``.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():

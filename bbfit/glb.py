@@ -24,24 +24,10 @@ def is_glb(data: bytes) -> bool:
 
 
 def gltf_parts(data: bytes, name: str = "model", path: str | Path = "the file") -> tuple[dict[str, Any], bytes]:
-    """The JSON and the binary chunk of a .glb or .gltf file.
+    """The JSON object of a .glb or .gltf file from its bytes, and its first binary chunk, which is empty if there is none.
 
-    Parameters
-    ----------
-    data
-        Contents of the file. What does not begin with the magic number of GLB is read as JSON.
-    name, path
-        What the file is for, and its path: for messages only.
-
-    Returns
-    -------
-    tuple[dict[str, Any], bytes]
-        tuple of dict and bytes The JSON's object and the contents of the first binary chunk, which are empty if there is none.
-
-    Raises
-    ------
-    InputError
-        If the file is cut short, is not glTF 2.0, or its JSON is not an object.
+    Data without the magic number of GLB is read as JSON. Raises ``InputError`` if the file is cut short, is not glTF 2.0, or its JSON is no
+    object. The message contains ``name``, which is what the file is for, and ``path``.
     """
     text, binary = data, b""
     if data[:4] == b"glTF":

@@ -16,16 +16,9 @@ from bbfit.files import write_bytes
 
 
 def read_rgba(path: str | Path) -> NDArray[np.uint8]:
-    """Read a straight-alpha PNG or WebP picture.
+    """Read a straight-alpha PNG or WebP picture as uint8 [H, W, 4] RGBA; 16-bit files are reduced to 8 bits.
 
-    Returns
-    -------
-    uint8 [H, W, 4] RGBA; 16-bit files are reduced to 8 bits.
-
-    Raises
-    ------
-    MissingFileError, InputError
-        if the file is missing, cut short, damaged, of another format, or has no alpha channel.
+    Raises ``MissingFileError`` or ``InputError`` if the file is missing, cut short, damaged, of another format, or has no alpha channel.
     """
     path = Path(path)
     if not path.is_file():
@@ -86,20 +79,15 @@ def over_color(premultiplied: Tensor, color: float | Tensor = 1.0) -> Tensor:
 
 
 def bleed_color(texture: Tensor) -> Tensor:
-    """Give each transparent texel the color of the nearest opaque one.
+    """Give each transparent texel of a straight RGBA texture, [h, w, 4], the color of the nearest opaque one.
+
+    The texture is uint8 or floating point in [0, 1], and the result has its shape and type. Visible texels are unchanged, and a second call
+    changes nothing. If nothing is visible, the result is all zero.
 
     Filtering straight alpha mixes in the color of transparent texels: next to visible texels in bilinear filtering, everywhere in mip
     levels. A texel is transparent if its alpha rounds to 0 in 8 bits; it becomes exactly 0. A texel is opaque if its alpha is at least half
     of the texture's largest; fainter texels often have a color that no view determined. The nearest texel follows from the exact Euclidean
     distance transform (Felzenszwalb and Huttenlocher 2012).
-
-    Parameters
-    ----------
-    texture : straight RGBA, [h, w, 4]: uint8, or floating point in [0, 1].
-
-    Returns
-    -------
-    The same shape and type; visible texels are unchanged, and a second call changes nothing. All zero if nothing is visible.
     """
     alpha = texture[..., 3]
     hidden = (alpha == 0) if texture.dtype == torch.uint8 else (alpha * 255 < 0.5)

@@ -41,10 +41,10 @@ def split_views(count: int, seed: int) -> tuple[list[int], list[int]]:
 
 
 def write_transforms(folder: Path, camera: Camera, image_paths: list[str], train: list[int], test: list[int]) -> None:
-    """Write both transforms files for a batch of cameras.
+    """Write both transforms files for a batch of cameras and ``image_paths``, which are relative to ``folder`` and end in ``.png``.
 
-    ``image_paths`` are relative to ``folder`` and end in ``.png``. Orthographic cameras, which the layout does not know, are marked
-    with ``camera_model = "ORTHOGRAPHIC"`` and ``orthographic_extent_x`` in meters, as well as intrinsics in pixels per meter.
+    The layout does not know orthographic cameras. Theirs have ``camera_model = "ORTHOGRAPHIC"`` and ``orthographic_extent_x`` in meters, as
+    well as intrinsics in pixels per meter.
     """
     matrices = camera_to_nerf(camera.world_to_camera.double())
     k = camera.intrinsics[0].double()

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bbfit.checks import check_folder, fail
+from bbfit.provenance import installed_version
 
 if TYPE_CHECKING:
     import trimesh
@@ -21,10 +21,7 @@ _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 def check_model_path(name: str, path: str | Path) -> Path:
     """Require one of the endings ``SUFFIXES`` and an existing folder; return the path as a ``Path``.
 
-    Raises
-    ------
-    InputError or MissingFileError
-        That call the file ``name``.
+    Raises ``InputError`` or ``MissingFileError`` with a message that calls the file ``name``.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -55,7 +52,4 @@ def glb_of_scene(scene: trimesh.Scene, complete: Callable[[dict[str, Any]], None
 
 def generator() -> str:
     """The name and version of this program, as files name what made them."""
-    try:
-        return f"bbfit {version('bbfit')}"
-    except PackageNotFoundError:  # used from a folder that was never installed
-        return "bbfit"
+    return f"bbfit {installed_version('bbfit') or ''}".rstrip()

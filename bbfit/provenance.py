@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -36,25 +37,10 @@ EXECUTION = {"affects_result": False}
 def identity(value: Any) -> Any:
     """Convert a value to JSON that is the same for two values exactly if both lead to the same result.
 
-    Dataclasses become mappings of their fields, except the fields with the metadata :data:`EXECUTION`. A path becomes the name and the
-    digest of its file. Floating-point numbers without a fraction become integers, so that 0 and 0.0 are the same.
-
-    Parameters
-    ----------
-    value
-        A dataclass, mapping, list, tuple, path, number, string, boolean or ``None``, nested to any depth.
-
-    Returns
-    -------
-    Any
-        Mappings with string keys, lists, numbers, strings, booleans and ``None``.
-
-    Raises
-    ------
-    MissingFileError, InputError
-        If the file of a path is missing or empty.
-    TypeError
-        If a value has another type.
+    The value is a dataclass, mapping, list, tuple, path, number, string, boolean or ``None``, nested to any depth; any other type raises
+    ``TypeError``. Dataclasses become mappings of their fields, except the fields with the metadata :data:`EXECUTION`. A path becomes the
+    name and the digest of its file, which must exist and not be empty (``MissingFileError``, ``InputError``). Floating-point numbers
+    without a fraction become integers, so that 0 and 0.0 are the same.
     """
     if is_dataclass(value) and not isinstance(value, type):
         included = [entry for entry in fields(value) if entry.metadata.get("affects_result", True)]
@@ -73,31 +59,16 @@ def identity(value: Any) -> Any:
 
 
 def cache_key(algorithm: str, *inputs: Any) -> str:
-    """The key of an algorithm's result for some inputs.
+    """The key of the result of an algorithm in :data:`VERSIONS` for all inputs that it depends on.
 
-    Parameters
-    ----------
-    algorithm
-        A name in :data:`VERSIONS`.
-    *inputs
-        All values that the result depends on. They must have an :func:`identity`, whose errors are raised.
-
-    Returns
-    -------
-    str
-        SHA-256 over the name and the version of the algorithm and the identities of the inputs, as 64 hexadecimal digits.
+    It is the SHA-256 over the algorithm's name and version and the :func:`identity` of the inputs, as 64 hexadecimal digits. The errors of
+    :func:`identity` are raised.
     """
     return sha256(json.dumps([algorithm, VERSIONS[algorithm], identity(inputs)], sort_keys=True).encode()).hexdigest()
 
 
 def digest_file(path: Path) -> str:
-    """SHA-256 of the contents of a file, as 64 hexadecimal digits.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the file does not exist.
-    """
+    """SHA-256 of the contents of a file, as 64 hexadecimal digits. Raises ``FileNotFoundError`` if the file does not exist."""
     digest = sha256()
     with path.open("rb") as file:
         while block := file.read(1 << 20):
@@ -109,3 +80,11 @@ def digest_files(files: Iterable[Path], folder: Path) -> str:
     """SHA-256 over the contents of files and their paths relative to ``folder``. A single file has the digest of its contents alone."""
     digests = [(Path(os.path.relpath(file, folder)).as_posix(), digest_file(file)) for file in files]
     return digests[0][1] if len(digests) == 1 else sha256(json.dumps(digests).encode()).hexdigest()
+
+
+def installed_version(package: str) -> str | None:
+    """The version of an installed package, or ``None`` if it is not installed, such as bbfit in a source folder."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

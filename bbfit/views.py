@@ -43,19 +43,9 @@ class ViewSet:
 
     @staticmethod
     def from_arrays(images: NDArray[Any] | Tensor, cameras: Camera) -> ViewSet:
-        """Views from pictures in memory, which are named 0000, 0001 and so on.
+        """Views from straight-alpha RGBA pictures, [V, H, W, 4], with V cameras, which are named 0000, 0001 and so on.
 
-        Parameters
-        ----------
-        images : array or tensor
-            straight-alpha RGBA, [V, H, W, 4]: uint8, or floats in [0, 1], which are rounded to 8 bits.
-        cameras : Camera
-            V cameras of pictures of W x H pixels.
-
-        Raises
-        ------
-        InputError
-            if the pictures have another shape or type, or values out of range.
+        Pictures are uint8, or floats in [0, 1], which are rounded to 8 bits. Other shapes, types and values raise ``InputError``.
         """
         pictures = torch.as_tensor(images).detach().cpu()
         cameras = cameras.batch().to(torch.float64).to("cpu")
@@ -84,10 +74,8 @@ class ViewSet:
     def image(self, index: int) -> Tensor:
         """One picture, uint8 [H, W, 4], straight alpha. Do not write to it: it may be cached.
 
-        Raises
-        ------
-        MissingFileError, InputError
-            if the file is missing, damaged, without alpha, fully transparent or of another size than the rest.
+        Raises ``MissingFileError`` or ``InputError`` if the file is missing, damaged, without alpha, fully transparent or not of the
+        others' size.
         """
         path = self.paths[index]
         picture = self.read(path)
@@ -142,18 +130,17 @@ class ViewDataset:
 
         Parameters
         ----------
-        folder : str or Path
-            folder with one or two transforms files.
-        seed : int
-            seed of the random quarter that becomes the test split if the folder has none.
-        cache_bytes : int
-            most bytes of decoded pictures that stay in memory.
+        folder
+            Folder with one or two transforms files.
+        seed
+            Seed of the random quarter that becomes the test split if the folder has none.
+        cache_bytes
+            Most bytes of decoded pictures that stay in memory.
 
         Raises
         ------
         MissingFileError, InputError
-            if there are no transforms, no usable camera, too few views, or pictures missing, unreadable, without alpha or of
-            unequal size.
+            If there are no transforms, no usable camera, too few views, or pictures missing, unreadable, without alpha or of unequal size.
         """
         folder = check_folder("views", folder)
         train, test = read_frames(folder)
@@ -185,16 +172,16 @@ class ViewDataset:
         Parameters
         ----------
         images, cameras
-            as for :meth:`ViewSet.from_arrays`; no picture may be fully transparent.
-        test : sequence of int, optional
-            indices of the held-out views. Default: the random quarter of ``seed``.
-        seed : int
-            seed of that quarter.
+            As for :meth:`ViewSet.from_arrays`; no picture may be fully transparent.
+        test
+            Indices of the held-out views. Default: a random quarter.
+        seed
+            Seed of that quarter.
 
         Raises
         ------
         InputError
-            if a picture cannot be used, there are fewer than two, or no view is left for training or for the test.
+            If a picture cannot be used, there are fewer than two, or no view is left for training or for the test.
         """
         views = ViewSet.from_arrays(images, cameras)
         if len(views) < 2:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 from bbfit.blender.processes import BlenderPool, require_bpy
@@ -62,11 +62,6 @@ def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int 
         fail("out", f"{out} is the tree itself", "choose another name")
     require_bpy()
     with BlenderPool({"tree": str(tree.path.resolve())}) as pool:
-        write_pieces(out, _pieces(pool.convert(triangles)))
+        with pool.convert(triangles).open("rb") as file:
+            write_pieces(out, iter(partial(file.read, _PIECE), b""))
     return out
-
-
-def _pieces(path: Path) -> Iterator[bytes]:
-    with path.open("rb") as file:
-        while piece := file.read(_PIECE):
-            yield piece

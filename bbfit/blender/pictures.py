@@ -125,12 +125,7 @@ def to_y_up(payload: bytes) -> NDArray[np.float64]:
 def vertical_axis(low: NDArray[np.floating], high: NDArray[np.floating], axis: str) -> Tensor:
     """The point at half the tree's height on the vertical line that the cameras circle (``ViewsConfig.axis``), [3] float64.
 
-    Parameters
-    ----------
-    low, high
-        The corners of the tree's bounding box in meters, [3] each.
-    axis
-        ``"auto"``, ``"origin"`` or ``"center"``.
+    ``low`` and ``high`` are the corners of the tree's bounding box in meters, [3] each.
     """
     target = torch.from_numpy((np.asarray(low, np.float64) + high) / 2)
     through_origin = all(low[i] <= 0 <= high[i] for i in (0, 2))

@@ -29,13 +29,7 @@ class BlenderError(InputError):
 
 
 def require_bpy() -> None:
-    """Require that Blender's module bpy is installed.
-
-    Raises
-    ------
-    InputError
-        If it is not. The message says what to install.
-    """
+    """Raise an :class:`~bbfit.checks.InputError` that says what to install if Blender's module bpy is missing."""
     if importlib.util.find_spec("bpy") is None:
         fail(
             "Blender",
@@ -140,31 +134,16 @@ class BlenderPool:
         return worker, event
 
     def load(self) -> dict[str, Any]:
-        """Start the first process, which loads and measures the tree.
+        """Start the first process, which loads and measures the tree. Raises :class:`BlenderError`, or ``InputError`` for an unusable tree.
 
-        Returns
-        -------
-        dict
-            ``vertices`` and ``faces`` (counts), ``blender`` (version), and ``payload`` (the vertices as raw float32, Z up).
-
-        Raises
-        ------
-        BlenderError
-            If Blender crashes.
-        InputError
-            If the tree cannot be used.
+        The result has ``vertices`` and ``faces`` (counts), ``blender`` (version), and ``payload`` (the vertices as raw float32, Z up).
         """
         return self._start_first("reading", measure=True)
 
     def convert(self, triangles: int | None) -> Path:
         """Write the tree as a GLB file with at most about ``triangles`` triangles. Leaving the pool removes the file.
 
-        Raises
-        ------
-        BlenderError
-            If Blender crashes.
-        InputError
-            If the tree cannot be read or written.
+        Raises :class:`BlenderError` if Blender crashes, and ``InputError`` if the tree cannot be read or written.
         """
         path = Path(self._scratch.name) / "tree.glb"
         self._settings = self._settings | {"convert": {"path": str(path), "triangles": triangles}}
@@ -183,27 +162,11 @@ class BlenderPool:
         return event
 
     def render(self, frames: list[dict[str, Any]], workers: int, finished: int, on_done: Callable[[int], None]) -> None:
-        """Render frames on the loaded process and ``workers - 1`` more.
+        """Render frames (:func:`~bbfit.blender.pictures.frames`) on the loaded process and ``workers - 1`` more.
 
-        A process that crashes is replaced, and its frame is rendered again. This happens at most :data:`RESTARTS` times.
-
-        Parameters
-        ----------
-        frames
-            The requests for pictures (:func:`~bbfit.blender.pictures.frames`).
-        workers
-            The number of processes.
-        finished
-            The number of pictures that exist already.
-        on_done
-            Called after each picture with the number of finished pictures, including those that existed already.
-
-        Raises
-        ------
-        BlenderError
-            If Blender crashes once more.
-        InputError
-            If a picture cannot be written.
+        A process that crashes is replaced, and its frame is rendered again. After more than :data:`RESTARTS` crashes, this raises
+        :class:`BlenderError`. If a picture cannot be written, it raises ``InputError``. ``on_done`` is called after each picture with the
+        number of finished pictures, which includes the ``finished`` ones that existed already.
         """
         waiting, crashes, total = deque(frames), 0, finished + len(frames)
         assigned: dict[Blender, dict[str, Any]] = {}

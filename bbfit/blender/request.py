@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import check_file, fail
 from bbfit.files import read_json, write_json
-from bbfit.provenance import VERSIONS, identity
+from bbfit.provenance import VERSIONS, identity, installed_version
 from bbfit.tree_files.tree_file import TreeFile
 
 
@@ -62,26 +61,17 @@ class ViewsRequest:
 
     @staticmethod
     def of(tree: TreeFile, config: ViewsConfig) -> ViewsRequest:
-        """The request for views of a tree before rendering.
-
-        Raises
-        ------
-        MissingFileError
-            If the panorama of the configuration does not exist.
-        """
+        """The request for views of a tree before rendering. Raises ``MissingFileError`` if the configuration's panorama does not exist."""
         if config.hdri is not None:
             config = replace(config, hdri=check_file("hdri", config.hdri))
         known = RenderedTree(tree.path.name, tree.digest, tree.bytes, tree.up_axis)
-        return ViewsRequest(identity(config), known, bbfit=_version())
+        return ViewsRequest(identity(config), known, bbfit=installed_version("bbfit") or "unknown")
 
     @staticmethod
     def load(path: Path) -> ViewsRequest | None:
         """Read a request. The result is ``None`` if bbfit did not write the file. Values of an unexpected type count as unknown.
 
-        Raises
-        ------
-        InputError
-            If the file is not valid JSON.
+        Raises ``InputError`` if the file is not valid JSON.
         """
         content = read_json("views", path)
         if not isinstance(content, dict) or not isinstance(content.get("tree"), dict):
@@ -107,24 +97,9 @@ class ViewsRequest:
         write_json(path, content)
 
     def check_same(self, folder: Path, file: str) -> ViewsRequest | None:
-        """Compare the request with an earlier one, which must be for the same pictures.
+        """The earlier request in ``file`` of a folder of pictures. ``None`` if the file does not exist.
 
-        Parameters
-        ----------
-        folder
-            The folder of the pictures.
-        file
-            The name of the request's file in it.
-
-        Returns
-        -------
-        ViewsRequest or None
-            The earlier request. ``None`` if the file does not exist.
-
-        Raises
-        ------
-        InputError
-            If the earlier request differs. The message names the first difference.
+        Raises ``InputError`` with the first difference if the earlier request was for other pictures.
         """
         path, hint = folder / file, f"choose another output folder, or remove {folder} to render again"
         if not path.is_file():
@@ -149,10 +124,3 @@ def _shown(value: Any) -> str:
     if isinstance(value, dict):
         return str(value.get("name"))
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-def _version() -> str:
-    try:
-        return version("bbfit")
-    except PackageNotFoundError:  # run from a source folder that is not installed
-        return "unknown"

@@ -171,8 +171,7 @@ def decimated(placed: list[PlacedMesh], ratio: float) -> list[PlacedMesh]:
     All meshes are joined first, so that edges collapse wherever this changes the tree's shape least. With the same ratio for each mesh,
     leaves of a few triangles would lose as large a share as finely tessellated bark. Foliage still loses area, because a card of two
     triangles turns into one triangle and then disappears. So the remaining islands of each foliage material are enlarged about their
-    centers until the material has its former area (Cook, Halstead, Planck, Ryu, "Stochastic Simplification of Aggregate Detail",
-    SIGGRAPH 2007).
+    centers until the material has its former area (Cook et al., "Stochastic Simplification of Aggregate Detail", SIGGRAPH 2007).
     """
     import bpy
 

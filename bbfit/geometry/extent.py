@@ -21,14 +21,8 @@ def corners(cloud: BillboardCloud) -> Tensor:
 def shown_bounds(cloud: BillboardCloud, *, spared: float = 0.0) -> Tensor:
     """Lowest and highest corner of a cloud's texels with at least half of the largest alpha, [2, 3] float64 in meters.
 
-    Parameters
-    ----------
-    spared : share of those texels that may lie outside on each side of each axis, for stray texels.
-
-    Raises
-    ------
-    InputError
-        if it has no billboards, or the share is not in [0, 0.5).
+    The share ``spared`` of those texels may lie outside on each side of each axis, for stray texels. Raises ``InputError`` if the cloud has
+    no billboards, or the share is not in [0, 0.5).
     """
     check_range("spared", spared, 0, 0.49)
     if not len(cloud):

@@ -1,10 +1,10 @@
-"""Launching Warp kernels: at once on a GPU, in pieces on all cores of a CPU, because Warp runs a CPU launch in the calling thread."""
+"""Launching Warp kernels, and their results as differentiable functions."""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
@@ -41,6 +41,19 @@ def _initialize() -> None:
 
 
 _initialize()
+
+
+def launch(kernel: Any, count: int, least: int, arguments: Sequence[Any], outputs: Sequence[Any] = (), *, across: int = 1, on: Any) -> None:
+    """Launch a kernel over [count, across] on a device: at once on a GPU, in pieces of at least ``least`` of ``count`` on a CPU.
+
+    Warp runs a CPU launch in the calling thread; the pieces share all cores. The kernel's first argument is where its piece begins.
+    """
+    kernel.module.load(on)  # or every thread would compile it
+
+    def piece(begin: int, end: int) -> None:
+        wp.launch(kernel, (end - begin, across), [begin, *arguments], outputs, device=on)
+
+    in_parallel(piece, [(0, count)] if on.is_cuda else pieces_of(count, least))
 
 
 def worker_count() -> int:
@@ -80,8 +93,21 @@ def pieces_of(count: int, least: int, most: int | None = None) -> list[tuple[int
 
 
 def warp_array(tensor: Tensor, dtype: Any) -> Any:
-    """A Warp view of the memory of a contiguous tensor, which must outlive it."""
+    """A Warp view of the memory of a contiguous tensor, which it keeps alive."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def struct_array(tensor: Tensor, kind: Any) -> Any:
+    """A Warp view of a contiguous tensor whose last dimension is the memory of a struct. It keeps the tensor alive."""
+    device, shape = wp.device_from_torch(tensor.device), tuple(tensor.shape[:-1])
+    array = wp.array(ptr=tensor.data_ptr(), shape=shape, dtype=kind, device=device)
+    array._tensor = tensor  # as wp.from_torch does
+    return array
+
+
+def differentiable(value: Tensor, picture: Tensor, gradient: Tensor) -> Tensor:
+    """The scalar ``value``, whose gradient in a finite ``picture`` is ``gradient``, of the picture's shape."""
+    return value + (gradient * (picture - picture.detach())).sum()
 
 
 @cache

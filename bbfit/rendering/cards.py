@@ -71,7 +71,8 @@ class MipChain:
 
 
 def draw_cards(cards: Cards, camera: Camera) -> Tensor:
-    """Draw cards as a graphics card does, with one sample per pixel.
+    """Draw cards on the CPU as a graphics card does, with one sample per pixel: premultiplied RGBA in [0, 1], float32 [H, W, 4] for one
+    camera and [V, H, W, 4] for a batch.
 
     Without mip levels, and for cards that show their whole rectangles, the picture equals that of :func:`~bbfit.rendering.dispatch.render`
     up to the rounding of textures to 8 bits. Filtering and blending use display-referred values, as fits do. Programs that filter in linear
@@ -87,16 +88,11 @@ def draw_cards(cards: Cards, camera: Camera) -> Tensor:
 
     Parameters
     ----------
-    cards : Cards
+    cards
         Polygons, their atlas and their mip levels, which need not reach down to one texel. Without levels the atlas is filtered bilinearly
         at every distance (sampler LINEAR).
-    camera : Camera
+    camera
         One camera or V cameras.
-
-    Returns
-    -------
-    Tensor
-        Premultiplied RGBA in [0, 1], float32 [H, W, 4] for one camera and [V, H, W, 4] for a batch, on the CPU.
 
     Raises
     ------
@@ -111,19 +107,9 @@ def draw_cards(cards: Cards, camera: Camera) -> Tensor:
 
 
 def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> MipChain:
-    """Concatenate mip levels.
+    """Concatenate mip levels, uint8 [h, w, C] each, level 0 first, which has the given shape.
 
-    Parameters
-    ----------
-    chain : Sequence[NDArray]
-        uint8 [h, w, C] each, level 0 first.
-    shape : tuple[int, ...]
-        Shape of level 0.
-
-    Raises
-    ------
-    InputError
-        If a level is not uint8 or not half as large as the level before, rounded down.
+    Raises InputError if there is no level, or a level is not uint8 or not half as large as the level before, rounded down.
     """
     if not chain:
         fail("chain", "has no levels", "level 0 is the atlas's picture")
@@ -234,10 +220,8 @@ def _faces(sheet: Sheet, camera: Camera) -> bool:
 
 
 def _hits(piece: Card, camera: Camera, to_uv: Tensor, to_depth: Tensor, free: Tensor) -> tuple[Tensor, ...]:
-    """Pixels whose rays meet a piece: x, y, u, v, the third homogeneous coordinate and the depth, [M] each.
-
-    Only pixels that are ``free``, bool [H, W], are returned; they are then marked as taken.
-    """
+    """The ``free`` pixels, bool [H, W], whose rays meet a piece, which then are not free: x, y, u, v, the third homogeneous coordinate
+    and the depth, [M] each."""
     low, high = torch.zeros(2, dtype=torch.int64), torch.tensor([camera.width, camera.height])
     corners = torch.from_numpy(_homogeneous(piece.corners)) @ camera.world_to_pixel.mT
     if bool((corners[:, 2] > 1e-9).all()):  # otherwise a part is behind the camera, and the corners bound nothing

@@ -17,11 +17,11 @@ def render(cloud: BillboardCloud, camera: Camera, *, backend: Backend = "auto") 
 
     Parameters
     ----------
-    cloud : BillboardCloud
+    cloud
         N >= 0 billboards.
-    camera : Camera
+    camera
         One camera or V cameras.
-    backend : {"auto", "reference", "fused"}
+    backend
         ``fused``: Warp kernels in float32; ``reference``: kornia and autograd in any precision; ``auto``: the reference for a float64
         cloud and the kernels for any other.
 

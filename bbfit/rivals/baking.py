@@ -95,17 +95,13 @@ def bake(
 
     Parameters
     ----------
-    tree
-        As for ``render_views``.
+    tree, folder, on_progress
+        As for :func:`~bbfit.blender.pictures.render_pictures`. Without a folder, an interrupted bake cannot resume.
     slabs
         N rectangles. They must contain everything that is to be visible; a margin for the renderer's filter is added.
     fill_cuts
         Give texels that show the dark inside of a stem, which the slab cuts open, the color of the nearest lit texel. A texel counts as
         inside if it reflects less than 3% of ``config.views.ambient_strength``, in sunlight or not.
-    folder
-        Keeps the pictures, so that an interrupted bake can resume (``render_pictures``); not kept when left out.
-    on_progress
-        Called with the number of finished pictures and of all pictures.
 
     Returns
     -------
@@ -114,10 +110,8 @@ def bake(
 
     Raises
     ------
-    MissingFileError or InputError
-        If the tree or the folder cannot be used, if a picture would have more than 16384 texels a side, or if there is no Blender.
-    BlenderError
-        If Blender crashes again and again.
+    MissingFileError, InputError, BlenderError
+        As for ``render_pictures``, also if a picture would have more than 16384 texels a side.
     """
     if folder is None:
         with tempfile.TemporaryDirectory(prefix="bbfit-") as scratch:
@@ -149,12 +143,8 @@ def bake(
 def tree_triangles(tree: str | Path | TreeFile) -> NDArray[np.float64]:
     """Corners of all triangles of a tree in the world of its views, [T, 3, 3] in meters.
 
-    Raises
-    ------
-    MissingFileError or InputError
-        If the file is missing, cannot be read or has no triangles, or if it takes Blender to read it and there is none.
-    BlenderError
-        If Blender crashes over it.
+    Blender reads formats other than .glb, .gltf and .obj. The errors of :func:`~bbfit.blender.conversion.tree_as_glb` and
+    :meth:`~bbfit.tree_files.tree_file.TreeFile.mesh` are raised.
     """
     tree = TreeFile.open(tree)
     if tree.suffix not in _MESH_SUFFIXES:

@@ -99,23 +99,10 @@ def billboard_cloud(
 
 
 def choose_planes(triangles: Array, count: int, *, areas: Array | None = None, share: float = 0.95) -> PlaneChoice:
-    """Choose at most N planes that hold a share of the triangles' area within the smallest epsilon that the bisection finds.
+    """Choose at most N >= 1 planes that hold a share of the triangles' area within the smallest epsilon that the bisection finds.
 
-    Parameters
-    ----------
-    triangles
-        Corners, [T, 3, 3] in meters.
-    count
-        N >= 1.
-    areas
-        Weight of each triangle, [T]; its area when left out.
-    share
-        In (0, 1].
-
-    Raises
-    ------
-    InputError
-        If there are no triangles, or all have zero area.
+    The triangles' corners are [T, 3, 3] in meters, their weights ``areas`` [T] (by default their areas), and ``share`` is in (0, 1].
+    Raises ``InputError`` if there are no triangles, or all have zero area.
     """
     check_count("billboards", count)
     check_range("share", share, 0, 1, open_low=True)

@@ -32,15 +32,10 @@ def crossed_planes(
     folder: str | Path | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> BillboardCloud:
-    """N upright billboards at k·180°/N degrees through the tree's axis, each showing all of the tree in parallel projection.
+    """N >= 1 upright billboards at k·180°/N degrees through the tree's axis, each showing all of the tree in parallel projection.
 
     The axis is the one that the views' cameras circle (``config.views.axis``). Billboard 0 faces the first view. Rectangles are cropped to
     their visible part. For everything else see ``bake``.
-
-    Parameters
-    ----------
-    count
-        N >= 1.
     """
     check_count("billboards", count)
     points = tree_triangles(tree).reshape(-1, 3)
@@ -56,14 +51,8 @@ def crossed_planes(
 def upright_slabs(points: NDArray[np.floating], axis: Tensor, azimuth_degrees: float, count: int) -> Slabs:
     """S parallel upright slabs of equal thickness that partition points, with planes in their middles, ordered from back to front.
 
-    Parameters
-    ----------
-    points
-        [P, 3] in meters.
-    axis
-        [3] origin of the azimuths; it only decides which side is the front.
-    azimuth_degrees
-        Direction of the normal: 0 is +Z, 90 is +X, as in ``Orbit``.
+    The points, [P, 3], are in meters. The normal has the given azimuth as in ``Orbit`` (0 is +Z, 90 is +X) about ``axis``, [3], which only
+    decides which side is the front.
     """
     angle = math.radians(azimuth_degrees)
     right, up, normal = (

@@ -12,16 +12,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.checks import check_count, fail
 from bbfit.tree_files.tree_file import TreeFile
-
-if TYPE_CHECKING:
-    import trimesh
 
 # Rounds of edge collapse, each with the excess of the previous one as its target; steps of the search for a grid.
 _ROUNDS, _STEPS = 4, 24
@@ -52,25 +49,11 @@ class _Part:
 
 
 def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: int | None = None) -> DecimatedTree:
-    """Reduce a tree to a number of vertices, or of bytes of its GLB.
+    """Reduce a .glb, .gltf or .obj to at least 4 ``vertices``, or to a GLB of ``size`` bytes, textures and materials included.
 
     Parts of different materials stay separate and share the budget by their triangles. Vertices that lie in the same place with the same
-    texture coordinates are welded first. Normals are left out: surfaces are flat.
-
-    Parameters
-    ----------
-    tree
-        .glb, .gltf or .obj.
-    vertices
-        At least 4.
-    size
-        bytes, textures and materials included.
-
-    Raises
-    ------
-    MissingFileError or InputError
-        If the file cannot be used, the package fast-simplification is missing, both limits or neither are given, or the limit cannot be
-        reached.
+    texture coordinates are welded first. Normals are left out: surfaces are flat. Raises ``MissingFileError`` or ``InputError`` if the file
+    cannot be used, the package fast-simplification is missing, both limits or neither are given, or the limit cannot be reached.
     """
     if (vertices is None) == (size is None):
         fail("decimate", "expected either vertices or a size", "give one of them")
@@ -180,18 +163,14 @@ def _used(part: _Part) -> _Part:
     return replace(part, points=part.points[used], faces=faces.reshape(-1, 3), uv=_taken(part.uv, used))
 
 
-def _scene(parts: list[_Part]) -> trimesh.Scene:
+def _glb(parts: list[_Part]) -> bytes:
     import trimesh
 
     meshes = []
     for part in parts:
         visual = trimesh.visual.TextureVisuals(uv=part.uv, material=part.material) if part.material is not None else None
         meshes.append(trimesh.Trimesh(part.points, part.faces, visual=visual, process=False, validate=False))
-    return trimesh.Scene(meshes)
-
-
-def _glb(parts: list[_Part]) -> bytes:
-    data = _scene(parts).export(file_type="glb")
+    data = trimesh.Scene(meshes).export(file_type="glb")
     assert isinstance(data, bytes)
     return data
 

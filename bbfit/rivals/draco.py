@@ -26,20 +26,11 @@ class DracoSize:
 
 
 def draco_size(tree: str | Path | TreeFile, *, position_bits: int = 14) -> DracoSize:
-    """Compress every mesh of a tree, with its texture coordinates and normals, as glTF's KHR_draco_mesh_compression would.
+    """Compress every mesh of a .glb, .gltf or .obj as glTF's KHR_draco_mesh_compression would, with texture coordinates and normals.
 
-    Parameters
-    ----------
-    tree
-        .glb, .gltf or .obj.
-    position_bits
-        Bits for each coordinate of a position, of 1 to 30; texture coordinates take 12 and normals 10, as in Draco's own encoder, whose
-        highest level of compression is used.
-
-    Raises
-    ------
-    MissingFileError or InputError
-        If the file cannot be used or the package DracoPy is missing.
+    A coordinate of a position takes ``position_bits`` bits, 1 to 30. As in Draco's own encoder, whose highest level of compression is used,
+    texture coordinates take 12 and normals 10. Raises ``MissingFileError`` or ``InputError`` if the file cannot be used or the package
+    DracoPy is missing.
     """
     check_range("position_bits", position_bits, 1, 30)
     try:

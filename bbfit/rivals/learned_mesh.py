@@ -59,17 +59,9 @@ class LearnedMesh:
         check_shape("texture", tuple(self.texture.shape), (None, None, 4))
 
     def draw(self, camera: Camera) -> Tensor:
-        """Draw one view by casting 16 rays a pixel; every surface on a ray is blended over those behind it.
+        """Draw one view by casting 16 rays a pixel: premultiplied RGBA in [0, 1], float32 [H, W, 4].
 
-        Returns
-        -------
-        Tensor
-            Premultiplied RGBA in [0, 1], float32 [H, W, 4].
-
-        Raises
-        ------
-        InputError
-            If the camera is a batch, or Mitsuba or LLVM is missing.
+        Every surface on a ray is blended over those behind it. Raises ``InputError`` for a batch of cameras, or without Mitsuba or LLVM.
         """
         if camera.batched:
             fail("camera", "expected one camera, got a batch", "draw its cameras one by one")
@@ -94,14 +86,12 @@ def learn_mesh(
 
     Parameters
     ----------
-    views
-        Training views, from around the tree.
+    views, steps, size, seed, on_step
+        As for ``refine_mesh``; the views are from around the tree.
     vertices
         Upper bound on the vertices of the result, which comes close to it; vertices on seams count once for each side, as in a file.
     texels
         Width and height of the texture.
-    steps, size, seed, on_step
-        See ``refine_mesh``.
 
     Raises
     ------
@@ -147,7 +137,7 @@ def refine_mesh(
     seed: int = 0,
     on_step: Callable[[int, float], None] | None = None,
 ) -> LearnedMesh:
-    """Move a mesh's vertices and paint its texture so that it looks like the views; triangles and texture coordinates stay.
+    """Move a mesh's vertices and paint its texture so that it looks like the training views; triangles and texture coordinates stay.
 
     Each step draws one view and descends on the mean squared error of its premultiplied RGBA. Its gradient has two parts: that of what
     each sample sees, by automatic differentiation, and that of the silhouettes, by sampling points on them (Li et al. 2018, "Differentiable
@@ -155,25 +145,9 @@ def refine_mesh(
     Inverse Rendering of Geometry"), texels by Adam (Kingma and Ba 2015). Threads add up gradients in any order, so that two runs of one
     seed are alike but not equal.
 
-    Parameters
-    ----------
-    start
-        The mesh to begin with.
-    views
-        Training views.
-    steps
-        Views drawn; the first half of them at half of the size.
-    size
-        Larger side of the pictures drawn, in pixels; the views' own at most.
-    seed
-        Chooses the order of the views and the places of the samples.
-    on_step
-        Called after each step with the number of steps done and the step's loss.
-
-    Raises
-    ------
-    InputError
-        If an argument is out of range, or Mitsuba or LLVM is missing.
+    The pictures drawn have a larger side of ``size`` pixels, the views' own at most, and half of it in the first half of the steps. The
+    seed chooses the order of the views and the places of the samples. ``on_step`` is called after each step with the number of steps
+    done and the step's loss. Raises ``InputError`` if an argument is out of range, or Mitsuba or LLVM is missing.
     """
     _check_plan(steps, size, seed)
     threads = torch.get_num_threads()

@@ -26,15 +26,8 @@ SMALLEST_PART = 0.01
 def hull_surface(views: ViewSet) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Carve the hull from two grids, the second around the cells that the first one keeps.
 
-    Returns
-    -------
-    tuple[NDArray[np.float64], NDArray[np.int64]]
-        Vertices in meters [P, 3] and triangles [F, 3] of a closed surface, counter-clockwise from outside (Lorensen and Cline 1987).
-
-    Raises
-    ------
-    InputError
-        If no point lies inside the silhouettes of all views.
+    The result is a closed surface (Lorensen and Cline 1987): vertices in meters, [P, 3], and triangles counter-clockwise from outside,
+    [F, 3]. Raises ``InputError`` if no point lies inside the silhouettes of all views.
     """
     center, half = _reach(views.cameras)
     low, high = center - half, center + half

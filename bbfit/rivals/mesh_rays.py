@@ -29,21 +29,10 @@ STEP_ON = 1e-5
 
 
 def pixel_rays(camera: Camera, places: Tensor, grid: int) -> tuple[Tensor, Tensor]:
-    """Rays through the cells of every pixel, in world space.
+    """Rays of one camera through ``grid`` x ``grid`` cells of every pixel: origins in meters and unit directions in world space.
 
-    Parameters
-    ----------
-    camera
-        One camera.
-    places
-        Where in its cell each ray passes, in [0, 1], [H·W·grid², 2] (right, down): pixel by pixel, in it row by row.
-    grid
-        Cells along a pixel's side.
-
-    Returns
-    -------
-    tuple[Tensor, Tensor]
-        Origins in meters and unit directions, float32 [H·W·grid², 3] each.
+    Both are float32 [H·W·grid², 3]. ``places`` are where in its cell each ray passes, right and down in [0, 1], [H·W·grid², 2]: pixel by
+    pixel, in it row by row.
     """
     rows, columns = torch.arange(camera.height * grid), torch.arange(camera.width * grid)
     y, x = torch.meshgrid(rows, columns, indexing="ij")
@@ -102,14 +91,9 @@ class RayCaster:
         self._parameters.update()
 
     def colors(self, origins: Tensor, directions: Tensor, texture: Tensor) -> Tensor:
-        """What rays see: premultiplied RGBA, float32 [S, 4].
+        """What rays see, premultiplied RGBA, float32 [S, 4].
 
-        Parameters
-        ----------
-        origins, directions
-            [S, 3], directions of unit length.
-        texture
-            Straight RGBA in [0, 1], [h, w, 4].
+        Origins and unit directions are [S, 3], the texture is straight RGBA in [0, 1], [h, w, 4].
         """
         mi, dr = _libraries()
         seen = self._trace(_points(origins), _points(directions), self._vertices, mi.TensorXf(_array(texture)), attached=False)
@@ -119,20 +103,10 @@ class RayCaster:
     def gradients(
         self, origins: Tensor, directions: Tensor, texture: Tensor, samples: int, loss: Callable[[Tensor], Tensor]
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Gradients of a loss on pixels, each the mean of ``samples`` successive rays.
+        """Gradients of a loss on pixels, each the mean of ``samples`` successive rays, which are as for ``colors``.
 
-        Parameters
-        ----------
-        origins, directions, texture
-            As ``colors``, S = pixels · ``samples``.
-        loss
-            From the pixels, [S / ``samples``, 4], to its derivative by them.
-
-        Returns
-        -------
-        tuple[Tensor, Tensor, Tensor]
-            The derivative by the pixels, [S / ``samples``, 4], by the vertices, [P, 3], with fixed silhouettes, and by the texture, [h, w,
-            4].
+        ``loss`` maps the pixels, [S / ``samples``, 4], to its derivative by them. The result is this derivative, and the gradients by the
+        vertices, [P, 3], with fixed silhouettes, and by the texture, [h, w, 4].
         """
         mi, dr = _libraries()
         vertices, texels = mi.Float(self._vertices), mi.TensorXf(_array(texture))

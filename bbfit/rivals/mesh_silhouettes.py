@@ -80,27 +80,10 @@ def boundary_gradient(
     random: torch.Generator,
     density: float = BOUNDARY_SAMPLES,
 ) -> Tensor:
-    """Gradient of a loss through the motion of silhouettes: an integral along them, estimated by sampling.
+    """Gradient of a loss by the points of a mesh, [points, 3], through the motion of silhouettes: an integral along them, by sampling.
 
-    Parameters
-    ----------
-    surface, points
-        The mesh and its points, [points, 3].
-    camera
-        One camera.
-    slope
-        Derivative of the loss by the premultiplied RGBA of each pixel, [H·W, 4].
-    colors
-        What rays of given origins and directions see, premultiplied RGBA: ``colors``.
-    random
-        Chooses the samples.
-    density
-        Samples per pixel of the view.
-
-    Returns
-    -------
-    Tensor
-        The gradient by the points, [points, 3].
+    ``slope`` is the derivative of the loss by the premultiplied RGBA of each pixel of the one camera, [H·W, 4]. ``colors`` returns what
+    rays of given origins and directions see (``RayCaster.colors``). ``density`` is the number of samples per pixel.
     """
     points = points.detach().requires_grad_()
     ends = camera.project(points.double())[surface.silhouette(points.detach(), camera)]  # [K, 2, 2]

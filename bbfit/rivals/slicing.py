@@ -65,13 +65,7 @@ class Slicings:
         return [(first % count, 1 - (place - first)), ((first + 1) % count, place - first)]
 
     def draw(self, camera: Camera) -> Tensor:
-        """Draw the tree.
-
-        Returns
-        -------
-        Tensor
-            Premultiplied RGBA, [V, H, W, 4] ([H, W, 4] for a single camera).
-        """
+        """Draw the tree as premultiplied RGBA, [V, H, W, 4] ([H, W, 4] for a single camera)."""
         if camera.batched:
             return torch.stack([self.draw(camera[index]) for index in range(len(camera))])
         drawn = [weight * render(self.clouds[index], camera) for index, weight in self.weights(camera) if weight > 0]
@@ -87,17 +81,9 @@ def slicing(
     folder: str | Path | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Slicings:
-    """Slice a tree along evenly spaced directions.
+    """Slice a tree into ``slices`` >= 1 slices along each of ``directions`` >= 1 directions at equal angles over 180 degrees.
 
-    Empty slices are left out. With ``config.two_sided`` slices have back textures, unlike in the paper. For everything else see
-    ``bake``.
-
-    Parameters
-    ----------
-    directions
-        Number of slicings, at least 1, at equal angles over 180 degrees.
-    slices
-        Slices per slicing, at least 1.
+    Empty slices are left out. With ``config.two_sided`` slices have back textures, unlike in the paper. For everything else see ``bake``.
     """
     check_count("directions", directions)
     check_count("slices", slices)

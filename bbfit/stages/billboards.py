@@ -65,20 +65,8 @@ def fit_stage(
 ) -> Stage:
     """Fit billboards and write ``cloud.safetensors``, ``loss.csv`` and ``loss.png``. An interrupted fit continues from its checkpoint.
 
-    Parameters
-    ----------
-    folder
-        The run's folder.
-    views
-        The views, of which the training views are used.
-    tree
-        The mesh that places the billboards. ``None`` places them by the views alone.
-    config
-        The options of the fit.
-    limit
-        The maximum size of the model in bytes and its export options. ``None`` is no limit.
-    on_step
-        Called after every step of the fit.
+    The fit uses the training views. Without ``tree``, the views alone place the billboards. ``limit`` is the maximum size of the model in
+    bytes with its export options. ``on_step`` is called after every step of the fit.
     """
     config = config.resolve()
     checkpoint = folder / "fit.checkpoint"

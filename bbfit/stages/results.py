@@ -38,18 +38,8 @@ def export_stage(folder: Path, model: ShippedModel) -> Stage:
 def evaluate_stage(folder: Path, model: ShippedModel, views: ViewDataset, tree: TreeFile | None, seconds: Mapping[str, float]) -> Stage:
     """Score the exported model on the held-out views, and write ``metrics.json`` and ``comparison.png``.
 
-    Parameters
-    ----------
-    folder
-        The run's folder. It contains the outputs of the fit and of the export.
-    model
-        The exported model.
-    views
-        The views, of which the held-out ones are used.
-    tree
-        The original tree, or ``None`` if it is not known.
-    seconds
-        The seconds of the earlier stages, which the report contains.
+    ``folder`` contains the outputs of the fit and of the export. ``tree`` is the original tree, if it is known. ``seconds`` are those of
+    the earlier stages, which the report contains.
     """
 
     def work(on_progress: OnProgress) -> None:
@@ -69,20 +59,10 @@ def report_stage(
     views: ViewDataset,
     facts: Mapping[str, Any],
 ) -> Stage:
-    """Write ``report.html``.
+    """Write ``report.html`` with the score of ``model`` and its pictures beside the held-out views.
 
-    Parameters
-    ----------
-    folder
-        The run's folder. It contains the outputs of the fit and of the evaluation.
-    report
-        The score of ``model``.
-    model
-        The exported model.
-    views
-        The views, of which the held-out ones are shown.
-    facts
-        The fields of :class:`~bbfit.reporting.html.RunFacts` that come from the record of the run.
+    ``folder`` contains the outputs of the fit and of the evaluation. ``facts`` are the fields of
+    :class:`~bbfit.reporting.html.RunFacts` that come from the record of the run.
     """
     pareto = folder / "pareto.png" if any(facts["options"].get("budget", {}).values()) else None
 

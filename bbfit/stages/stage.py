@@ -7,14 +7,13 @@ import platform
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol
 
 from bbfit.checks import InputError
 from bbfit.files import read_json, write_json
-from bbfit.provenance import cache_key, digest_file
+from bbfit.provenance import cache_key, digest_file, installed_version
 
 RECORD_FILE = "run.json"
 """The name of the record in a folder."""
@@ -83,17 +82,9 @@ class Record:
         return all((file := self.folder / path).is_file() and digest_file(file) == digest for path, digest in entry["outputs"].items())
 
     def run(self, stage: Stage, on_progress: OnProgress = silent) -> bool:
-        """Run a stage and record it, or skip it if its results are current.
+        """Run a stage and record it, or skip it if its results are current. Returns whether the stage was run.
 
-        Returns
-        -------
-        bool
-            Whether the stage was run.
-
-        Raises
-        ------
-        InputError, OSError
-            If the work raises it. The record then stays as it was.
+        Raises ``InputError`` or ``OSError`` if the work does. The record then stays as it was.
         """
         key = stage.key  # before the work, during which an input file may change
         if self._is_current(stage.name, key):
@@ -111,17 +102,10 @@ class Record:
 
 def record_head(source: str, config: Mapping[str, Any], seeds: Mapping[str, int]) -> dict[str, Any]:
     """The fields of a record besides its stages: source, resolved configuration as JSON, seeds, versions of packages, and the machine."""
-    versions = {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
+    versions = {"python": platform.python_version()} | {name: installed_version(name) for name in _PACKAGES}
     return {"source": source, "config": dict(config), "seeds": dict(seeds), "versions": versions, "machine": platform.platform()}
 
 
 def _is_entry(entry: Any) -> bool:
     kinds = {"inputs": str, "outputs": dict, "seconds": int | float}
     return isinstance(entry, dict) and all(isinstance(entry.get(name), kind) for name, kind in kinds.items())
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None

@@ -29,14 +29,9 @@ _COLORS = re.compile("\x1b\\[[0-9;]*m")
 
 
 class RayWorkers:
-    """All machines of a Ray cluster.
+    """All machines of a Ray cluster. Raises ``InputError`` if Ray is not installed or, on entering the context, if no cluster answers.
 
     If the process or the machine of a task dies, Ray repeats the task up to ``config.retries`` times.
-
-    Raises
-    ------
-    InputError
-        If Ray is not installed, or, on entering the context, if no cluster answers at the address.
     """
 
     def __init__(self, config: SweepConfig) -> None:
@@ -75,13 +70,7 @@ class RayWorkers:
             self._ray.shutdown()
 
     def submit(self, task: Task) -> None:
-        """Run a task as soon as the cluster has room.
-
-        Raises
-        ------
-        InputError
-            If a file of an input does not lie in the folder of the first file or below.
-        """
+        """Run a task as soon as the cluster has room. The errors of :func:`read_files` are raised."""
         contents = [self._reference(paths) for paths in task.inputs.values()]
         main_files = {name: paths[0].name if paths[0].is_file() else "" for name, paths in task.inputs.items()}
         cores = max(self._config.cpus, self._smallest_machine) if task.alone else self._config.cpus
@@ -125,13 +114,7 @@ def _check_address(address: str) -> None:
 
 
 def read_files(*paths: Path) -> Files:
-    """Read all files of a folder, or a tuple of files that lie in the folder of the first file or below.
-
-    Raises
-    ------
-    InputError
-        If a file lies elsewhere.
-    """
+    """Read all files of a folder, or a tuple of files. Raises ``InputError`` if one of them lies outside the folder of the first."""
     if paths[0].is_dir():
         folder, paths = paths[0], tuple(sorted(file for file in paths[0].rglob("*") if file.is_file()))
     else:

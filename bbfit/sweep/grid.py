@@ -56,17 +56,9 @@ class Grid:
 
     @staticmethod
     def load(name: str) -> Grid:
-        """Load a built-in grid, or a YAML file with the optional keys ``fit``, ``variants``, ``axes`` and ``trees``.
+        """Load a built-in grid, or a .yaml or .yml file with the optional keys ``fit``, ``variants``, ``axes`` and ``trees``.
 
-        Parameters
-        ----------
-        name
-            The name of a built-in grid, or the path of a .yaml or .yml file.
-
-        Raises
-        ------
-        MissingFileError, InputError
-            If the grid does not exist, or the file does not describe a grid.
+        Raises ``MissingFileError`` or ``InputError`` if the grid does not exist or the file does not describe one.
         """
         built_in = sorted(path.stem for path in _BUILT_IN.glob("*.yaml"))
         if name not in built_in and not name.endswith((".yaml", ".yml")):
@@ -79,13 +71,7 @@ class Grid:
         return _grid(content, path)
 
     def narrowed(self, config: SweepConfig) -> Grid:
-        """The grid with the variants and the axis values that the options of a sweep select.
-
-        Raises
-        ------
-        InputError
-            If the grid does not have a selected variant.
-        """
+        """The grid with the variants (``InputError`` if it lacks one) and the axis values that the options of a sweep select."""
         axes = dict(self.axes)
         for name in ("loss", "billboards"):
             if values := getattr(config, name):
@@ -97,17 +83,9 @@ class Grid:
         return replace(self, axes=axes, variants=variants)
 
     def cells(self, base: FitConfig | None = None) -> list[Cell]:
-        """All cells. The last axis varies fastest.
+        """All cells. The last axis varies fastest. Raises ``InputError`` if a value is invalid, or values contradict each other.
 
-        Parameters
-        ----------
-        base
-            Fields that differ from their defaults apply to all cells, unless the grid varies them.
-
-        Raises
-        ------
-        InputError
-            If a value is invalid, or values contradict each other.
+        Fields of ``base`` that differ from their defaults apply to all cells, unless the grid varies them.
         """
         shared = {name: value for name in _FIELDS if (value := getattr(base or FitConfig(), name)) != getattr(FitConfig(), name)}
         cells = []

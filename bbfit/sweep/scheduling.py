@@ -115,17 +115,8 @@ def sources(
 ) -> list[Source]:
     """The trees of a sweep with unique names: that of the species, the file or the folder, with the parent folder's if they coincide.
 
-    Parameters
-    ----------
-    species, trees, views
-        Species to grow, files of trees, and folders of views.
-    species_file
-        A file with more species.
-
-    Raises
-    ------
-    MissingFileError, InputError
-        If there are no trees, one does not exist, or two have the same name.
+    ``trees`` are files, ``views`` are folders, and ``species_file`` contains more species. Raises ``MissingFileError`` or ``InputError`` if
+    there are no trees, one does not exist, or two have the same name.
     """
     result = [Source(load_species(name, species_file).name, species=name) for name in species]
     on_disk = [(path, Source(path.stem, tree=check_file("tree", path))) for path in map(Path, trees)]
@@ -144,27 +135,11 @@ def sources(
     return result
 
 
-@dataclass(frozen=True)
-class _PendingResult:
-    """The key and the description of a result that a task computes."""
-
-    key: str
-    request: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class _PreparedTree:
-    """A tree whose views are rendered."""
-
-    views: ViewDataset
-    mesh: TreeFile | None
-
-
 class _Sweep:
     def __init__(self, folder: Path, sources: list[Source], cells: list[Cell], config: SweepConfig, stages: RunConfig) -> None:
         self._folder, self._sources, self._cells, self._config, self._stages = folder, sources, cells, config, stages
         self._results = Results(folder / "results")
-        self._pending = dict[str, _PendingResult]()  # by the name of the task
+        self._pending = dict[str, tuple[str, Any]]()  # by the name of a task: the key and the description of its result
         self._waiting = defaultdict[str, list[tuple[Source, int]]](list)  # by key: the trees and cells that wait for a run
         self._outcomes = dict[tuple[Source, int], tuple[str | None, Outcome]]()  # key and outcome
         self._ready = self._kept = 0
@@ -178,12 +153,12 @@ class _Sweep:
         self._report(on_progress)
         while self._pending:
             task, outcome = workers.next()
-            pending = self._pending.pop(task.name)
-            self._results.put(pending.key, outcome, pending.request)
+            key, request = self._pending.pop(task.name)
+            self._results.put(key, outcome, request)
             if task.name in preparing:
                 self._submit_runs(preparing[task.name], outcome, workers)
-            for source, cell in self._waiting.pop(pending.key, ()):
-                self._outcomes[source, cell] = pending.key, outcome
+            for source, cell in self._waiting.pop(key, ()):
+                self._outcomes[source, cell] = key, outcome
             self._report(on_progress, outcome.reason or "")
 
     def result(self) -> SweepResult:
@@ -218,7 +193,7 @@ class _Sweep:
         if earlier and self._is_final(earlier) and (earlier.reason or (self._folder_of(source) / "views" / TEST_FILE).is_file()):
             self._submit_runs(source, earlier, workers)
             return
-        self._pending[name] = _PendingResult(key, identity({"tree": source.species or str(source.tree), "views": views}))
+        self._pending[name] = key, identity({"tree": source.species or str(source.tree), "views": views})
         files = {"tree": tree and tree.files, "species_file": source.species and grow.species_file, "hdri": views.hdri}
         inputs = {kind: paths if isinstance(paths, tuple) else (paths,) for kind, paths in files.items() if paths}
         workers.submit(Task(name, prepare_tree, inputs, self._folder_of(source), (self._stages, source.species), alone=True))
@@ -239,16 +214,16 @@ class _Sweep:
             failed = Outcome(None, reason, outcome.where)
             self._outcomes |= {(source, cell): (None, failed) for cell in range(len(self._cells))}
             return
-        mesh = self._folder_of(source) / "tree.glb" if source.species else source.tree
-        tree = _PreparedTree(views, TreeFile.open(mesh) if mesh and (outcome.facts or {}).get("mesh") else None)
+        path = self._folder_of(source) / "tree.glb" if source.species else source.tree
+        mesh = TreeFile.open(path) if path and (outcome.facts or {}).get("mesh") else None
         for number in range(len(self._cells)):
-            self._submit_run(source, number, tree, workers)
+            self._submit_run(source, number, views, mesh, workers)
 
-    def _submit_run(self, source: Source, number: int, tree: _PreparedTree, workers: Workers) -> None:
+    def _submit_run(self, source: Source, number: int, views: ViewDataset, mesh: TreeFile | None, workers: Workers) -> None:
         """Submit the run of a cell, unless its result exists or the same run is already submitted."""
         fit, export = self._cells[number].config, self._stages.export
         versions = {name: VERSIONS[name] for name in ("export", "evaluate")}
-        request = {"fit": fit_inputs(tree.views, fit, tree.mesh), "export": export, "views": tree.views.fingerprint, "versions": versions}
+        request = {"fit": fit_inputs(views, fit, mesh), "export": export, "views": views.fingerprint, "versions": versions}
         key = cache_key("fit", request)[:_DIGITS]
         earlier = self._results.get(key)
         if earlier and self._is_final(earlier):
@@ -259,8 +234,8 @@ class _Sweep:
         if len(self._waiting[key]) > 1:
             return
         folder = source.views or self._folder_of(source) / "views"
-        inputs = {"views": (folder,)} | ({"tree": tree.mesh.files} if fit.placement == "clusters" and tree.mesh else {})
-        self._pending[key] = _PendingResult(key, identity(request))
+        inputs = {"views": (folder,)} | ({"tree": mesh.files} if fit.placement == "clusters" and mesh else {})
+        self._pending[key] = key, identity(request)
         workers.submit(Task(key, fit_tree, inputs, self._folder / "runs" / key, (RunConfig(fit=fit, export=export),)))
 
     def _is_final(self, outcome: Outcome) -> bool:

@@ -79,12 +79,8 @@ class Workers(Protocol):
 def prepare_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig, species: str | None) -> Facts:
     """Grow a tree, or take the input ``tree``, and render its views into ``folder``.
 
-    The inputs also contain ``species_file`` and ``hdri``, if the options of the stages name such files.
-
-    Raises
-    ------
-    InputError, OSError
-        If the tree or an option cannot be used, or a file cannot be written.
+    The inputs also contain ``species_file`` and ``hdri``, if the options of the stages name such files. Raises ``InputError`` or
+    ``OSError`` if the tree or an option cannot be used, or a file cannot be written.
     """
     from bbfit.pipeline import prepare
 
@@ -98,10 +94,7 @@ def prepare_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig, sp
 def fit_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig) -> Facts:
     """Run the fit and all later stages for the input ``views``. The input ``tree``, if there is one, is the mesh that places billboards.
 
-    Raises
-    ------
-    InputError, OSError
-        If the views, the mesh or an option cannot be used, or a file cannot be written.
+    Raises ``InputError`` or ``OSError`` if the views, the mesh or an option cannot be used, or a file cannot be written.
     """
     from bbfit.pipeline import run
 

@@ -21,12 +21,8 @@ _FLOAT = 5126
 def read_gltf(path: Path) -> tuple[list[Path], list[NDArray[np.float32]]]:
     """The files that a .gltf or .glb refers to, and the vertex positions of its primitives, [P, 3] each.
 
-    Packed, sparse and damaged positions are omitted. The program that loads the file checks those.
-
-    Raises
-    ------
-    MissingFileError, InputError
-        If the file is damaged, or refers to a file that is missing or outside its folder.
+    Packed, sparse and damaged positions are omitted. The program that loads the file checks those. Raises ``MissingFileError`` or
+    ``InputError`` if the file is damaged, or refers to a file that is missing or outside its folder.
     """
     content, binary = gltf_parts(path.read_bytes(), "tree", path)
     buffers: list[bytes] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,27 +12,22 @@ from bbfit.trees.species import Species
 
 TAPERED_CYLINDRICAL = 4
 PRUNING_ENVELOPE = 8
+_SHAPES: tuple[Callable[[Array], Array], ...] = (
+    lambda ratio: 0.2 + 0.8 * ratio,  # conical
+    lambda ratio: 0.2 + 0.8 * np.sin(np.pi * ratio),  # spherical
+    lambda ratio: 0.2 + 0.8 * np.sin(0.5 * np.pi * ratio),  # hemispherical
+    lambda ratio: np.ones_like(ratio),  # cylindrical
+    lambda ratio: 0.5 + 0.5 * ratio,  # tapered cylindrical
+    lambda ratio: np.where(ratio <= 0.7, ratio / 0.7, (1 - ratio) / 0.3),  # flame
+    lambda ratio: 1 - 0.8 * ratio,  # inverse conical
+    lambda ratio: np.where(ratio <= 0.7, 0.5 + 0.5 * ratio / 0.7, 0.5 + 0.5 * (1 - ratio) / 0.3),  # tend flame
+)
 
 
 def shape_ratio(shape: int, ratio: Array, species: Species) -> Array:
     """Length of branches against their height in the crown (section 4.3's table); ``ratio`` is 0 at the top and 1 at the crown's base."""
-    if shape == 0:  # conical
-        return 0.2 + 0.8 * ratio
-    if shape == 1:  # spherical
-        return 0.2 + 0.8 * np.sin(np.pi * ratio)
-    if shape == 2:  # hemispherical
-        return 0.2 + 0.8 * np.sin(0.5 * np.pi * ratio)
-    if shape == 3:  # cylindrical
-        return np.ones_like(ratio)
-    if shape == TAPERED_CYLINDRICAL:
-        return 0.5 + 0.5 * ratio
-    if shape == 5:  # flame
-        return np.where(ratio <= 0.7, ratio / 0.7, (1 - ratio) / 0.3)
-    if shape == 6:  # inverse conical
-        return 1 - 0.8 * ratio
-    if shape == 7:  # tend flame
-        return np.where(ratio <= 0.7, 0.5 + 0.5 * ratio / 0.7, 0.5 + 0.5 * (1 - ratio) / 0.3)
-    assert shape == PRUNING_ENVELOPE
+    if shape != PRUNING_ENVELOPE:
+        return _SHAPES[shape](ratio)
     below_peak = 1 - species.prune_width_peak
     inside = np.clip(ratio, 0, 1)
     upper = (inside / below_peak) ** species.prune_power_high

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # The right half of each outline from the stalk (0, 0) to the tip, both on the midrib, as (across, along) in shares of the leaf's length;
-# the left half mirrors it. Widths are for a LeafScaleX of 1. The index is LeafShape's
-# number; 0 is the default.
+# the left half mirrors it. Widths are for a LeafScaleX of 1. The index is LeafShape's number; 0 is the default.
 _HALVES: tuple[tuple[tuple[float, float], ...], ...] = (
     ((0.0, 0.0), (0.32, 0.14), (0.48, 0.36), (0.46, 0.6), (0.27, 0.86), (0.0, 1.0)),  # default
     ((0.0, 0.0), (0.27, 0.12), (0.4, 0.34), (0.32, 0.62), (0.12, 0.88), (0.0, 1.0)),  # ovate

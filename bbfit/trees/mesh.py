@@ -67,14 +67,9 @@ def leaf_vertices(species: Species, leaves: int) -> int:
 
 
 def tree_parts(skeleton: Skeleton, seed: int, *, detail: float) -> list[Part]:
-    """The tree's triangles by material, Y up: bark, then one part for each leaf tone.
+    """The tree's triangles by material, Y up: bark, then one part for each leaf tone, which ``seed`` chooses.
 
-    Parameters
-    ----------
-    seed
-        For the leaf tones.
-    detail
-        Factor on the rings of a stem and the corners of a ring, more than 0.
+    ``detail`` is a factor of more than 0 on the rings of a stem and the corners of a ring.
     """
     lines: list[_Lines] = []
     bark = _Bark()

@@ -7,6 +7,7 @@ leaf. The skeleton does not depend on the detail of the mesh.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,22 +115,9 @@ def arctan2(y: Array, x: Array) -> Array:
     return np.arctan2(np.ascontiguousarray(y), np.ascontiguousarray(x))
 
 
-def rotation_x(angles: Array) -> Array:
-    """Rotations about the x axis, [K, 3, 3], by K angles in radians."""
-    return _rotation(angles, 0)
-
-
-def rotation_y(angles: Array) -> Array:
-    """Rotations about the y axis, [K, 3, 3], by K angles in radians."""
-    return _rotation(angles, 1)
-
-
-def rotation_z(angles: Array) -> Array:
-    """Rotations about the z axis, [K, 3, 3], by K angles in radians."""
-    return _rotation(angles, 2)
-
-
-def _rotation(angles: Array, axis: int) -> Array:
+def rotation(name: Literal["x", "y", "z"], angles: Array) -> Array:
+    """Rotations about a coordinate axis, [K, 3, 3], by K angles in radians."""
+    axis = "xyz".index(name)
     after, last = (axis + 1) % 3, (axis + 2) % 3
     matrices = np.zeros((len(angles), 3, 3))
     matrices[:, axis, axis] = 1

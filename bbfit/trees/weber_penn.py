@@ -35,20 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.trees.formulas import TAPERED_CYLINDRICAL, in_envelope, shape_ratio, stem_radius
-from bbfit.trees.skeleton import (
-    Array,
-    Indices,
-    Leaves,
-    Skeleton,
-    Stems,
-    arctan2,
-    cross,
-    dot,
-    rotation_about,
-    rotation_x,
-    rotation_y,
-    rotation_z,
-)
+from bbfit.trees.skeleton import Array, Indices, Leaves, Skeleton, Stems, arctan2, cross, dot, rotation, rotation_about
 from bbfit.trees.species import Species
 
 Count = Callable[[int, int], None]
@@ -78,16 +65,10 @@ class _Buds:
 
 
 def grow_skeleton(species: Species, seed: int, count: Count, *, leaves: float = 1.0) -> Skeleton:
-    """Grow a tree; the same seed gives the same tree.
+    """Grow a tree; the same seed of at least 0 gives the same tree.
 
-    Parameters
-    ----------
-    seed
-        Any whole number of at least 0.
-    count
-        Called before memory for a level's stems, or for the leaves, is allocated.
-    leaves
-        Section 4.5's quality: share of the leaves that grow, 0 to 1; they are enlarged to keep the total area.
+    ``count`` is called before memory for a level's stems, or for the leaves, is allocated. ``leaves`` is section 4.5's quality: the share
+    of the leaves that grow, 0 to 1; they are enlarged to keep the total area.
     """
     levels: list[Stems] = []
     for level in range(species.levels):
@@ -108,7 +89,7 @@ def grow_skeleton(species: Species, seed: int, count: Count, *, leaves: float = 
 
 def _trunk(species: Species, scale: float, random: np.random.Generator) -> _Buds:
     length = scale * (species.length[0] + random.uniform(-1, 1, 1) * species.length_v[0])
-    return _Buds(np.array([-1]), np.zeros(1), np.zeros((1, 3)), rotation_z(random.uniform(0, 2 * np.pi, 1)), length)
+    return _Buds(np.array([-1]), np.zeros(1), np.zeros((1, 3)), rotation("z", random.uniform(0, 2 * np.pi, 1)), length)
 
 
 def _children(species: Species, levels: list[Stems], random: np.random.Generator, count: Count) -> _Buds:
@@ -142,7 +123,7 @@ def _leaves(species: Species, levels: list[Stems], share: float, random: np.rand
         fan = np.radians(species.down_angle[level] * (offset - 0.5) + species.down_angle_v[level] * random.uniform(-1, 1, len(offset)))
         offset = np.ones_like(offset)
         points, frames = stems.at(parent, offset)
-        frames = frames @ rotation_y(fan)
+        frames = frames @ rotation("y", fan)
     else:
         points, frames = _bud_frames(species, stems, parent, offset, turn, level, random)
     if species.leaf_bend:
@@ -154,8 +135,8 @@ def _facing_light(frames: Array, points: Array, bend: float) -> Array:
     """Leaves turned about the vertical to face outwards, then pitched to face upwards, each by a share of the angle that is missing."""
     normals = frames[:, :, 1]
     around = arctan2(points[:, 1], points[:, 0]) - arctan2(normals[:, 1], normals[:, 0])
-    frames = rotation_z(bend * ((around + np.pi) % (2 * np.pi) - np.pi)) @ frames
-    return frames @ rotation_x(bend * arctan2(frames[:, 2, 2], frames[:, 2, 1]))
+    frames = rotation("z", bend * ((around + np.pi) % (2 * np.pi) - np.pi)) @ frames
+    return frames @ rotation("x", bend * arctan2(frames[:, 2, 2], frames[:, 2, 1]))
 
 
 def _shares(species: Species, stems: Stems) -> Array:
@@ -198,7 +179,7 @@ def _bud_frames(
     else:  # from one end of the parent to the other
         height = (1 - offset) / (1 - species.base_size[stems.level])
         down = species.down_angle[level] + vary * (1 - 2 * shape_ratio(0, height, species))
-    return points, frames @ rotation_z(turn) @ rotation_x(np.radians(down))
+    return points, frames @ rotation("z", turn) @ rotation("x", np.radians(down))
 
 
 def _whole(values: Array, random: np.random.Generator) -> Indices:
@@ -215,7 +196,7 @@ def _grow(species: Species, level: int, buds: _Buds, random: np.random.Generator
     frames[:, 0] = buds.frames
     helix = species.curve_v[level] < 0
     if helix:
-        frames[:, 0] = frames[:, 0] @ rotation_x(np.full(len(frames), np.radians(-species.curve_v[level])))
+        frames[:, 0] = frames[:, 0] @ rotation("x", np.full(len(frames), np.radians(-species.curve_v[level])))
     root = np.arange(len(nodes))  # the bud that a stem or the stem it was split from grew from
     first = np.zeros(len(nodes), np.int64)
     parent, offset = buds.parent, buds.offset
@@ -259,7 +240,7 @@ def _grow(species: Species, level: int, buds: _Buds, random: np.random.Generator
             pitch += _curvature(curve, back, segment, resolution)
             pitch += np.radians(species.curve_v[level]) / resolution * random.uniform(-1, 1, len(nodes))
             yaw = np.radians(species.bend_v[level]) / resolution * random.uniform(-1, 1, len(nodes))
-        turned = rotation_z(vertical) @ here @ rotation_z(spin) @ rotation_x(pitch) @ rotation_y(yaw)
+        turned = rotation("z", vertical) @ here @ rotation("z", spin) @ rotation("x", pitch) @ rotation("y", yaw)
         turned = _attracted(turned, species.tropism if level >= 2 else (*species.tropism[:2], 0.0), resolution)
         if level == 0:
             declination = arctan2(np.hypot(turned[:, 0, 2], turned[:, 1, 2]), turned[:, 2, 2])

@@ -124,6 +124,8 @@ def test_a_killed_sweep_goes_on_where_it_was(done: SweepResult, two_trees: list[
     script.write_text(f"""
 import os, signal, sys
 from pathlib import Path
+from bbfit.fitting.config import FitConfig
+from bbfit.pipeline import RunConfig
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.scheduling import run_sweep
 
@@ -132,7 +134,8 @@ def kill(stage, done, total, note=""):
         os.kill(os.getpid(), signal.SIGKILL)
 
 if __name__ == "__main__":
-    run_sweep(Path({str(folder)!r}), {QUICK!r}, views=[Path(name) for name in sys.argv[1:]], on_progress=kill)
+    short, views = RunConfig(fit=FitConfig(steps=12)), [Path(name) for name in sys.argv[1:]]
+    run_sweep(Path({str(folder)!r}), {QUICK!r}, short, views=views, on_progress=kill)
 """)
     assert subprocess.run([sys.executable, str(script), *map(str, two_trees)]).returncode == -signal.SIGKILL
     before = times(folder)

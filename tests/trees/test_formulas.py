@@ -11,7 +11,7 @@ from plain_tree import ROUNDING, angles, grown, plain
 
 from bbfit.trees.formulas import in_envelope, shape_ratio, stem_radius
 from bbfit.trees.leaf_shapes import leaf_shape
-from bbfit.trees.skeleton import rotation_about, rotation_x, rotation_y, rotation_z
+from bbfit.trees.skeleton import rotation, rotation_about
 from bbfit.trees.species import load_species
 
 
@@ -75,10 +75,10 @@ def test_radius_falls_off_by_taper(taper: float) -> None:
 def test_rotations_turn_as_the_right_hand_says() -> None:
     x, y, z = np.eye(3)
     quarter = np.array([np.pi / 2])
-    assert np.allclose(rotation_x(quarter)[0] @ y, z) and np.allclose(rotation_y(quarter)[0] @ z, x)
-    assert np.allclose(rotation_z(quarter)[0] @ x, y)
-    for axis, rotation in ((x, rotation_x), (y, rotation_y), (z, rotation_z)):
-        assert np.allclose(rotation_about(7 * axis[None], np.array([0.3])), rotation(np.array([0.3])), atol=ROUNDING)
+    assert np.allclose(rotation("x", quarter)[0] @ y, z) and np.allclose(rotation("y", quarter)[0] @ z, x)
+    assert np.allclose(rotation("z", quarter)[0] @ x, y)
+    for name, axis in (("x", x), ("y", y), ("z", z)):
+        assert np.allclose(rotation_about(7 * axis[None], np.array([0.3])), rotation(name, np.array([0.3])), atol=ROUNDING)
     assert np.array_equal(rotation_about(np.zeros((1, 3)), quarter)[0], np.eye(3))
 
 

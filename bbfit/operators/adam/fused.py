@@ -10,10 +10,10 @@ import warp as wp
 from torch import Tensor
 
 from bbfit.operators.adam.kernels import texel_block, update_blocks
-from bbfit.operators.adam.reference import EPSILON
+from bbfit.operators.adam.reference import EPSILON, AdamReference
 from bbfit.operators.drawing.fused import occupancy
 from bbfit.operators.drawing.sampling_kernels import BLOCK
-from bbfit.operators.launching import in_parallel, pieces_of, warp_array
+from bbfit.operators.launching import launch, warp_array
 
 # A first moment that has decayed to this share moves a texel by less than 1e-5 of a step in all.
 _FORGOTTEN = 1.4e-6
@@ -27,17 +27,10 @@ def rest_after(beta1: float) -> int:
 
 
 @dataclass(frozen=True)
-class AdamFused:
-    """Texels and Adam's moments, padded to whole blocks, all of which :meth:`update` changes in place."""
+class AdamFused(AdamReference):
+    """As the reference, with all tensors in float32 and padded to P' texels, a multiple of
+    :data:`~bbfit.operators.drawing.sampling_kernels.BLOCK`."""
 
-    texels: Tensor
-    """Float32 [P', 4], P' a multiple of :data:`~bbfit.operators.drawing.sampling_kernels.BLOCK`."""
-    gradient: Tensor
-    """To add to before every update, which clears it, [P', 4]."""
-    first_moment: Tensor
-    """[P', 4]."""
-    second_moment: Tensor
-    """[P', 4]."""
     last: Tensor
     """Step in which each block last had a gradient, int32 [P' / BLOCK]."""
     occupied: Tensor
@@ -54,12 +47,11 @@ class AdamFused:
     def start(texels: Tensor) -> AdamFused:
         """The state before the first step, which takes over the memory of ``texels`` [P', 4], as :meth:`padded` returns them."""
         never = torch.full((len(texels) // BLOCK,), -(1 << 30), dtype=torch.int32, device=texels.device)
-        zeros = [torch.zeros_like(texels) for _ in range(3)]
-        return AdamFused(texels, zeros[0], zeros[1], zeros[2], never, occupancy(texels))
+        return AdamFused(texels, *(torch.zeros_like(texels) for _ in range(3)), last=never, occupied=occupancy(texels))
 
     def tensors(self) -> dict[str, Tensor]:
-        """What :meth:`restored` needs to continue; the gradient is zero between steps."""
-        return {"texels": self.texels, "first_moment": self.first_moment, "second_moment": self.second_moment, "last": self.last}
+        """As of the reference, and the last steps with a gradient."""
+        return {**super().tensors(), "last": self.last}
 
     def restored(self, tensors: dict[str, Tensor]) -> AdamFused:
         """The state that :meth:`tensors` returned."""
@@ -67,34 +59,13 @@ class AdamFused:
         return replace(AdamFused.start(kept["texels"]), **kept)
 
     def update(self, step: int, rate: float, betas: tuple[float, float], binarization: float = 0.0, alpha_rate: float = 1.0) -> None:
-        """As :meth:`bbfit.operators.adam.reference.AdamReference.update`, up to rounding and :func:`rest_after`.
-
-        Binarization does not wake blocks that rest.
-        """
+        """As of the reference, up to rounding and :func:`rest_after`; binarization does not wake blocks that rest."""
         beta1, beta2 = betas
         run = 1 if self.texels.is_cuda else RUN
-        arguments = [
-            run,
-            step,
-            rate / (1 - beta1**step),
-            beta1,
-            beta2,
-            (1 - beta2**step) ** -0.5,
-            EPSILON,
-            rest_after(beta1),
-            binarization,
-            alpha_rate,
-            *(
-                warp_array(tensor.view(-1, 4 * BLOCK), texel_block)
-                for tensor in (self.texels, self.gradient, self.first_moment, self.second_moment)
-            ),
-            warp_array(self.last, wp.int32),
-            warp_array(self.occupied, wp.uint8),
-        ]
-        runs, device = -(-len(self.last) // run), wp.device_from_torch(self.texels.device)
-        update_blocks.module.load(device)  # or every thread would compile it
-
-        def launch(begin: int, end: int) -> None:
-            wp.launch(update_blocks, end - begin, [begin * run, *arguments], device=device)
-
-        in_parallel(launch, [(0, runs)] if self.texels.is_cuda else pieces_of(runs, LEAST_RUNS))
+        rate, correction = rate / (1 - beta1**step), (1 - beta2**step) ** -0.5
+        numbers = [run, step, rate, beta1, beta2, correction, EPSILON, rest_after(beta1), binarization, alpha_rate]
+        blocks = (self.texels, self.gradient, self.first_moment, self.second_moment)
+        arrays = [warp_array(tensor.view(-1, 4 * BLOCK), texel_block) for tensor in blocks]
+        arrays += [warp_array(self.last, wp.int32), warp_array(self.occupied, wp.uint8)]
+        on = wp.device_from_torch(self.texels.device)
+        launch(update_blocks, -(-len(self.last) // run), LEAST_RUNS, [*numbers, *arrays], on=on)

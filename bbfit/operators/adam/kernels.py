@@ -45,8 +45,9 @@ def update_blocks(
     last: wp.array(dtype=wp.int32),
     occupied: wp.array(dtype=wp.uint8),
 ):
-    """Take a step; launched over runs of ``run`` blocks, from block ``first`` on. Clears ``gradient``, updates ``occupied``."""
-    begin = first + wp.tid() * run
+    """Take a step; launched over runs of ``run`` blocks, from run ``first`` on. Clears ``gradient``, updates ``occupied``."""
+    tid, _ = wp.tid()
+    begin = (first + tid) * run
     for i in range(begin, wp.min(begin + run, texels.shape[0])):
         g = gradient[i]
         idle = step - last[i]

@@ -53,15 +53,13 @@ class AdamReference:
 
         Parameters
         ----------
-        step : int
+        step
             Number of the step, from 1.
-        rate : float
-            Learning rate.
-        betas : tuple[float, float]
-            Decay of the two moments in a step.
-        binarization : float
+        rate, betas
+            Learning rate, and decay of the two moments in a step.
+        binarization
             Factor of :func:`binarization_loss`, whose gradient is added.
-        alpha_rate : float
+        alpha_rate
             Factor of the change of alpha.
         """
         leaf = self.texels.detach().requires_grad_()

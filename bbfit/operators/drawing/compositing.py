@@ -25,19 +25,8 @@ def composite(colors: list[Tensor], alphas: list[Tensor], depths: list[Tensor]) 
     pair, without sorting: crossing planes have no order for a whole picture, and sorting and gathering per pixel costs several times as
     much on a CPU. Among layers of equal depth (within :data:`TIE`) the lower index is in front.
 
-    Parameters
-    ----------
-    colors : list[Tensor]
-        N >= 1 straight colors, [V, 3, H, W] in [0, 1].
-    alphas : list[Tensor]
-        N opacities, [V, 1, H, W] in [0, 1].
-    depths : list[Tensor]
-        N depths, [V, 1, H, W]; smaller is nearer. Not differentiated.
-
-    Returns
-    -------
-    Tensor
-        Premultiplied RGBA, [V, 4, H, W].
+    N >= 1 layers have straight colors [V, 3, H, W] and opacities [V, 1, H, W] in [0, 1], and depths [V, 1, H, W], which are smaller where
+    nearer and not differentiated. The result is premultiplied RGBA, [V, 4, H, W].
     """
     weights = list(alphas)
     for j in range(1, len(alphas)):
@@ -68,16 +57,9 @@ def opacity(alpha: Tensor, mode: AlphaMode) -> Tensor:
 
 
 def thresholds(x: Tensor, y: Tensor, texture: int) -> Tensor:
-    """Pseudo-random thresholds of alpha in (0, 1) for the mode ``hash``, one for each pixel and texture.
+    """Pseudo-random thresholds of alpha in (0, 1) for the mode ``hash``, one for each pixel, int64 (x, y), and texture, by its first texel.
 
     An integer hash of 32 bits (lowbias32, C. Wellons, "Prospecting for Hash Functions", 2018).
-
-    Parameters
-    ----------
-    x, y : Tensor
-        Columns and rows of pixels, int64, broadcast.
-    texture : int
-        Index of the texture's first texel.
     """
     bits, (of_x, of_y, of_texture, first_round, second_round) = 0xFFFFFFFF, HASH
     mixed = (x * of_x & bits) ^ (y * of_y & bits) ^ (texture * of_texture & bits)

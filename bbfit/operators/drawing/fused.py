@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -19,7 +20,7 @@ from bbfit.operators.drawing.projection import Projection, project
 from bbfit.operators.drawing.sampling_kernels import BLOCK
 from bbfit.operators.image_loss.fused import PixelLoss
 from bbfit.operators.image_loss.kernels import LOSSES
-from bbfit.operators.launching import in_parallel, pieces_of, warp_array
+from bbfit.operators.launching import in_parallel, pieces_of, struct_array, warp_array
 
 # Most bands of rows that a picture is cut into. Independent of the number of threads, which must not change the order of sums.
 MOST_BANDS = 32
@@ -30,11 +31,6 @@ def render_fused(cloud: BillboardCloud, camera: Camera) -> Tensor:
 
     Differentiable in texels and placement, except in the alpha mode ``hash``. On a CPU equal inputs give equal bytes, whatever the number
     of threads; on CUDA gradients are summed in no fixed order.
-
-    Returns
-    -------
-    Tensor
-        Premultiplied RGBA, float32 [V, H, W, 4] ([H, W, 4] for a single camera).
     """
     image = render_projection(cloud.texels, project(cloud, camera))
     return image if camera.batched else image[0]
@@ -61,10 +57,9 @@ class _Drawing(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         texels, to_texel = ctx.saved_tensors
         of_texels = torch.zeros_like(texels)
-        of_matrices = differentiate(
-            texels, ctx.projection, of_texels, image_gradient=gradients[0].contiguous(), placement=ctx.needs_input_grad[1]
-        )[1]
-        return (of_texels if ctx.needs_input_grad[0] else None), (of_matrices.to(to_texel) if of_matrices is not None else None), None
+        image_gradient, (of_texture, of_placement, _) = gradients[0].contiguous(), ctx.needs_input_grad
+        of_matrices = differentiate(texels, ctx.projection, of_texels, image_gradient=image_gradient, placement=of_placement)[1]
+        return (of_texels if of_texture else None), (of_matrices.to(to_texel) if of_matrices is not None else None), None
 
 
 def occupancy(texels: Tensor) -> Tensor:
@@ -74,25 +69,20 @@ def occupancy(texels: Tensor) -> Tensor:
 
 
 def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None, out: Tensor | None = None) -> Tensor:
-    """Draw texels, float32 [P, 4], contiguous: premultiplied RGBA, float32 [V, H, W, 4].
+    """Draw texels, float32 [P, 4], contiguous: premultiplied RGBA, float32 [V, H, W, 4], into ``out``, contiguous, if given.
 
-    ``occupied`` is the :func:`occupancy` of the texels, computed if omitted. ``out`` is memory for the picture, contiguous; it is
-    overwritten completely.
+    ``occupied`` is the :func:`occupancy` of the texels, computed if omitted.
     """
     views, height, width = len(projection), projection.height, projection.width
     image = torch.empty(views, height, width, 4, dtype=torch.float32, device=texels.device) if out is None else out
     if not len(texels) or not views:
         return image.zero_()
-    occupied = occupancy(texels.detach()) if occupied is None else occupied
-    run, device = _run(projection, texels.device), wp.device_from_torch(texels.device)
-    kernel, packed = kernels(_capacity(projection.count), _lanes(projection, texels.device)).draw, _packed_planes(projection)
-    kernel.module.load(device)  # or every thread would compile it
-    arguments = [run, width, int(projection.orthographic), projection.count, _test(projection.alpha), _planes(packed)]
-    arguments += [warp_array(texels, wp.vec4), warp_array(occupied, wp.uint8)]
-    outputs = [warp_array(image, wp.vec4)]
+    compiled, runs, arguments = _prepared(texels, projection, occupied)
+    device, outputs = wp.device_from_torch(texels.device), [warp_array(image, wp.vec4)]
+    compiled.draw.module.load(device)  # or every thread would compile it
 
     def launch(begin: int, end: int) -> None:
-        wp.launch(kernel, (views, end - begin, -(-width // run)), [begin, *arguments], outputs, device=device)
+        wp.launch(compiled.draw, (views, end - begin, runs), [begin, *arguments], outputs, device=device)
 
     in_parallel(launch, [(0, height)] if texels.is_cuda else pieces_of(height, -(-projection.least_pixels // (width * views)), MOST_BANDS))
     return image
@@ -108,59 +98,33 @@ def differentiate(
     occupied: Tensor | None = None,
     placement: bool = False,
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Backward pass of :func:`draw`, which adds the gradient in texels to ``texel_gradient``.
+    """Backward pass of :func:`draw` for texels [P, 4], which adds their gradient to ``texel_gradient``; both float32, contiguous.
 
-    Parameters
-    ----------
-    texels, texel_gradient : Tensor
-        Float32 [P, 4], contiguous.
-    image_gradient : Tensor, optional
-        Gradient of a loss in the picture, float32 [V, H, W, 4], contiguous.
-    loss : PixelLoss, optional
-        A loss of the picture that is computed on the way and whose gradient is added to ``image_gradient``.
-    occupied : Tensor, optional
-        :func:`occupancy` of the texels; computed if omitted.
-    placement : bool
-        Whether to compute the gradient in ``projection.to_texel``.
+    The picture's gradient is ``image_gradient``, float32 [V, H, W, 4], contiguous, plus that of ``loss``, which is computed on the way.
+    ``occupied`` is the :func:`occupancy` of the texels, computed if omitted.
 
     Returns
     -------
     tuple[Tensor or None, Tensor or None]
-        The sum of ``loss`` over each view's pixels, float64 [V], if there is a loss; the gradient in the homographies, float64
+        The sum of ``loss`` over each view's pixels, float64 [V], if there is a loss; the gradient in ``projection.to_texel``, float64
         [V, N, 3, 3], if ``placement``.
     """
-    views, height, width, count = len(projection), projection.height, projection.width, projection.count
-    device = texels.device
+    views, height, count, device = len(projection), projection.height, projection.count, texels.device
     sums = torch.zeros(views if loss else 0, height, dtype=torch.float32, device=device)
     matrices = torch.zeros(views if placement else 0, height, count, 3, 3, dtype=torch.float64, device=device)
     if views and (len(texels) or loss):
         nothing = torch.zeros(0, 0, 0, 4, dtype=torch.float32, device=device)
         target = loss.target if loss else nothing.to(torch.uint8)
-        occupied = occupancy(texels.detach()) if occupied is None else occupied
-        run, packed = _run(projection, device), _packed_planes(projection)
-        arguments = [
-            run,
-            width,
-            int(projection.orthographic),
-            count,
-            _test(projection.alpha),
-            _planes(packed),
-            warp_array(texels, wp.vec4),
-            warp_array(occupied, wp.uint8),
-            warp_array(nothing if image_gradient is None else image_gradient, wp.vec4),
-            warp_array(target.view(torch.int32).squeeze(-1), wp.int32),
-            int(loss.straight) if loss else 0,
-            LOSSES[loss.kind] if loss else 0,
-            loss.weight if loss else 0.0,
-        ]
+        compiled, runs, arguments = _prepared(texels, projection, occupied)
+        arguments.append(warp_array(nothing if image_gradient is None else image_gradient, wp.vec4))
+        arguments.append(warp_array(target.view(torch.int32).squeeze(-1), wp.int32))
+        arguments += [int(loss.straight), LOSSES[loss.kind], loss.weight] if loss else [0, 0, 0.0]
         outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices, wp.vec3d)]
-        kernel, pieces = kernels(_capacity(count), _lanes(projection, device)).differentiate, -(-width // run)
-
         on = wp.device_from_torch(device)
-        kernel.module.load(on)  # or every thread would compile it
+        compiled.differentiate.module.load(on)  # or every thread would compile it
 
         def launch(view: int, number: int, begin: int, end: int) -> None:
-            wp.launch(kernel, (number, end - begin, pieces), [view, begin, *arguments], outputs, device=on)
+            wp.launch(compiled.differentiate, (number, end - begin, runs), [view, begin, *arguments], outputs, device=on)
 
         for phase in schedule(projection, device):
             in_parallel(launch, phase)
@@ -191,35 +155,21 @@ def schedule(projection: Projection, device: torch.device) -> list[list[tuple[in
     return phases
 
 
+def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -> tuple[SimpleNamespace, int, list[Any]]:
+    """Compiled kernels, the number of threads for a row of pixels, and the arguments that both kernels begin with after their offsets."""
+    lanes = 1 if texels.is_cuda else projection.lanes
+    run = 1 if lanes == 1 else projection.width
+    compiled = kernels(max(4, 1 << (projection.count - 1).bit_length()), lanes)  # for the next power of two of billboards
+    numbers = [projection.to_texel.detach().flatten(2), projection.nearness]
+    planes = torch.cat([*(part.contiguous().view(torch.int32) for part in numbers), projection.textures, projection.boxes], -1)
+    occupied = occupancy(texels.detach()) if occupied is None else occupied
+    arguments = [run, projection.width, int(projection.orthographic), projection.count, _test(projection.alpha)]
+    arguments += [struct_array(planes.flatten(0, 1), Plane), warp_array(texels, wp.vec4), warp_array(occupied, wp.uint8)]
+    return compiled, -(-projection.width // run), arguments
+
+
 def _test(mode: AlphaMode) -> Any:
-    """An alpha mode for a kernel: the cutoff (0: blend, -1: hash), the hardness (0: a step) and the slope of the gradient."""
+    """An alpha mode as :func:`~bbfit.operators.drawing.sampling_kernels.opacity` expects it."""
     if mode.kind != "mask":
         return wp.vec3(0.0 if mode.kind == "blend" else -1.0, 0.0, 0.0)
     return wp.vec3(mode.cutoff, 0.0 if math.isinf(mode.hardness) else mode.hardness, min(mode.hardness, STEEPEST))
-
-
-def _capacity(count: int) -> int:
-    """Most billboards that a kernel is compiled for: the next power of two, at least 4."""
-    return max(4, 1 << (count - 1).bit_length())
-
-
-def _lanes(projection: Projection, device: torch.device) -> int:
-    """Pixels that a thread processes at a time."""
-    return 1 if device.type == "cuda" else projection.lanes
-
-
-def _run(projection: Projection, device: torch.device) -> int:
-    """Pixels of a row that a thread processes in all."""
-    return 1 if _lanes(projection, device) == 1 else projection.width
-
-
-def _packed_planes(projection: Projection) -> Tensor:
-    """Memory of an array of :class:`~bbfit.operators.drawing.kernels.Plane`, int32 [V, N, 19]."""
-    views, count = projection.boxes.shape[:2]
-    numbers = [projection.to_texel.detach().reshape(views, count, 9), projection.nearness]
-    return torch.cat([*(part.contiguous().view(torch.int32) for part in numbers), projection.textures, projection.boxes], -1)
-
-
-def _planes(packed: Tensor) -> Any:
-    """A Warp view of :func:`_packed_planes`, which must outlive it."""
-    return wp.array(ptr=packed.data_ptr(), shape=packed.shape[0] * packed.shape[1], dtype=Plane, device=wp.device_from_torch(packed.device))

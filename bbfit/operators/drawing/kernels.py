@@ -69,10 +69,8 @@ class Plane:
 
 @cache
 def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
-    """The kernels ``draw`` and ``differentiate``, compiled for at most ``capacity`` billboards and ``lanes`` pixels at a time.
-
-    Texel coordinates are computed for all lanes at once, in vector registers; ``lanes`` is 1 on CUDA.
-    """
+    """The kernels ``draw`` and ``differentiate``, compiled for at most ``capacity`` billboards and ``lanes`` pixels at a time: 1 on CUDA,
+    more on a CPU, which computes their texel coordinates at once, in vector registers."""
     floats = wp.types.vector(length=capacity, dtype=wp.float32)
     ints = wp.types.vector(length=capacity, dtype=wp.int32)
     wide = wp.types.vector(length=lanes, dtype=wp.float32)

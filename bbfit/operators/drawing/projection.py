@@ -86,26 +86,19 @@ def project(cloud: BillboardCloud, camera: Camera) -> Projection:
         nearness = -numerator / torch.where(visible, denominator[..., 2], 1)[..., None]
     else:
         nearness = to_texel[..., 2, :]
+    table = texture_table(cloud)
+    first = table[:, 0] + torch.where(signed_distance(cloud, cameras).detach() >= 0, 0, table[:, 3])
     boxes, rows_apart = _extents(to_pixel.detach(), cloud.texture_sizes, visible, height, width)
-    return Projection(
-        to_texel.to(torch.float32),
-        nearness.detach().to(torch.float32),
-        _facing_textures(cloud, signed_distance(cloud, cameras).detach() >= 0),
-        boxes,
-        rows_apart,
-        width,
-        height,
-        cameras.orthographic,
-        cloud.alpha,
-    )
+    textures = torch.cat([first[..., None], table[:, 1:3].expand(*first.shape, 2)], -1)
+    matrices, nearness = to_texel.to(torch.float32), nearness.detach().to(torch.float32)
+    return Projection(matrices, nearness, textures, boxes, rows_apart, width, height, cameras.orthographic, cloud.alpha)
 
 
-def _facing_textures(cloud: BillboardCloud, front: Tensor) -> Tensor:
-    """First texel, height and width of the texture that each view sees, int32 [V, N, 3]."""
+def texture_table(cloud: BillboardCloud) -> Tensor:
+    """First texel, height and width of each texture, and the distance from there to the back's first texel, int32 [N, 4]."""
     area = cloud.texture_sizes.prod(-1)
     owned = area * (1 + cloud.two_sided.long())
-    first = owned.cumsum(0) - owned + torch.where(cloud.two_sided & ~front, area, 0)
-    return torch.cat([first[..., None], cloud.texture_sizes.expand(*first.shape, 2)], -1).to(torch.int32)
+    return torch.stack([owned.cumsum(0) - owned, *cloud.texture_sizes.unbind(-1), area * cloud.two_sided], -1).to(torch.int32)
 
 
 def _extents(to_pixel: Tensor, sizes: Tensor, visible: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:

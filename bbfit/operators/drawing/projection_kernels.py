@@ -76,20 +76,17 @@ def texel_to_world(r: Rectangle, width: wp.float64, height: wp.float64) -> mat43
 @wp.kernel
 def project_planes(
     chosen: wp.array(dtype=wp.int32),
+    lenses: wp.array(dtype=Lens),
+    rectangles: wp.array(dtype=Rectangle),
+    textures: wp.array(dtype=wp.vec4i),  # texture_table of the projection module
     width: int,
     height: int,
     orthographic: int,
-    lenses: wp.array(dtype=Lens),
-    rectangles: wp.array(dtype=Rectangle),
-    textures: wp.array(dtype=wp.vec4i),
     planes: wp.array2d(dtype=Plane),
     to_texel: wp.array2d(dtype=wp.mat33d),
     rows_apart: wp.array(dtype=wp.int32),
 ):
-    """Write what :class:`bbfit.operators.drawing.projection.Projection` holds; launched over views and billboards.
-
-    ``textures`` are the first texel, height, width, and the offset of the back's first texel.
-    """
+    """Write what :class:`bbfit.operators.drawing.projection.Projection` holds; launched over views and billboards."""
     b, n = wp.tid()
     lens = lenses[chosen[b]]
     r = rectangles[n]

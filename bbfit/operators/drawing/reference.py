@@ -19,7 +19,7 @@ NUDGES = 8
 
 
 def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
-    """Draw a billboard cloud.
+    """Draw a billboard cloud: premultiplied RGBA, [V, H, W, 4] ([H, W, 4] for a single camera), in the cloud's dtype.
 
     Each texture is filtered bilinearly with straight alpha, as engines do, and then premultiplied. A margin of one transparent texel in the
     color of its neighbor surrounds it. The alpha mode of the cloud turns filtered alpha into opacity (without a gradient in the mode
@@ -27,15 +27,10 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
 
     Parameters
     ----------
-    cloud : BillboardCloud
+    cloud
         N >= 0 billboards.
-    camera : Camera
+    camera
         One camera or V cameras.
-
-    Returns
-    -------
-    Tensor
-        Premultiplied RGBA, [V, H, W, 4] ([H, W, 4] for a single camera), in the cloud's dtype.
     """
     cameras = camera.batch().to(cloud.texels.dtype)
     views, height, width = len(cameras), cameras.height, cameras.width
@@ -101,10 +96,8 @@ def _facing_textures(cloud: BillboardCloud, front: Tensor) -> list[Tensor]:
     """The texture of each billboard that each view sees, with its margin: N tensors [V, 4, h + 2, w + 2]."""
     sources = []
     for n, texture in enumerate(cloud.textures()):
-        padded = pad(texture.permute(0, 3, 1, 2), (1, 1, 1, 1), mode="replicate")
-        margin = torch.ones_like(padded[0])
-        margin[3] = pad(torch.ones_like(texture[0, ..., 3]), (1, 1, 1, 1))
-        padded = padded * margin
+        color, alpha = texture.permute(0, 3, 1, 2).split((3, 1), 1)
+        padded = torch.cat([pad(color, (1, 1, 1, 1), mode="replicate"), pad(alpha, (1, 1, 1, 1))], 1)
         sources.append(padded.expand(len(front), -1, -1, -1) if len(texture) == 1 else padded[(~front[:, n]).long()])
     return sources
 

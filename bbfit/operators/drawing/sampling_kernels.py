@@ -114,10 +114,8 @@ def weights(fx: float, fy: float) -> wp.vec4:
 
 @wp.func
 def fetch(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: int, fx: float, fy: float) -> wp.vec4:
-    """Bilinear straight RGBA; beyond the outermost texel centers the color is constant and alpha fades to 0.
-
-    ``left`` and ``top`` are the whole parts of the texel coordinates, at least -1, ``fx`` and ``fy`` the rest.
-    """
+    """Bilinear straight RGBA; beyond the outermost texel centers the color is constant and alpha fades to 0. ``left`` and ``top`` are the
+    whole parts of the texel coordinates, at least -1, ``fx`` and ``fy`` the rest."""
     if left >= 0 and left + 1 < texture[2] and top >= 0 and top + 1 < texture[1]:
         i = texture[0] + top * texture[2] + left
         return bilinear(texels, i, i + texture[2], fx, fy)
@@ -133,11 +131,8 @@ def fetch(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: in
 
 @wp.func
 def opacity(alpha: float, test: wp.vec3) -> float:
-    """Opacity of a sample (:func:`bbfit.operators.drawing.compositing.opacity`).
-
-    ``test`` encodes the alpha mode (:mod:`bbfit.operators.drawing.fused`): the cutoff (0: blend, -1: hash), the hardness (0: a step), and
-    the slope of the gradient.
-    """
+    """Opacity of a sample (:func:`bbfit.operators.drawing.compositing.opacity`). ``test`` encodes the alpha mode: the cutoff (0: blend,
+    -1: hash), the hardness (0: a step), and the slope of the gradient."""
     if test[0] == 0.0:
         return alpha
     if test[1] == 0.0:

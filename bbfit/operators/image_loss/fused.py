@@ -10,8 +10,7 @@ from torch import Tensor
 
 from bbfit.operators.config import Loss
 from bbfit.operators.image_loss.kernels import LOSSES, compare, unpack
-from bbfit.operators.launching import LEAST_PIXELS, in_parallel, pieces_of, warp_array
-from bbfit.operators.precomputed import differentiable
+from bbfit.operators.launching import LEAST_PIXELS, differentiable, launch, warp_array
 from bbfit.operators.sharpness.fused import add_sharpness_gradient
 from bbfit.operators.ssim.fused import ssim_and_gradient
 
@@ -35,17 +34,15 @@ def image_loss_fused(render: Tensor, target: Tensor, kind: Loss, ssim_weight: fl
     gradient = torch.empty_like(render)
     structure = add_structure(render, target, ssim_weight, sharpness_weight, gradient)
     pixels, losses = render.numel() // 4, torch.empty(render.shape[:-1], device=render.device)
-    arrays = [warp_array(picture.detach().view(-1, 4), wp.vec4) for picture in (render, target, gradient)]
-    outputs = [warp_array(losses.view(-1), wp.float32), arrays[2]]
-    wp.launch(compare, pixels, [LOSSES[kind], 1 / pixels, *arrays[:2]], outputs, device=wp.device_from_torch(render.device))
+    arrays = [warp_array(picture.view(-1, 4), wp.vec4) for picture in (render, target, gradient)]
+    arguments = [LOSSES[kind], 1 / pixels, *arrays, warp_array(losses.view(-1), wp.float32)]
+    wp.launch(compare, pixels, arguments, device=wp.device_from_torch(render.device))
     return differentiable(losses.mean(dtype=torch.float64) + structure, render, gradient)
 
 
 def add_structure(render: Tensor, target: Tensor, ssim_weight: float, sharpness_weight: float, out: Tensor) -> Tensor | float:
-    """The weighted terms for structure and sharpness of :func:`image_loss_fused`, a float64 scalar.
-
-    ``out`` is memory for their gradient in ``render``; it is overwritten completely. All pictures are float32 [V, H, W, 4], contiguous.
-    """
+    """The weighted terms for structure and sharpness of :func:`image_loss_fused`, a float64 scalar; ``out`` becomes their gradient in
+    ``render``. All pictures are float32 [V, H, W, 4], contiguous."""
     lost: Tensor | float = 0.0
     if ssim_weight:
         lost = ssim_weight * (1 - ssim_and_gradient(render, target, -ssim_weight, out)[0])
@@ -57,18 +54,9 @@ def add_structure(render: Tensor, target: Tensor, ssim_weight: float, sharpness_
 
 
 def unpacked(packed: Tensor, straight: bool, out: Tensor | None = None) -> Tensor:
-    """8-bit RGBA, straight or premultiplied, uint8 [V, H, W, 4], contiguous, as premultiplied RGBA in [0, 1], float32.
-
-    ``out`` is memory for the result, contiguous; it is overwritten completely.
-    """
+    """8-bit RGBA, straight or premultiplied, uint8 [V, H, W, 4], as premultiplied RGBA, float32, in ``out`` if given; all contiguous."""
     image = torch.empty(packed.shape, dtype=torch.float32, device=packed.device) if out is None else out
-    run, device = 1 if packed.is_cuda else 1 << 10, wp.device_from_torch(packed.device)
+    run, on = 1 if packed.is_cuda else 1 << 10, wp.device_from_torch(packed.device)
     arguments = [run, warp_array(packed.view(torch.int32).flatten(), wp.int32), int(straight)]
-    outputs, runs = [warp_array(image.view(-1, 4), wp.vec4)], -(-packed.numel() // 4 // run)
-    unpack.module.load(device)  # or every thread would compile it
-
-    def launch(begin: int, end: int) -> None:
-        wp.launch(unpack, end - begin, [begin, *arguments], outputs, device=device)
-
-    in_parallel(launch, [(0, runs)] if packed.is_cuda else pieces_of(runs, LEAST_PIXELS // run))
+    launch(unpack, -(-packed.numel() // 4 // run), LEAST_PIXELS // run, arguments, [warp_array(image.view(-1, 4), wp.vec4)], on=on)
     return image

@@ -15,7 +15,6 @@ The function :func:`add_pixel_loss` is called for every pixel of a picture by th
 """
 
 # mypy: ignore-errors
-# ruff: noqa: UP018 - int(0) declares a variable of a kernel, 0 a constant.
 
 import warp as wp
 
@@ -25,6 +24,7 @@ LOSSES = {"l1": 1, "l2": 2, "backgrounds": 3}
 """Numbers of the losses in kernels; 0 is none."""
 L1, BACKGROUNDS = wp.constant(LOSSES["l1"]), wp.constant(LOSSES["backgrounds"])
 ROUNDING = wp.constant(5e-7)
+Pixels = wp.array(dtype=wp.vec4)
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
@@ -63,26 +63,18 @@ def add_pixel_loss(d: wp.vec4, loss: int, weight: float, total: float, g: wp.vec
 
 
 @wp.kernel
-def unpack(first: int, run: int, packed: wp.array(dtype=wp.int32), straight: int, image: wp.array(dtype=wp.vec4)):
+def unpack(first: int, run: int, packed: wp.array(dtype=wp.int32), straight: int, image: Pixels):
     """Write 8-bit RGBA [P] as premultiplied floats; launched over runs of pixels, from run ``first`` on."""
-    begin = (first + wp.tid()) * run
-    i = int(begin)
-    while i < wp.min(begin + run, packed.shape[0]):
+    tid, _ = wp.tid()
+    begin = (first + tid) * run
+    for i in range(begin, wp.min(begin + run, packed.shape[0])):
         image[i] = premultiplied(packed[i], straight)
-        i += 1
 
 
 @wp.kernel
-def compare(
-    loss: int,
-    weight: float,
-    render: wp.array(dtype=wp.vec4),
-    target: wp.array(dtype=wp.vec4),
-    losses: wp.array(dtype=wp.float32),
-    gradient: wp.array(dtype=wp.vec4),
-):
+def compare(loss: int, weight: float, render: Pixels, target: Pixels, gradient: Pixels, losses: wp.array(dtype=wp.float32)):
     """Write the loss of every pixel [P] and add its derivative, times ``weight``, to ``gradient`` [P]; launched over pixels."""
     i = wp.tid()
-    total, g = add_pixel_loss(render[i] - target[i], loss, weight, float(0.0), gradient[i])
+    total, g = add_pixel_loss(render[i] - target[i], loss, weight, 0.0, gradient[i])
     losses[i] = total
     gradient[i] = g

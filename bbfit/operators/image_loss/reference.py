@@ -10,23 +10,17 @@ from bbfit.operators.ssim.reference import ssim_reference
 
 
 def image_loss_reference(render: Tensor, target: Tensor, kind: Loss, ssim_weight: float, sharpness_weight: float = 0.0) -> Tensor:
-    """The mean of :func:`pixel_loss_reference` plus weighted terms for structure and sharpness.
+    """Loss of a render, a scalar that is differentiable in both pictures.
 
     Parameters
     ----------
-    render, target : Tensor
+    render, target
         Premultiplied RGBA in [0, 1], [V, H, W, 4].
-    kind : {"l1", "l2", "backgrounds"}
-        Loss of a pixel.
-    ssim_weight : float
-        Factor of 1 - SSIM (:func:`~bbfit.operators.ssim.reference.ssim_reference`).
-    sharpness_weight : float
-        Factor of :func:`~bbfit.operators.sharpness.reference.sharpness_reference`.
-
-    Returns
-    -------
-    Tensor
-        A scalar, differentiable in both pictures.
+    kind
+        Loss of a pixel (:func:`pixel_loss_reference`), whose mean is taken.
+    ssim_weight, sharpness_weight
+        Factors of 1 - SSIM (:func:`~bbfit.operators.ssim.reference.ssim_reference`) and of
+        :func:`~bbfit.operators.sharpness.reference.sharpness_reference`, which are added.
     """
     loss = pixel_loss_reference(render, target, kind).mean()
     if ssim_weight:
@@ -37,7 +31,7 @@ def image_loss_reference(render: Tensor, target: Tensor, kind: Loss, ssim_weight
 
 
 def pixel_loss_reference(render: Tensor, target: Tensor, kind: Loss) -> Tensor:
-    """Loss of every pixel.
+    """Loss of every pixel, [V, H, W], of premultiplied RGBA in [0, 1], [V, H, W, 4]; differentiable in both pictures.
 
     ``l1`` and ``l2`` are absolute and squared differences, summed over the four channels (thesis, section 4.4).
 
@@ -47,18 +41,6 @@ def pixel_loss_reference(render: Tensor, target: Tensor, kind: Loss) -> Tensor:
         sum over channels of E[(c - a b)^2] = sum of (c^2 - a c) + a^2,
 
     which is ``l2`` minus one term: where alpha is missing too, missing color costs less, because the background shows instead.
-
-    Parameters
-    ----------
-    render, target : Tensor
-        Premultiplied RGBA in [0, 1], [V, H, W, 4].
-    kind : {"l1", "l2", "backgrounds"}
-        Which loss.
-
-    Returns
-    -------
-    Tensor
-        [V, H, W], differentiable in both pictures.
     """
     difference = render - target
     loss = (difference.abs() if kind == "l1" else difference.square()).sum(-1)

@@ -6,8 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from bbfit.operators.launching import LEAST_PIXELS, in_parallel, pieces_of
-from bbfit.operators.precomputed import differentiable
+from bbfit.operators.launching import LEAST_PIXELS, differentiable, launch, warp_array
 from bbfit.operators.sharpness.kernels import differentiate, measure
 from bbfit.operators.sharpness.reference import BLOCK
 
@@ -19,45 +18,24 @@ def sharpness_fused(render: Tensor, target: Tensor) -> Tensor:
 
 
 def add_sharpness_gradient(render: Tensor, target: Tensor, weight: float, gradient: Tensor) -> Tensor:
-    """Add ``weight`` times the gradient of the difference in sharpness to ``gradient``.
+    """The difference in sharpness, a float64 scalar, whose gradient in ``render``, times ``weight``, is added to ``gradient``.
 
-    On a CPU equal inputs give equal bytes, whatever the number of threads.
-
-    Parameters
-    ----------
-    render, target : Tensor
-        Premultiplied RGBA in [0, 1], float32 [V, H, W, 4], contiguous.
-    weight : float
-        Factor of the gradient.
-    gradient : Tensor
-        Gradient in ``render`` to add to, float32 [V, H, W, 4], contiguous.
-
-    Returns
-    -------
-    Tensor
-        The difference in sharpness, a float64 scalar.
+    All three pictures are float32 [V, H, W, 4], contiguous; render and target are premultiplied RGBA in [0, 1]. On a CPU equal inputs give
+    equal bytes, whatever the number of threads.
     """
     views, height, width, _ = render.shape
     rows, columns = -(-height // BLOCK), -(-width // BLOCK)
-    device, on_gpu = wp.device_from_torch(render.device), render.is_cuda
+    on = wp.device_from_torch(render.device)
     excess = torch.empty(views, rows, columns, 2, 3, dtype=torch.float32, device=render.device)
     sums = torch.zeros(views, rows, dtype=torch.float32, device=render.device)
-    pictures = [wp.from_torch(picture.detach(), dtype=wp.vec4, requires_grad=False) for picture in (render, target, gradient)]
-    blocks, totals = wp.from_torch(excess, dtype=wp.vec3), wp.from_torch(sums)
+    pictures = [warp_array(picture, wp.vec4) for picture in (render, target, gradient)]
+    blocks, totals = warp_array(excess, wp.vec3), warp_array(sums, wp.float32)
     terms = views * rows * columns * 3
     factor = weight * 2 / terms / BLOCK**2
-    measure.module.load(device)  # or every thread would compile it
-
-    def measured(begin: int, end: int) -> None:
-        run = 1 if on_gpu else columns
-        arguments = [begin, run, rows, pictures[0], pictures[1]]
-        wp.launch(measure, (end - begin, -(-columns // run)), arguments, [blocks, totals], device=device)
-
-    def differentiated(begin: int, end: int) -> None:
-        run = 1 if on_gpu else width
-        arguments = [begin, run, height, factor, pictures[0], blocks]
-        wp.launch(differentiate, (end - begin, -(-width // run)), arguments, [pictures[2]], device=device)
-
-    for work, count, pixels in ((measured, views * rows, width * BLOCK), (differentiated, views * height, width)):
-        in_parallel(work, [(0, count)] if on_gpu else pieces_of(count, -(-LEAST_PIXELS // pixels)))
+    for kernel, (down, along, pixels), inputs, written in (
+        (measure, (rows, columns, width * BLOCK), [rows, *pictures[:2]], [blocks, totals]),
+        (differentiate, (height, width, width), [height, factor, pictures[0], blocks], [pictures[2]]),
+    ):
+        run = 1 if on.is_cuda else along
+        launch(kernel, views * down, -(-LEAST_PIXELS // pixels), [run, *inputs], written, across=-(-along // run), on=on)
     return sums.sum(dtype=torch.float64) / terms

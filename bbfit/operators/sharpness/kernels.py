@@ -26,6 +26,7 @@ from bbfit.operators.launching import FLAGS
 from bbfit.operators.sharpness.reference import BLOCK as BLOCK_VALUE
 
 BLOCK = wp.constant(BLOCK_VALUE)
+Pictures, Excess = wp.array3d(dtype=wp.vec4), wp.array4d(dtype=wp.vec3)
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
@@ -44,19 +45,9 @@ def signs(d: wp.vec3) -> wp.vec3:
 
 
 @wp.kernel
-def measure(
-    first_row: int,
-    run: int,
-    rows: int,
-    render: wp.array3d(dtype=wp.vec4),
-    target: wp.array3d(dtype=wp.vec4),
-    excess: wp.array4d(dtype=wp.vec3),
-    sums: wp.array2d(dtype=wp.float32),
-):
-    """Write e_B for rows and columns to ``excess`` [V, H', W', 2]; add its squares to ``sums`` [V, H'].
-
-    Launched over the rows of blocks of all views, from ``first_row`` on, and runs of blocks.
-    """
+def measure(first_row: int, run: int, rows: int, render: Pictures, target: Pictures, excess: Excess, sums: wp.array2d(dtype=wp.float32)):
+    """Write e_B for rows and columns to ``excess`` [V, H', W', 2]; add its squares to ``sums`` [V, H']; launched over rows and runs of
+    blocks."""
     tid, piece = wp.tid()
     view = (first_row + tid) // rows
     row = (first_row + tid) % rows
@@ -89,19 +80,9 @@ def measure(
 
 
 @wp.kernel
-def differentiate(
-    first_row: int,
-    run: int,
-    height: int,
-    weight: float,
-    render: wp.array3d(dtype=wp.vec4),
-    excess: wp.array4d(dtype=wp.vec3),
-    gradient: wp.array3d(dtype=wp.vec4),
-):
-    """Add ``weight``, which is a multiple of 2 / (N n), times the bracket of the backward pass to ``gradient``.
-
-    Launched over the rows of all views, from ``first_row`` on, and runs of pixels.
-    """
+def differentiate(first_row: int, run: int, height: int, weight: float, render: Pictures, excess: Excess, gradient: Pictures):
+    """Add ``weight``, a multiple of 2 / (N n), times the bracket of the backward pass to ``gradient``; launched over rows and runs of
+    pixels."""
     tid, piece = wp.tid()
     view = (first_row + tid) // height
     y = (first_row + tid) % height

@@ -10,7 +10,7 @@ BLOCK = 8
 
 
 def sharpness_reference(render: Tensor, target: Tensor) -> Tensor:
-    """Mean squared difference of local contrast between two pictures over white.
+    """Mean squared difference of local contrast between two pictures over white, a scalar that is differentiable in both.
 
     The contrast of a block of 8 x 8 pixels is the mean absolute difference between neighboring pixels, taken along rows and along columns.
     The squared difference of the two pictures' contrasts is averaged over blocks, channels and views, and summed over both directions. It
@@ -20,13 +20,8 @@ def sharpness_reference(render: Tensor, target: Tensor) -> Tensor:
 
     Parameters
     ----------
-    render, target : Tensor
+    render, target
         Premultiplied RGBA in [0, 1], [V, H, W, 4].
-
-    Returns
-    -------
-    Tensor
-        A scalar of at least 0, differentiable in both pictures.
     """
     total = render.new_zeros(())
     white = [(image[..., :3] + 1 - image[..., 3:]).permute(0, 3, 1, 2) for image in (render, target)]

@@ -10,8 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from bbfit.operators.launching import in_parallel, pieces_of, worker_count
-from bbfit.operators.precomputed import differentiable
+from bbfit.operators.launching import differentiable, in_parallel, launch, pieces_of, worker_count
 from bbfit.operators.ssim.kernels import PAIRS_REACH, REACH, STAGES, kernels
 
 # Least pairs of rows for a thread, which starts PAIRS_REACH pairs early.
@@ -25,23 +24,10 @@ def ssim_fused(render: Tensor, target: Tensor) -> Tensor:
 
 
 def ssim_and_gradient(a: Tensor, b: Tensor, weight: float, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Mean structural similarity and ``weight`` times its gradient in ``a``.
+    """Mean structural similarity, a float64 scalar, and ``weight`` times its gradient in ``a``, float32 [V, H, W, 4].
 
-    On a CPU equal inputs give equal bytes, whatever the number of threads.
-
-    Parameters
-    ----------
-    a, b : Tensor
-        Float32 [V, H, W, 4] in [0, 1], contiguous, at least 11 pixels high and wide.
-    weight : float
-        Factor of the gradient.
-    out : Tensor, optional
-        Memory for the gradient, float32 and contiguous like ``a``; it is overwritten completely.
-
-    Returns
-    -------
-    tuple[Tensor, Tensor]
-        The similarity, a float64 scalar, and the gradient, float32 [V, H, W, 4].
+    ``a`` and ``b`` are float32 [V, H, W, 4] in [0, 1], contiguous, at least 11 pixels high and wide. ``out`` is memory for the gradient,
+    like ``a``; it is overwritten completely. On a CPU equal inputs give equal bytes, whatever the number of threads.
     """
     assert a.shape == b.shape and a.shape[3] == 4 and min(a.shape[1:3]) > REACH and len(a)
     assert a.dtype == b.dtype == torch.float32 and a.is_contiguous() and b.is_contiguous() and a.device == b.device
@@ -94,12 +80,7 @@ def _ranges(a: Tensor, b: Tensor, own: SimpleNamespace) -> list[Any]:
     extents = wp.from_torch(torch.tensor([0, width], dtype=torch.int32, device=a.device).repeat(rows, 1), dtype=wp.vec2i)
     if not a.is_cuda:
         bits = [_overlapping(picture.view(torch.int32).flatten(0, 1), own, own.bits) for picture in (a, b)]
-
-        def find(begin: int, end: int) -> None:
-            wp.launch(own.find_extents, end - begin, [begin, width, *bits], [extents], device=device)
-
-        own.find_extents.module.load(device)
-        in_parallel(find, pieces_of(rows, 2 * _LEAST_PAIRS))
+        launch(own.find_extents, rows, 2 * _LEAST_PAIRS, [width, *bits], [extents], on=device)
     shape = (views, (height + 1) // 2 + PAIRS_REACH)
     ranges = [wp.from_torch(torch.empty(*shape, 2, dtype=torch.int32, device=a.device), dtype=wp.vec2i) for _ in range(2)]
     wp.launch(own.widen_extents, shape, [height, width, extents], ranges, device=device)

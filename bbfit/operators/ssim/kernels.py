@@ -64,10 +64,13 @@ def joint(extents: wp.array(dtype=wp.vec2i), view: int, height: int, first: int,
 
 
 @wp.func
-def within(begin: int, end: int, count: int, step: int):
-    """A range within ``count`` places, widened until both ends are multiples of ``step`` or ``count``."""
-    begin = wp.max(wp.min(begin, count - step), 0)
-    end = (wp.max(end, step) + step - 1) // step * step
+def within(extent: wp.vec2i, before: int, after: int, count: int, step: int):
+    """An extent, longer by ``before`` and ``after``, within ``count`` places, and widened until both ends are multiples of ``step`` or
+    ``count``; (0, 0) if it is empty."""
+    if extent[1] <= extent[0]:
+        return wp.vec2i(0, 0)
+    begin = wp.max(wp.min(extent[0] - before, count - step), 0)
+    end = (wp.max(extent[1] + after, step) + step - 1) // step * step
     return wp.vec2i(begin - begin % step, wp.where(end > count - step, count, end))
 
 
@@ -270,32 +273,27 @@ def kernels(pixels: int = 1) -> SimpleNamespace:
             if last_stage > 3 and y >= 2 * first:
                 spread_columns(pixels[0], pixels[1], along, threads_along, view, y, scale, a, b, spread, gradient)
 
+    @wp.func
+    def zero(a: wp.array2d(dtype=bits), b: wp.array2d(dtype=bits), row: int, x: int):
+        """Whether a vector of pixels is zero in both pictures."""
+        u = a[row, x]
+        v = b[row, x]
+        either = int(0)
+        for j in range(wp.static(lanes)):
+            either = either | u[j] | v[j]
+        return either == 0
+
     @wp.kernel(**options)
     def find_extents(first: int, width: int, a: wp.array2d(dtype=bits), b: wp.array2d(dtype=bits), extents: wp.array(dtype=wp.vec2i)):
         """Write a range that contains all pixels of a row that are not zero in both pictures; (width, 0) if there are none."""
-        row = first + wp.tid()
+        tid, _ = wp.tid()
+        row = first + tid
         begin = int(0)
-        zero = bool(True)
-        while zero and begin < width:
-            u = a[row, wp.min(begin, width - step)]
-            v = b[row, wp.min(begin, width - step)]
-            either = int(0)
-            for j in range(wp.static(lanes)):
-                either = either | u[j] | v[j]
-            zero = either == 0
-            if zero:
-                begin += step
+        while begin < width and zero(a, b, row, wp.min(begin, width - step)):
+            begin += step
         end = int(width)
-        zero = bool(True)
-        while zero and end > begin:
-            u = a[row, wp.max(end - step, 0)]
-            v = b[row, wp.max(end - step, 0)]
-            either = int(0)
-            for j in range(wp.static(lanes)):
-                either = either | u[j] | v[j]
-            zero = either == 0
-            if zero:
-                end -= step
+        while end > begin and zero(a, b, row, wp.max(end - step, 0)):
+            end -= step
         extents[row] = wp.where(begin < width, wp.vec2i(begin, end), wp.vec2i(width, 0))
 
     @wp.kernel(**options)
@@ -308,16 +306,9 @@ def kernels(pixels: int = 1) -> SimpleNamespace:
         view, pair = wp.tid()
         y = 2 * pair - REACH
         extent = joint(extents, view, height, y - REACH, y + 1 + REACH)
-        pixels = wp.vec2i(0, 0)
-        if extent[1] > extent[0]:
-            pixels = within(extent[0] - REACH, extent[1] + REACH, width, step)
-        pixel_ranges[view, pair] = pixels
+        pixel_ranges[view, pair] = within(extent, REACH, REACH, width, step)
         extent = joint(extents, view, height, y - REACH, y + 1 + 2 * REACH)
-        windows = wp.vec2i(0, 0)
-        if extent[1] > extent[0]:
-            windows = within(
-                extent[0] - REACH, extent[1] + step, width - REACH, step
-            )  # one vector more, because the range of pixels is rounded up
-        window_ranges[view, pair] = windows
+        # One vector more, because the range of pixels is rounded up.
+        window_ranges[view, pair] = within(extent, REACH, step, width - REACH, step)
 
     return SimpleNamespace(vector=vector, bits=bits, step=pixels, sweep=sweep, find_extents=find_extents, widen_extents=widen_extents)

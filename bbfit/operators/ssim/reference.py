@@ -14,17 +14,12 @@ def ssim_reference(render: Tensor, target: Tensor) -> Tensor:
     """Mean SSIM over all windows that lie inside the picture (Wang et al. 2004, equation 13).
 
     The window is a Gaussian of 11 pixels with sigma 1.5; the data range is 1. Equals :func:`kornia.metrics.ssim` on these windows at half
-    the cost, because the Gaussian is applied along one axis at a time.
+    the cost, because the Gaussian is applied along one axis at a time. A scalar of at most 1, differentiable in both pictures.
 
     Parameters
     ----------
-    render, target : Tensor
+    render, target
         Premultiplied RGBA in [0, 1], [V, H, W, 4]; at least 11 pixels high and wide.
-
-    Returns
-    -------
-    Tensor
-        A scalar of at most 1, differentiable in both pictures.
     """
     a, b = render.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2)
     c1, c2 = 0.01**2, 0.03**2
