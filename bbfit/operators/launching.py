@@ -100,7 +100,7 @@ def warp_array(tensor: Tensor, dtype: Any) -> Any:
 def struct_array(tensor: Tensor, kind: Any) -> Any:
     """A Warp view of a contiguous tensor whose last dimension is the memory of a struct. It keeps the tensor alive."""
     device, shape = wp.device_from_torch(tensor.device), tuple(tensor.shape[:-1])
-    array = wp.array(ptr=tensor.data_ptr(), shape=shape, dtype=kind, device=device)
+    array: Any = wp.array(ptr=tensor.data_ptr(), shape=shape, dtype=kind, device=device)
     array._tensor = tensor  # as wp.from_torch does
     return array
 

@@ -15,6 +15,7 @@ The function :func:`add_pixel_loss` is called for every pixel of a picture by th
 """
 
 # mypy: ignore-errors
+# ruff: noqa: UP018 - int(0) declares a variable of a kernel, 0 a constant.
 
 import warp as wp
 
@@ -67,8 +68,10 @@ def unpack(first: int, run: int, packed: wp.array(dtype=wp.int32), straight: int
     """Write 8-bit RGBA [P] as premultiplied floats; launched over runs of pixels, from run ``first`` on."""
     tid, _ = wp.tid()
     begin = (first + tid) * run
-    for i in range(begin, wp.min(begin + run, packed.shape[0])):
+    i = int(begin)
+    while i < wp.min(begin + run, packed.shape[0]):
         image[i] = premultiplied(packed[i], straight)
+        i += 1
 
 
 @wp.kernel
