@@ -47,7 +47,8 @@ class AdamFused(AdamReference):
     def start(texels: Tensor) -> AdamFused:
         """The state before the first step, which takes over the memory of ``texels`` [P', 4], as :meth:`padded` returns them."""
         never = torch.full((len(texels) // BLOCK,), -(1 << 30), dtype=torch.int32, device=texels.device)
-        return AdamFused(texels, *(torch.zeros_like(texels) for _ in range(3)), last=never, occupied=occupancy(texels))
+        first, second, gradient = (torch.zeros_like(texels) for _ in range(3))
+        return AdamFused(texels, first, second, gradient, last=never, occupied=occupancy(texels))
 
     def tensors(self) -> dict[str, Tensor]:
         """As of the reference, and the last steps with a gradient."""
