@@ -15,7 +15,7 @@ The function :func:`add_pixel_loss` is called for every pixel of a picture by th
 """
 
 # mypy: ignore-errors
-# ruff: noqa: UP018 - int(0) declares a variable of a kernel, 0 a constant.
+
 
 import warp as wp
 
