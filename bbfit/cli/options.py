@@ -18,7 +18,14 @@ _Annotated, _Hidden, _Flat = cast(Any, Annotated), cast(Any, tyro.conf.Suppress)
 # The help describes the default of an option that is None if it is not given.
 _NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")
 _DOTTED = re.compile(r"--(\w+)\.([\w-]+)(=.*)?$")
-_RENAMED = {"--views.device": "--render-device", "--views.workers": "--render-workers"}
+_RENAMED = {
+    "--fit.crispness-weight": "--binarization-weight",
+    "--fit.placement-rate": "--placement-learning-rate",
+    "--fit.revisions": "--refinement-rounds",
+    "--fit.searches": "--restarts",
+    "--views.device": "--render-device",
+    "--views.workers": "--render-workers",
+}
 
 
 def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:

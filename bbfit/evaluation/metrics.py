@@ -41,23 +41,15 @@ def root_mean_squared_error(target: Image, render: Image) -> float:
 
 
 def psnr(target: Image, render: Image) -> float:
-    """Peak signal-to-noise ratio in dB for data range 1, at most 120; higher is better.
-
-    ``-10 log10(mse)``, where one mean squared error is taken over all pixels and channels.
-    """
+    """Peak signal-to-noise ratio in dB, at most 120; higher is better: ``-10 log10(mse)`` with one error over all pixels and channels."""
     return float(-10 * np.log10(max(mean_squared_error(target, render), MSE_FLOOR)))
 
 
 def ssim(target: Image, render: Image) -> float:
     """Structural similarity over white, in [-1, 1]; higher is better (Wang et al. 2004).
 
-    Gaussian window of 11 x 11 pixels with a standard deviation of 1.5, as in the paper's section III-C; the mean over channels and over
-    the pixels whose window lies inside the picture.
-
-    Raises
-    ------
-    InputError
-        if a side of the picture is shorter than the window.
+    Gaussian window of 11 x 11 pixels with a standard deviation of 1.5, as in the paper's section III-C; the mean over channels and over the
+    pixels whose window lies inside the picture. Raises InputError if a side of the picture is shorter than the window.
     """
     from skimage.metrics import structural_similarity
 
@@ -77,13 +69,7 @@ def ssim(target: Image, render: Image) -> float:
 
 
 def check_size(width: int, height: int) -> None:
-    """Require pictures of at least the size of the SSIM window.
-
-    Raises
-    ------
-    InputError
-        if a side is shorter.
-    """
+    """Raise InputError for pictures with a side shorter than the SSIM window."""
     if min(width, height) < SSIM_WINDOW:
         fail(
             "views",
@@ -113,10 +99,7 @@ def flip(target: Image, render: Image) -> float:
 
 
 def alpha_iou(target: Image, render: Image) -> float:
-    """Intersection over union of the silhouettes (alpha >= 0.5) of two RGBA pictures, in [0, 1]; higher is better.
-
-    Two empty silhouettes agree: 1.
-    """
+    """Intersection over union of the silhouettes (alpha >= 0.5) of two RGBA pictures, in [0, 1], 1 for two empty ones; higher is better."""
     check_shape("target", target.shape, (None, None, 4))
     check_shape("render", render.shape, target.shape)
     inside_render, inside_target = (picture[..., 3] >= ALPHA_THRESHOLD for picture in (render, target))

@@ -180,11 +180,12 @@ class Report:
 
         Returns
         -------
-        ``{"over_white": {"psnr", "ssim", "flip"}, "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
-        "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw",
-        "alpha": {"mode", "cutoff"}, "seconds": {stage: ..}, "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
-        "rings": [{"elevation_degrees", "views", and the same measures}],
-        "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures}]}``
+        dict
+            ``{"over_white": {"psnr", "ssim", "flip"}, "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
+            "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw",
+            "alpha": {"mode", "cutoff"}, "seconds": {stage: ..}, "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
+            "rings": [{"elevation_degrees", "views", and the same measures}],
+            "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures}]}``
         """
         return asdict(self.mean) | {
             "vertices": self.vertices.to_json(),

@@ -82,7 +82,7 @@ def evaluate_model(
     original: OriginalTree | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Report:
-    """Do what :func:`evaluate` does for a model whose polygons or file may have been computed before."""
+    """Do what :func:`evaluate` does for a model whose polygons or file may already be computed."""
     started, original, on_progress = time.perf_counter(), original or OriginalTree(), on_progress or (lambda done, total: None)
     total = len(views) + HALVINGS + 1
     scores = score_views(lambda index: held_out(model.draw, views, index)[1], views, on_view=lambda done, _: on_progress(done, total))
@@ -101,21 +101,10 @@ def evaluate_model(
 def score_views(
     draw: Callable[[int], Tensor], views: ViewSet, *, on_view: Callable[[int, int], None] | None = None
 ) -> tuple[ViewScore, ...]:
-    """Measure pictures of a tree, whatever drew them, against held-out views.
+    """Measure pictures of a tree, whatever drew them, against V held-out views of at least 11 x 11 pixels.
 
-    Parameters
-    ----------
-    draw : callable
-        Returns the picture of the view with a given index: premultiplied RGBA in [0, 1], [H, W, 4].
-    views : ViewSet
-        V held-out views of at least 11 x 11 pixels.
-    on_view : callable
-        Called after each view with the number of finished views and V.
-
-    Raises
-    ------
-    InputError
-        if there are no views or they are too small.
+    ``draw`` returns the picture of the view with a given index: premultiplied RGBA in [0, 1], [H, W, 4]. ``on_view`` is called after each
+    view with the number of finished views and V. Raises InputError if there are no views or they are too small.
     """
     if len(views) == 0:
         fail("views", "there is no held-out view to measure on", "give views with a test split")
@@ -133,15 +122,8 @@ def score_views(
 def held_out(draw: Callable[[Camera], Tensor], views: ViewSet, index: int) -> tuple[Tensor, Tensor]:
     """The target and the render of one view as they are measured: premultiplied RGBA in [0, 1], each float64 [H, W, 4] on the CPU.
 
-    Parameters
-    ----------
-    draw : callable
-        Returns what one camera sees: premultiplied RGBA [H, W, 4], as :meth:`~bbfit.exporting.model.ShippedModel.draw` does.
-
-    Raises
-    ------
-    InputError
-        if the picture cannot be read, or the render has values that are not finite.
+    ``draw`` returns what one camera sees, premultiplied RGBA [H, W, 4] (:meth:`~bbfit.exporting.model.ShippedModel.draw`). Raises
+    InputError if the picture cannot be read, or if the render has values that are not finite.
     """
     target = views.targets([index], torch.float64)[0]
     with torch.inference_mode():
@@ -152,13 +134,7 @@ def held_out(draw: Callable[[Camera], Tensor], views: ViewSet, index: int) -> tu
 
 
 def measure(target: Tensor, image: Tensor) -> Measures:
-    """All measures of one view.
-
-    Parameters
-    ----------
-    target, image : Tensor
-        Premultiplied RGBA in [0, 1], [H, W, 4], of at least 11 x 11 pixels.
-    """
+    """All measures of one view, from premultiplied RGBA in [0, 1], [H, W, 4], of at least 11 x 11 pixels."""
     check_shape("target", tuple(target.shape), (None, None, 4))
     check_shape("image", tuple(image.shape), tuple(target.shape))
     rgba = tuple(picture.detach().cpu().double().numpy() for picture in (target, image))
@@ -166,12 +142,7 @@ def measure(target: Tensor, image: Tensor) -> Measures:
     return Measures(
         OverWhite(metrics.psnr(*white), metrics.ssim(*white), metrics.flip(*white)),
         Rgba(metrics.root_mean_squared_error(*rgba), metrics.psnr(*rgba), metrics.alpha_iou(*rgba)),
-        ThesisScale(
-            thesis_scale.rmse(*rgba),
-            thesis_scale.ssim(*rgba),
-            thesis_scale.psnr(*rgba),
-            thesis_scale.sre(*rgba),
-        ),
+        ThesisScale(thesis_scale.rmse(*rgba), thesis_scale.ssim(*rgba), thesis_scale.psnr(*rgba), thesis_scale.sre(*rgba)),
         metrics.sharpness(*white),
         metrics.brightness(*rgba),
     )

@@ -18,10 +18,7 @@ _MARGIN = 1.15
 def worst_silhouette(cloud: BillboardCloud, views: ViewSet, *, stop: Callable[[], bool] = lambda: False) -> float:
     """The largest :func:`~bbfit.evaluation.metrics.silhouette_distance` between a cloud and a view, in pixels; 0 without views.
 
-    Parameters
-    ----------
-    stop : callable
-        Called before each view. Once it returns True, the remaining views are left out.
+    ``stop`` is called before each view. Once it returns True, the remaining views are left out.
     """
     worst, draw = 0.0, shipped_model(cloud).draw
     for index in range(len(views)):
@@ -33,7 +30,7 @@ def worst_silhouette(cloud: BillboardCloud, views: ViewSet, *, stop: Callable[[]
 
 
 def scale_within(error: float, error_pixels: float) -> float:
-    """The largest scale, in pixels per meter, at which an error stays within ``error_pixels`` pixels, also between the training views.
+    """The largest scale, in pixels per meter, that keeps an error within ``error_pixels`` pixels, also between the training views.
 
     ``error`` is in meters, measured in the training views.
     """

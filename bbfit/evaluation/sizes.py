@@ -25,33 +25,18 @@ def score_sizes(
 ) -> tuple[SizeScore, ...]:
     """Compare renders at the views' size, at half of it and so on with the views averaged to the same size.
 
+    Returns at most ``halvings + 1`` scores, the largest size first; sizes with a side below 11 pixels
+    (:data:`bbfit.evaluation.metrics.SSIM_WINDOW`) are left out. ``draw`` returns what a batch of B cameras sees: premultiplied RGBA over
+    nothing, [B, H, W, 4], which is then clamped to [0, 1]. ``on_size`` is called after each size with the number of finished sizes and
+    their total. Raises InputError if there are no views, they are too small, ``halvings`` is negative, or a render has another shape or
+    values that are not finite.
+
     A smaller camera covers the same field of view with fewer pixels, as if the tree were farther away. A pixel of the target is the mean,
     by area, of the part of the view that it covers. The mean is taken of premultiplied display-referred values, as in all scores, without
-    conversion to linear light; so coverage is the same at all sizes. Renders are clamped to [0, 1].
+    conversion to linear light; so coverage is the same at all sizes.
 
     With one sample per pixel the coverage of a small picture of a tree varies by some percent at random. Below the full size the coverage
     of a render is therefore the mean of several renders, 4 at half the size and 16 below, shifted by fractions of a pixel.
-
-    Parameters
-    ----------
-    draw : callable
-        Returns what a batch of B cameras sees: premultiplied RGBA over nothing, [B, H, W, 4].
-    views : ViewSet
-        V held-out views.
-    halvings : int
-        Number of halvings. Sizes with a side below 11 pixels (:data:`bbfit.evaluation.metrics.SSIM_WINDOW`) are left out.
-    on_size : callable
-        Called after each size with the number of finished sizes and their total.
-
-    Returns
-    -------
-    tuple of SizeScore
-        At most ``halvings + 1`` scores, the largest size first.
-
-    Raises
-    ------
-    InputError
-        if there are no views, they are too small, ``halvings`` is negative, or a render has another shape or values that are not finite.
     """
     check_count("halvings", halvings, 0)
     if len(views) == 0:
@@ -70,10 +55,7 @@ def score_sizes(
 def shrunk(picture: Tensor, width: int, height: int) -> Tensor:
     """A picture at a smaller size, [H, W, C] -> [h, w, C]; each pixel is the mean, by area, of what it covers.
 
-    Raises
-    ------
-    InputError
-        if the new size is larger, or not at least 1 x 1.
+    Raises InputError if the new size is larger, or not at least 1 x 1.
     """
     for name, side, old in (("width", width, picture.shape[1]), ("height", height, picture.shape[0])):
         check_count(name, side)

@@ -38,10 +38,7 @@ def psnr(target: Image, render: Image) -> float:
 def ssim(target: Image, render: Image) -> float:
     """Structural similarity with scikit-image's defaults (a flat 7 x 7 window) and a data range of 4095.
 
-    Raises
-    ------
-    InputError
-        if the picture is smaller than can be measured (:func:`bbfit.evaluation.metrics.check_size`).
+    Raises InputError if the picture is too small (:func:`bbfit.evaluation.metrics.check_size`).
     """
     from skimage.metrics import structural_similarity
 

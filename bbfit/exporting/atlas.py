@@ -15,22 +15,12 @@ BLOCK = 4
 
 
 def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
-    """Pack textures without resampling or rotating them.
+    """Pack R >= 1 straight-alpha textures, uint8 [h, w, 4] each, without resampling or rotating them.
 
-    Each texture gets a cell that is at least ``padding`` texels larger on every side and aligned to blocks of n x n texels, where n is the
-    largest power of two up to ``padding`` (at least 4). So no texel of a mip level up to log2(n) mixes two textures.
-
-    Parameters
-    ----------
-    textures : list of ndarray
-        R >= 1 straight-alpha pictures, uint8 [h, w, 4].
-    padding : int
-        At least 1 texel, which the fade to transparent at a billboard's rim needs.
-
-    Returns
-    -------
-    Atlas
-        Alpha is 0 outside the textures; transparent texels have the color of a neighbor (:func:`fill_cell`).
+    Each texture gets a cell that is at least ``padding`` >= 1 texels larger on every side, which the fade to transparent at a billboard's
+    rim needs. Cells are aligned to blocks of n x n texels, where n is the largest power of two up to ``padding`` (at least 4), so no texel
+    of a mip level up to log2(n) mixes two textures. Alpha is 0 outside the textures; transparent texels have the color of a neighbor
+    (:func:`fill_cell`).
     """
     sizes = np.array([texture.shape[1::-1] for texture in textures], dtype=np.int64)
     unit = max(BLOCK, 1 << (padding.bit_length() - 1))
@@ -46,12 +36,9 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
 
 
 def fill_cell(texture: NDArray[np.uint8], padding: int, width: int, height: int) -> NDArray[np.uint8]:
-    """Place a texture in its cell; transparent texels and the padding get their neighbors' color (:func:`~bbfit.images.bleed_color`).
+    """Place a texture in its cell, uint8 [height, width, 4], with its top-left texel at (``padding``, ``padding``).
 
-    Returns
-    -------
-    ndarray
-        uint8 [height, width, 4] with the texture's top-left texel at (``padding``, ``padding``); visible texels are unchanged.
+    Visible texels are unchanged; transparent texels and the padding get their neighbors' color (:func:`~bbfit.images.bleed_color`).
     """
     h, w = texture.shape[:2]
     cell = np.pad(texture, ((padding, height - h - padding), (padding, width - w - padding), (0, 0)))

@@ -14,17 +14,13 @@ from bbfit.images import to_bytes
 def cloud_cards(cloud: BillboardCloud, padding: int) -> Cards:
     """Rectangles and an atlas for which bilinear filtering gives the picture of :func:`~bbfit.rendering.dispatch.render`.
 
-    A billboard's picture fades to transparent over one texel beyond its outermost texel centers, so half a texel beyond its
-    rectangle. Each card is therefore half a texel larger than its rectangle on every side and reaches to the centers of the padding texels
-    around its texture. A two-sided billboard becomes two cards in the same place, front and back, of opposite winding.
+    A billboard's picture fades to transparent over one texel beyond its outermost texel centers, so half a texel beyond its rectangle. Each
+    card is therefore half a texel larger than its rectangle on every side and reaches to the centers of the padding texels around its
+    texture. A two-sided billboard becomes two cards in the same place, front and back, of opposite winding.
 
     Textures are rounded to 8 bits, which changes a premultiplied color by at most 1/255 per layer. Transparent texels get another color
-    (:func:`~bbfit.exporting.atlas.fill_cell`), which changes colors near the silhouette by at most 1/4 per layer, but no alpha.
-
-    Raises
-    ------
-    InputError
-        if the cloud is empty or has values that are not finite.
+    (:func:`~bbfit.exporting.atlas.fill_cell`), which changes colors near the silhouette by at most 1/4 per layer, but no alpha. Raises
+    InputError if the cloud is empty or has values that are not finite.
     """
     if len(cloud) == 0:
         fail("cloud", "has no billboards, so there is nothing to export", "fit it with at least one")

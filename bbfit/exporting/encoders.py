@@ -18,25 +18,16 @@ _WEBP_SIDE = 16383
 def encode_ktx2(levels: list[NDArray[np.uint8]]) -> bytes:
     """Encode mip levels as KTX 2.0 in Basis Universal's ETC1S with BasisLZ, for glTF's extension ``KHR_texture_basisu``.
 
+    The levels are straight-alpha display-referred sRGB, uint8 [h, w, 4] each. The sides of the first are multiples of 4. Each further level
+    has half the sides of the one before, rounded down, at least 1; the last need not be 1 x 1. Raises InputError for levels of other sizes,
+    or if the package alktx2 is missing. One release of alktx2 gives the same bytes for the same levels, with any number of threads.
+
     Graphics cards receive BC, ETC2 or ASTC blocks of one byte per texel. The encoder runs at the best quality of ETC1S. For three atlases
     of fitted trees of about 1000 x 1000 texels, the file with all levels has 22 to 29 % of the bytes of the first level's PNG. The
     premultiplied picture has 37.8 to 44.3 dB at that level, and 0.9 to 2.9 dB less at the next two. UASTC with Zstandard has 1.1 to 3.1 dB
-    more, in 53 to 61 % of that PNG; the error of either is far smaller than that of a fit. A texture's coverage at cutoff 0.5 changes by
-    at most 0.3 % at levels 0 to 2 and 1.6 % at level 3 where a quarter is covered, and by 0.4 % (3 % at levels 1 to 3) where 1 % is. An
-    atlas of 1856 x 1952 texels takes 29 s of one core.
-
-    One release of alktx2 gives the same bytes for the same levels, with any number of threads.
-
-    Parameters
-    ----------
-    levels : list of ndarray
-        Straight-alpha display-referred sRGB, uint8 [h, w, 4] each. The sides of the first are multiples of 4. Each further level has half
-        the sides of the one before, rounded down, at least 1; the last need not be 1 x 1.
-
-    Raises
-    ------
-    InputError
-        if the package alktx2 is missing, or for levels of other sizes.
+    more, in 53 to 61 % of that PNG; the error of either is far smaller than that of a fit. A texture's coverage at cutoff 0.5 changes by at
+    most 0.3 % at levels 0 to 2 and 1.6 % at level 3 where a quarter is covered, and by 0.4 % (3 % at levels 1 to 3) where 1 % is. An atlas
+    of 1856 x 1952 texels takes 29 s of one core.
     """
     if missing := ktx2_missing():
         fail("KTX2", "the package alktx2 is not installed", missing)
@@ -56,17 +47,8 @@ def encode_ktx2(levels: list[NDArray[np.uint8]]) -> bytes:
 def encode_webp(image: NDArray[np.uint8], lossless: bool = True) -> bytes:
     """Encode straight RGBA, uint8 [h, w, 4], as WebP; transparent texels keep their color, because filtering uses it.
 
-    Parameters
-    ----------
-    image : ndarray
-        At most 16,383 texels per side.
-    lossless : bool
-        Keep each texel. Otherwise alpha is exact, and color has quality 90 of 100 at half its resolution.
-
-    Raises
-    ------
-    InputError
-        for a larger picture.
+    ``lossless`` keeps each texel. Otherwise alpha is exact, and color has quality 90 of 100 at half its resolution. Raises InputError for a
+    picture of more than 16,383 texels per side.
     """
     from PIL import Image
 

@@ -64,32 +64,19 @@ def shown_cells(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], least
 
 
 def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
-    """Replace each card by a small convex polygon around its visible part.
+    """Replace each card by a convex polygon around its visible part with at most ``vertices`` >= 4 corners.
 
-    The polygon contains each point of the card where the bilinearly filtered alpha reaches ``least``, and lies inside the card. Its sides
-    touch the convex hull of the visible part. It is the smallest of all such polygons whose sides have one of about 130 directions and
-    whose corners lie in the card. Areas add up corner by corner, so the search is for a shortest cycle (after Aggarwal, Chang and Yap
-    1985, "Minimum area circumscribing polygons"). More vertices never give a larger polygon.
+    The polygon contains each point of the card where the bilinearly filtered alpha reaches ``least``, and lies inside the card. ``least``,
+    in [0, 1], is the cutoff of MASK, or 0 for any alpha above 0, as BLEND shows it. The visible part is larger in
+    mip levels: there the polygon may cut off up to half a texel of the level in use.
 
-    The visible part is larger in mip levels than in the texture: the polygon may cut off up to half a texel of the level in use.
+    The polygon's sides touch the convex hull of the visible part. It is the smallest of all such polygons whose sides have one of about 130
+    directions and whose corners lie in the card. Areas add up corner by corner, so the search is for a shortest cycle (after Aggarwal,
+    Chang and Yap 1985, "Minimum area circumscribing polygons"). More vertices never give a larger polygon.
 
-    Parameters
-    ----------
-    vertices : int
-        Most corners of a polygon, at least 4. A card with no more corners stays as it is if no smaller polygon exists.
-    least : float
-        Least visible alpha, in [0, 1]: the cutoff of MASK, or 0 for any alpha above 0, as BLEND shows it.
-
-    Returns
-    -------
-    Cards
-        The same number of cards in the same order, with the same normals, winding, textures and origins. A card with no visible part
-        shrinks to about one texel around its center.
-
-    Raises
-    ------
-    InputError
-        if ``vertices`` or ``least`` is out of range.
+    Cards keep their order, normals, winding, textures and origins. A card with no more than ``vertices`` corners stays as it is if no
+    smaller polygon exists; one with no visible part shrinks to about one texel around its center. Raises InputError if an argument is out
+    of range.
     """
     check_count("hull vertices", vertices, 4)
     check_range("least alpha", least, 0, 1)
@@ -120,17 +107,9 @@ def with_texel_corners(cards: Cards, card: Card, polygon: NDArray[np.float64]) -
 
 
 def overdraw(cards: Cards, least: float) -> float:
-    """Share of the cards' area in texels that is shaded although nothing is visible there, in [0, 1].
+    """Share of the cards' area in texels, in [0, 1], that is shaded although nothing is visible there.
 
-    Parameters
-    ----------
-    least : float
-        As in :func:`with_hulls`.
-
-    Raises
-    ------
-    InputError
-        if ``least`` is out of range.
+    ``least``, in [0, 1], is as in :func:`with_hulls`; InputError if it is out of range.
     """
     check_range("least alpha", least, 0, 1)
     shaded = shown = 0.0

@@ -45,19 +45,14 @@ class LodLevel:
 
 
 def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel]) -> bytes:
-    """Join models into one GLB whose first node lists the others as its coarser levels.
+    """Join GLB models, the finest first, into one GLB whose first node lists the others as its coarser levels; ``levels`` describes them.
+
+    The first model may be any file that :func:`is_self_contained` accepts, and keeps its items and their indices. The others are those of
+    :func:`~bbfit.exporting.gltf.glb_bytes`.
 
     The scene holds only the first level, under a new node; programs without MSFT_lod show only this level. As the extension requires, the
     nodes of the other levels are outside the scene. The ``extras`` of the first level's node hold the smallest screen coverage of each
     level (``MSFT_screencoverage``) and its smallest distance in meters (``lod_distances``).
-
-    Parameters
-    ----------
-    models : sequence of bytes
-        GLB files, the finest first. The first may be any file that :func:`is_self_contained` accepts, and keeps its items and their
-        indices; :func:`~bbfit.exporting.gltf.glb_bytes` wrote the others.
-    levels : sequence of LodLevel
-        One for each model.
     """
     assert len(models) == len(levels) > 0
     tree, views = split_glb(models[0])
@@ -80,12 +75,9 @@ def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel]) -> bytes:
 
 
 def is_self_contained(path: Path) -> bool:
-    """Whether a file is a GLB of glTF 2.0 with all of its data in its one binary chunk, so that others can be joined to it.
+    """Whether a file is a GLB of glTF 2.0 with all its data in its one binary chunk, so that others can be joined to it.
 
-    Raises
-    ------
-    InputError
-        If the file is a damaged GLB.
+    Raises InputError if the file is a damaged GLB.
     """
     data = path.read_bytes()
     if not is_glb(data):

@@ -96,31 +96,14 @@ def _around(cards: Cards) -> Camera:
 def matched_chain(cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Camera) -> list[NDArray[np.uint8]]:
     """Scale the alpha of each mip level such that the cards cover as much of the picture from afar as with level 0.
 
+    ``chain`` holds the levels of :func:`~bbfit.exporting.mips.mip_chain`, with the cutoff if there is one. ``cards`` are in the alpha mode
+    in which they are shown; blend and hash get the same levels, because a hash covers as much as a blend on average. ``cameras`` are views
+    of the tree other than those of the evaluation: about twenty from all around are enough and take a few seconds, four are too few. Raises
+    InputError if none of them sees a card.
+
     For each level there is a distance at which half of the cards' pixels use this or coarser levels. Coverage is measured as seen from
     there, in all views together; the pictures have more pixels than at that distance, so that single pixels matter less. Bisection gives
-    the level's factor. Level 0 stays as it was fitted. Alpha is clipped at 1; colors do not change.
-
-    The modes blend and hash get the same levels, because a hash covers as much as a blend on average.
-
-    About twenty views from all around are enough and take a few seconds; four are too few.
-
-    Parameters
-    ----------
-    cards : Cards
-        In the alpha mode in which they are shown.
-    chain : sequence of ndarray
-        Their mip levels, level 0 first (:func:`~bbfit.exporting.mips.mip_chain`, with the cutoff if there is one).
-    cameras : Camera
-        V views of the tree, other than those of the evaluation.
-
-    Returns
-    -------
-    As many levels; level 0 is the same array.
-
-    Raises
-    ------
-    InputError
-        if the cards show in no view.
+    the level's factor. Level 0 stays the same array. Alpha is clipped at 1; colors do not change.
     """
     cameras = cameras.batch()
     joined(chain, cards.atlas.image.shape)  # for its checks

@@ -27,36 +27,20 @@ _WHOLE = np.array([[[0.0, 0.0], [1.0, 1.0]]])
 
 
 def mip_chain(atlas: Atlas, cutoff: float | None) -> list[NDArray[np.uint8]]:
-    """The mip levels of an atlas, from its own size to 1 x 1 texel.
+    """The mip levels of an atlas, from its own array to 1 x 1 texel: straight-alpha display-referred RGBA, uint8 [h, w, 4] each.
 
     Each side is half that of the level before, rounded down, at least 1, as in KTX 2.0 and graphics interfaces. Each texel is the mean, by
     area, of the part of the atlas that it covers. Colors are averaged in linear light with alpha as weight; a texel that covers nothing
     visible gets the plain mean of the colors there, which in an :class:`Atlas` are those of visible neighbors. Alpha is averaged directly.
 
-    With a cutoff, the alpha of each texture is then multiplied at each level by the factor that restores its coverage in the atlas
-    (Castano 2010; :func:`coverage`), and clipped at 1. A texel of two textures belongs to the one that has more of it. If a texture has no
-    texel at a level, there is one factor for the whole picture.
+    ``cutoff`` is the least alpha that is drawn, in (0, 1] (InputError otherwise); with None, for blending, alpha stays the mean. With a
+    cutoff, the alpha of each texture is multiplied at each level by the factor that restores its coverage in the atlas (Castano 2010;
+    :func:`coverage`), and clipped at 1. A texel of two textures belongs to the one that has more of it. If a texture has no texel at a
+    level, there is one factor for the whole picture.
 
     Measured at levels 1 to 4, relative to level 0, for textures of about 230 x 250 texels with coverages of 0.8, 0.5 and 0.1: leaves with
-    soft rims keep their coverage within 0.1 %, random single opaque texels, which have few values of alpha, within 2.6 %. With more than
-    8 x 8 samples these errors are 2.1 % and, at cutoff 0.5, 5.5 %. Fitted trees with coverages of 1 to 32 % keep it within 0.2 %.
-
-    Parameters
-    ----------
-    atlas : Atlas
-        Its picture is level 0.
-    cutoff : float
-        Least alpha that is drawn, in (0, 1]; None for blending, where alpha stays the mean.
-
-    Returns
-    -------
-    list of ndarray
-        Straight-alpha display-referred RGBA, uint8 [h, w, 4] each; level 0 is the atlas's own array.
-
-    Raises
-    ------
-    InputError
-        for a cutoff out of range.
+    soft rims keep their coverage within 0.1 %, random single opaque texels, which have few values of alpha, within 2.6 %. With more
+    than 8 x 8 samples these errors are 2.1 % and, at cutoff 0.5, 5.5 %. Fitted trees with coverages of 1 to 32 % keep it within 0.2 %.
     """
     if cutoff is not None:
         check_range("cutoff", cutoff, 0, 1, open_low=True)
@@ -86,19 +70,11 @@ def mip_chain(atlas: Atlas, cutoff: float | None) -> list[NDArray[np.uint8]]:
 
 
 def coverage(alpha: NDArray[np.uint8], cutoff: float, rectangle: NDArray[np.floating]) -> float:
-    """Share of a rectangle in which bilinearly filtered alpha reaches a cutoff, in [0, 1].
+    """Share of a rectangle in which bilinearly filtered alpha, uint8 [h, w], reaches a cutoff in (0, 1].
 
-    Alpha is sampled at 8 x 8 points per texel (Castano 2010: 4 x 4), clamped to the edge of the picture. If no point lies in the rectangle,
-    the first point after its top-left corner is used.
-
-    Parameters
-    ----------
-    alpha : ndarray
-        uint8 [h, w].
-    cutoff : float
-        Least alpha that counts, in (0, 1].
-    rectangle : ndarray
-        [[left, top], [right, bottom]] as shares of the picture's width and height, which are the same at all mip levels.
+    ``rectangle`` is [[left, top], [right, bottom]] as shares of the picture's width and height, which are the same at all mip levels. Alpha
+    is sampled at 8 x 8 points per texel (Castano 2010: 4 x 4), clamped to the edge of the picture. If no point lies in the rectangle, the
+    first point after its top-left corner is used.
     """
     sides = np.array(alpha.shape[1::-1])
     first, last = np.ceil(rectangle * _POINTS * sides - 0.5).astype(np.int64)

@@ -30,12 +30,8 @@ from bbfit.rendering.dispatch import render
 class ShippedModel:
     """A billboard cloud with the export options of its files; make one with :func:`shipped_model`.
 
-    The polygons and the GLB are computed when they are first used, and kept.
-
-    Raises
-    ------
-    InputError
-        when the polygons are computed, if the cloud is empty or has values that are not finite.
+    The polygons and the GLB are computed when they are first used, and kept. That raises InputError if the cloud is empty or has values
+    that are not finite.
     """
 
     cloud: BillboardCloud
@@ -97,15 +93,9 @@ class ShippedModel:
 
 
 def shipped_model(cloud: BillboardCloud, config: ExportConfig | None = None, halvings: int = 0) -> ShippedModel:
-    """The model that the exported files of a billboard cloud contain.
+    """The model in the exported files of a billboard cloud; an alpha mode or cutoff that ``config`` leaves open is the cloud's own.
 
-    Parameters
-    ----------
-    cloud : BillboardCloud
-    config : ExportConfig
-        The export options. An alpha mode or cutoff that they leave open is the cloud's own.
-    halvings : int
-        How many times the sides of the textures are halved, for a model that is only seen from afar.
+    ``halvings`` halves the sides of the textures that many times, for a model that is only seen from afar.
     """
     resolved = (config or ExportConfig()).resolve()
     alpha = AlphaMode(resolved.alpha or cloud.alpha.kind, resolved.alpha_cutoff or cloud.alpha.cutoff)

@@ -55,21 +55,13 @@ def card_origins(cards: Cards) -> NDArray[np.float64]:
 def misordered(cards: Cards, cameras: Camera | None = None) -> Misordered:
     """Measure the error of a picture whose cards are drawn one after another, from back to front by their origins.
 
+    The shares are those of what all cameras see; each camera has the same weight at any distance. Cameras are pinholes, of which only the
+    positions and viewing directions are used, because their pictures are framed around the cards; by default they are those of
+    :func:`~bbfit.exporting.visibility.check_rig`. A card without an origin is sorted by the center of its bounds.
+
     The true order of a pixel is that of the depths along its ray; layers whose depths differ by less than a relative 1e-5 are right in
-    either order. A pair of layers in the wrong order counts with the share of the pixel in which these two are the first two opaque
-    layers, if alpha is the probability of being opaque: for two layers, the product of their alphas. A card without an origin is sorted
-    by the center of its bounds.
-
-    Parameters
-    ----------
-    cameras : Camera
-        Pinhole cameras, of which the positions and viewing directions are used; their pictures are framed around the cards. By default
-        those of :func:`~bbfit.exporting.visibility.check_rig`.
-
-    Returns
-    -------
-    Misordered
-        Shares of what all cameras see; each camera has the same weight at any distance.
+    either order. A pair of layers in the wrong order counts with the share of the pixel in which these two are the first two opaque layers,
+    if alpha is the probability of being opaque: for two layers, the product of their alphas.
     """
     if cameras is None:
         rig = check_rig(cards)
@@ -96,20 +88,12 @@ def fit_origins(
 ) -> NDArray[np.float64]:
     """Fit the origins of P cards, [P, 3], such that sorting by depth and sorting by distance both give the order along the rays.
 
-    L-BFGS (Byrd et al. 1995) minimizes the wrong share from the best of some starts. Sigmoids of decreasing softness replace the step
+    ``card`` is the card of each hit, [H] (:func:`~bbfit.exporting.visibility.visible_cards`). ``middles`` holds the centers of the cards,
+    and ``starts`` one or more guesses of the origins, [P, 3] each. ``scale`` is the tree's radius. All are in meters.
+
+    L-BFGS (Byrd et al. 1995) minimizes the wrong share from the best of the starts. Sigmoids of decreasing softness replace the step
     between right and wrong. A penalty keeps origins near the centers of their cards, so that bounds centered on them stay small. The best
     of the starts and of the results of each softness is returned.
-
-    Parameters
-    ----------
-    card : ndarray
-        The card of each hit, [H], from :func:`~bbfit.exporting.visibility.visible_cards`.
-    middles : ndarray
-        The centers of the cards in meters, [P, 3].
-    starts : list of ndarray
-        At least one, [P, 3] each.
-    scale : float
-        The tree's radius in meters.
     """
     from scipy.optimize import minimize
     from scipy.special import expit

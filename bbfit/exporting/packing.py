@@ -1,7 +1,8 @@
 """Rectangles packed by xatlas, in a process of its own.
 
-When xatlas (0.0.11) is torn down it tells its threads to end without taking their lock; one that is just about to wait never hears of
-it, and the caller waits for it forever: on a busy machine once in some thousand times. This process ends without tearing anything down.
+When xatlas (0.0.11) shuts down, it signals its threads to end without holding their lock. A thread that is about to wait misses the signal,
+and the caller waits for it forever: on a busy machine about once in some thousand times. This process therefore exits without shutting
+xatlas down.
 """
 
 from __future__ import annotations
@@ -18,10 +19,7 @@ from numpy.typing import NDArray
 def packed(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """Non-overlapping places, int64 [R, 2] from 0 on, for rectangles of given whole widths and heights (at least 2), int64 [R, 2].
 
-    Raises
-    ------
-    CalledProcessError
-        if the process fails; what it printed has gone to this process's standard error.
+    Raises CalledProcessError if the process fails; its messages go to this process's standard error.
     """
     # It finds its modules wherever this process does.
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

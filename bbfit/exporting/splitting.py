@@ -24,32 +24,19 @@ _PARTNERS, _BEYOND = 4, 0.02
 def split(cards: Cards, wrong: float = 1e-3, most: int = 200) -> Cards:
     """Split cards and give each piece an origin, such that sorting the origins by depth or by distance gives the right order.
 
+    ``wrong``, in [0, 1], is the accepted share of the visible picture: the mean of sorting by depth and by distance. Splitting also ends at
+    ``most`` >= 1 pieces; cards are never joined, so more cards than this stay as they are. InputError if either is out of range.
+    Neighboring pieces of one card share no vertices.
+
     Two flat convex pieces have an order from every camera if neither passes through the other, so for one pair it is enough to split one
     piece along the other's plane (Fuchs, Kedem and Naylor 1980, "On visible surface generation by a priori tree structures"). But one
-    origin per piece must serve all pairs and all cameras (:func:`~bbfit.exporting.node_order.fit_origins`), which needs more splits. On
-    the other hand, pieces may cross where almost nothing is visible.
+    origin per piece must serve all pairs and all cameras (:func:`~bbfit.exporting.node_order.fit_origins`), which needs more splits. On the
+    other hand, pieces may cross where almost nothing is visible.
 
     The algorithm therefore splits where the picture is wrong. It fits the origins, takes the pieces with the largest wrong share, and
     splits those that gain most, along the plane of a partner or across their length. It repeats this until the wrong share is at most
     ``wrong``, both with the cameras of the fit and with others (:func:`~bbfit.exporting.node_order.misordered`). Fully transparent pieces
     are dropped. Four planes through one axis become eight half planes.
-
-    Parameters
-    ----------
-    wrong : float
-        Accepted share of the visible picture, in [0, 1]: the mean of sorting by depth and by distance.
-    most : int
-        Number of pieces at which splitting ends, at least 1. Cards are never joined, so more cards than this stay as they are.
-
-    Returns
-    -------
-    Cards
-        The pieces, each with an origin. Neighboring pieces of one card share no vertices.
-
-    Raises
-    ------
-    InputError
-        if an argument is out of range.
     """
     check_range("wrong share", wrong, 0, 1)
     check_count("most pieces", most)

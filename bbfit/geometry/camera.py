@@ -1,14 +1,13 @@
-"""Cameras, and the conventions that hold everywhere in bbfit.
+"""Cameras, and the conventions of all of bbfit.
 
 World
-    Right-handed, Y up, meters, as glTF.
+    Right-handed, Y up, meters, as in glTF.
 Camera axes
-    +X right, +Y down, +Z forward, as OpenCV and kornia.
+    +X right, +Y down, +Z forward, as in OpenCV and kornia.
 Pixels
     (0, 0) is the *center* of the top-left pixel, in images and textures alike.
 
-The Z-up worlds of Blender and of the NeRF-synthetic layout are converted at the border, by :func:`camera_from_nerf` and
-:func:`camera_to_nerf`.
+Only :func:`camera_from_nerf` and :func:`camera_to_nerf` convert to and from the Z-up worlds of Blender and of the NeRF-synthetic layout.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from torch import Tensor
 
 from bbfit.checks import check_count, check_shape, fail
 
-# A viewing direction whose horizontal part is shorter than this counts as straight up or down.
+# Viewing directions with a shorter horizontal part count as straight up or down.
 VERTICAL = 1e-6
-# (x, y, z) of a Z-up world -> (x, z, -y) of ours.
+# (x, y, z) of a Z-up world -> (x, z, -y) of bbfit's.
 Z_UP_TO_Y_UP: tuple[tuple[float, ...], ...] = ((1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))
 
 
@@ -32,7 +31,7 @@ Z_UP_TO_Y_UP: tuple[tuple[float, ...], ...] = ((1, 0, 0, 0), (0, 0, 1, 0), (0, -
 class Camera:
     """One camera, or a batch of V cameras that share an image size.
 
-    Indexing a batch with an integer gives one camera (no leading dimension), with anything else a smaller batch.
+    An integer index into a batch gives one camera (no leading dimension), any other index a smaller batch.
     """
 
     world_to_camera: Tensor
@@ -81,7 +80,7 @@ class Camera:
         return Camera(self.world_to_camera.to(target), self.intrinsics.to(target), self.width, self.height, self.orthographic)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same cameras with a picture of ``width`` x ``height`` pixels that covers the same field of view."""
+        """The same cameras with pictures of ``width`` x ``height`` pixels of the same field of view."""
         scale = torch.tensor([width / self.width, height / self.height], dtype=self.intrinsics.dtype, device=self.intrinsics.device)
         intrinsics = self.intrinsics.clone()
         intrinsics[..., :2, :] *= scale[:, None]
@@ -145,8 +144,8 @@ class Camera:
 def pinhole_intrinsics(fov_x_degrees: float, width: int, height: int) -> Tensor:
     """Intrinsics of a pinhole with square pixels and a centered principal point, [3, 3] float64.
 
-    The field of view spans pixel *edges*, as in Blender and in the NeRF-synthetic layout, so the principal point in our center-based
-    coordinates is ((width - 1) / 2, (height - 1) / 2).
+    The field of view spans pixel *edges*, as in Blender and in the NeRF-synthetic layout. The principal point, which is relative to pixel
+    centers, is therefore ((width - 1) / 2, (height - 1) / 2).
     """
     focal = 0.5 * width / math.tan(math.radians(fov_x_degrees) / 2)
     return _intrinsics(focal, width, height)
@@ -181,9 +180,9 @@ def look_at(position: Tensor, target: Tensor) -> Tensor:
 
 
 def camera_from_nerf(camera_to_world: Tensor) -> Tensor:
-    """World-to-camera transforms in our conventions from camera-to-world matrices of the NeRF-synthetic layout.
+    """World-to-camera transforms in bbfit's conventions from camera-to-world matrices of the NeRF-synthetic layout, both [V, 4, 4].
 
-    The layout's world is Z up, its cameras look along -Z with +Y up (OpenGL). [V, 4, 4] -> [V, 4, 4].
+    The layout's world is Z up; its cameras look along -Z with +Y up (OpenGL).
     """
     axes = torch.tensor(Z_UP_TO_Y_UP, dtype=camera_to_world.dtype, device=camera_to_world.device)
     ours = axes @ camera_to_world @ _flip_yz(camera_to_world)
@@ -191,7 +190,7 @@ def camera_from_nerf(camera_to_world: Tensor) -> Tensor:
 
 
 def camera_to_nerf(world_to_camera: Tensor) -> Tensor:
-    """The inverse of :func:`camera_from_nerf`. [V, 4, 4] -> [V, 4, 4]."""
+    """The inverse of :func:`camera_from_nerf`, [V, 4, 4] -> [V, 4, 4]."""
     axes = torch.tensor(Z_UP_TO_Y_UP, dtype=world_to_camera.dtype, device=world_to_camera.device)
     return axes.mT @ torch.linalg.inv(world_to_camera) @ _flip_yz(world_to_camera)
 
@@ -201,7 +200,7 @@ def _flip_yz(like: Tensor) -> Tensor:
 
 
 def convergence_point(camera: Camera) -> Tensor:
-    """The point nearest to all optical axes in the least-squares sense, [3]: what a ring of cameras looks at.
+    """The point nearest to all optical axes in the least-squares sense, [3]: the target of a ring of cameras.
 
     Raises ``InputError`` if the axes are parallel, so that no such point is determined.
     """

@@ -1,4 +1,4 @@
-"""The billboard cloud: N textured rectangles in space, as a struct of arrays, saved to and loaded from one file."""
+"""The billboard cloud: N textured rectangles in space, as a struct of arrays, stored in one file."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class BillboardCloud:
     """N textured rectangles (Décoret et al. 2003, "Billboard Clouds for Extreme Model Simplification").
 
     The front of a billboard is the side that its normal, ``right x up``, points to. A one-sided entry shows the same texture from both
-    sides. A two-sided entry owns two textures, each drawn only when the camera is on its side; both are stored as seen from the front,
-    so that equal texels of both lie at the same point in space.
+    sides. A two-sided entry has two textures, each drawn only when the camera is on its side. Both are stored as seen from the front,
+    so equal texels of both are at the same point in space.
 
     Texture row 0 is at the top. The rectangle spans the texels' outer *edges*; beyond the outermost texel centers the picture fades
     to transparent over one texel, exactly as bilinear filtering does in an atlas with a transparent margin.
@@ -34,7 +34,7 @@ class BillboardCloud:
     centers: Tensor
     """Rectangle centers in meters, [N, 3]."""
     rights: Tensor
-    """Unit vectors along texture columns' index (to the right), [N, 3]."""
+    """Unit vectors from texture left to right, [N, 3]."""
     ups: Tensor
     """Unit vectors from texture bottom to top, perpendicular to ``rights``, [N, 3]."""
     half_extents: Tensor
@@ -46,7 +46,7 @@ class BillboardCloud:
     texels: Tensor
     """Straight-alpha display-referred RGBA in [0, 1], [P, 4]: per billboard its front texture row by row, then its back texture if any."""
     alpha: AlphaMode = field(default_factory=AlphaMode)
-    """How alpha is to be understood, in renders, scores and exports alike."""
+    """The alpha mode of renders, scores and exports."""
 
     def __post_init__(self) -> None:
         check_shape("centers", tuple(self.centers.shape), (None, 3))
@@ -76,12 +76,12 @@ class BillboardCloud:
 
     @property
     def vertex_count(self) -> int:
-        """Vertices of the exported mesh: four a quad, two quads for a two-sided billboard."""
+        """Vertices of the exported mesh: four per quad, two quads for a two-sided billboard."""
         return 4 * (len(self) + int(self.two_sided.sum()))
 
     @property
     def texel_density(self) -> float:
-        """Texels a meter along a side, of all textures together; 0 without any."""
+        """Texels per meter along a side, of all textures together; 0 for an empty cloud."""
         area = float((4 * self.half_extents.prod(-1) * (1 + self.two_sided.long())).sum())
         return math.sqrt(len(self.texels) / area) if len(self) else 0.0
 
@@ -131,7 +131,7 @@ class BillboardCloud:
 
         tensors = {name: getattr(self, name).detach().cpu().clone(memory_format=torch.contiguous_format) for name in TENSORS}
         alpha = json.dumps({"kind": self.alpha.kind, "cutoff": self.alpha.cutoff})
-        write_tensors(path, tensors, {"format": f"{FORMAT} {alpha}"})  # in one entry: several would come in any order
+        write_tensors(path, tensors, {"format": f"{FORMAT} {alpha}"})  # in one entry, because the order of several is not defined
 
     @staticmethod
     def load(path: str | Path) -> BillboardCloud:

@@ -1,4 +1,4 @@
-"""Charts of a run as SVG, in colors that the page they stand on decides, so that they read in light and in dark."""
+"""Charts of a run as SVG. The page decides the colors, so the charts are readable on light and on dark pages."""
 
 from __future__ import annotations
 
@@ -20,38 +20,36 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# What is drawn in these colors takes the page's custom property of that name.
+# Each color in a figure is replaced by the page's custom property.
 _THEME = {"#000001": "--ink", "#70767e": "--faint", "#e4e7ea": "--grid", "#1f5f8b": "--accent", "#a9c6da": "--soft", "#c8501e": "--worst"}
 _INK, _FAINT, _GRID, _ACCENT, _SOFT, _WORST = _THEME
-# Inches of 72 units of the SVG: the width of a phone, so that nothing shrinks there.
+# Width in inches, of 72 units of the SVG each: that of a phone, so that pages on phones do not shrink the charts.
 _WIDTH = 5.4
 
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart and where things are on it."""
+    """A chart and the places of its marks."""
 
     svg: str
     """An ``<svg>`` element with custom properties in place of colors; all of its ids begin with the chart's name."""
     marks: Mapping[str, float]
-    """Numbers that a script needs to move what is marked, in the SVG's units."""
+    """Positions and lengths in the SVG's units, with which a script moves the marks."""
 
 
 MEASURES = (("psnr", "PSNR, dB", max), ("ssim", "SSIM", max), ("flip", "FLIP", min))
-"""What views are compared by over white: the name, what it is called, and which of two values is the better."""
-
-
-# Middling hues that stand out from white and from black.
+"""Measures over white: name, title, and the function that gives the better of two values."""
+# Hues of medium lightness, which contrast with white and with black.
 _HUES = ("#3b82c4", "#d9702b", "#3f9e4d", "#c94f4f", "#8f6bc1", "#a06a4e", "#d066a8", "#7d8590", "#a3a21f", "#2aa6b5")
 
 
 def billboard_color(index: int) -> str:
-    """The color that a billboard has wherever it is drawn; after ten they come round."""
+    """The color of a billboard in all pictures; after ten billboards the colors repeat."""
     return _HUES[index % len(_HUES)]
 
 
 def worst_views(views: Sequence[ViewScore]) -> dict[str, int]:
-    """Which view is the worst by each of :data:`MEASURES`."""
+    """The index of the worst view by each of :data:`MEASURES`."""
     worst = {}
     for name, _, better in MEASURES:
         values = [float(getattr(view.measures.over_white, name)) for view in views]
@@ -60,11 +58,11 @@ def worst_views(views: Sequence[ViewScore]) -> dict[str, int]:
 
 
 def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
-    """PSNR, SSIM and FLIP over white of every view against the azimuth that it looks from, the worst of each marked.
+    """PSNR, SSIM and FLIP over white of every view against its azimuth, with the worst view of each measure marked.
 
-    A point's id is ``azimuth-MEASURE-NUMBER`` with the view's place in ``views``. Lines join views of one elevation, which stands at their
-    end if there are several; where there are many there are no lines. ``azimuth-cursor-MEASURE`` is a line at 0 degrees, and the mark
-    ``degree`` how far right one degree is.
+    The id of a point is ``azimuth-MEASURE-INDEX``, with the view's index in ``views``. Lines join views of one elevation, which is written
+    at their end if there are several elevations; with fewer than four views per elevation on average there are no lines.
+    ``azimuth-cursor-MEASURE`` is a line at 0 degrees, and the mark ``degree`` is the width of one degree. Raises InputError without views.
     """
     if not views:
         fail("views", "there is none to draw")
@@ -80,7 +78,7 @@ def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
         axes.axvline(0, color=_FAINT, linewidth=1, gid=f"cursor-{name}")
         if len(rings) <= len(views) / 4:
             for elevation, ring in rings.items():
-                # A turn is closed: the line goes on beyond both ends.
+                # The circle is closed: the line continues beyond both ends.
                 around = [*((angles[i] - 360, values[i]) for i in ring[-1:]), *((angles[i], values[i]) for i in ring)]
                 around += [(angles[i] + 360, values[i]) for i in ring[:1]]
                 axes.plot(*zip(*around, strict=True), color=_SOFT, linewidth=1.5)
@@ -112,10 +110,10 @@ def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
 
 
 def plan_chart(cloud: BillboardCloud) -> Chart:
-    """Where billboards stand, seen from above with azimuth 0 at the bottom: each one's rectangle, numbered from 1, in meters.
+    """The rectangles of the billboards from above, numbered from 1, in meters, with azimuth 0 at the bottom.
 
-    Lower edges are thick; upright billboards are lines. ``plan-eye`` is a camera at azimuth 0; the marks ``x`` and ``y`` are the center
-    that it turns about.
+    Lower edges are thick; upright billboards are lines. ``plan-eye`` is a camera at azimuth 0. It orbits the center, at the marks ``x`` and
+    ``y``.
     """
     from matplotlib.patches import Polygon
 
@@ -129,7 +127,7 @@ def plan_chart(cloud: BillboardCloud) -> Chart:
         axes.add_patch(Polygon(flat, facecolor=color, edgecolor=color, linewidth=1, alpha=0.22))
         lowest = np.argsort(quad[:, 1], kind="stable")[:2]
         axes.plot(*flat[lowest].T, color=color, linewidth=2.6, solid_capstyle="round")
-        # The number stands at the end of the lower edge that is farther out, where lines do not cross.
+        # The number is at the outer end of the lower edge, where lines do not cross.
         ends = flat[lowest] - middle[[0, 2]]
         end = ends[np.linalg.norm(ends, axis=-1).argmax()]
         x, z = middle[[0, 2]] + end * (1 + 0.09 * reach / max(float(np.linalg.norm(end)), 1e-9))
@@ -198,7 +196,7 @@ def _plain(axes: Axes) -> None:
 
 
 def _svg(figure: Figure, name: str) -> str:
-    """The figure as an element for a page: no colors of its own, text as text, ids that begin with ``name``."""
+    """The figure as an element for a page: colors as custom properties, text as text, ids that begin with ``name``."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 

@@ -17,7 +17,7 @@ from bbfit.evaluation.report import Measures, measures_from_json
 from bbfit.evaluation.scoring import OriginalTree, view_angles
 from bbfit.files import write_bytes
 from bbfit.images import encode_png, over_color, premultiply, read_rgba, to_bytes
-from bbfit.reporting.plots import FAINT, INK, PAPER, picture_font, spread_views
+from bbfit.reporting.plots import FAINT, INK, PAPER, picture_font, spread_views, write_figure
 from bbfit.reporting.sweep_tables import markdown
 from bbfit.views import ViewSet
 
@@ -107,7 +107,7 @@ def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
     drawn = [row for row in rows if row.measures is not None]
     if not drawn:
         return
-    figure = Figure(figsize=(13, 8.5), layout="constrained")
+    figure = Figure(figsize=(13, 8.5), dpi=110, layout="constrained")
     axes = figure.subplots(2, 2, sharex="col", sharey="row")
     for line, name in enumerate(("PSNR over white, dB", "FLIP, lower is better")):
         for column, cost in enumerate(("bytes", "vertices")):
@@ -125,18 +125,13 @@ def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
                 axis.set_xlabel(cost)
         axes[line][0].set_ylabel(name)
     figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=110)
-    write_bytes(path, data.getvalue())
+    write_figure(figure, path)
 
 
 def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) -> None:
     """Write ``systems.png``: one held-out view over white, and the picture of each system that was drawn.
 
-    Parameters
-    ----------
-    folder : Path
-        Holds a folder for each system, with its pictures in ``held_out`` under the views' names.
+    ``folder`` holds a folder for each system, with its pictures in ``held_out`` under the views' names.
     """
     from PIL import Image, ImageDraw
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from bbfit.evaluation import metrics
-from bbfit.evaluation.report import Cost, Report, ViewScore
+from bbfit.evaluation.report import Report, ViewScore
 from bbfit.evaluation.scoring import held_out
 from bbfit.evaluation.sizes import shrunk
 from bbfit.exporting.encoders import encode_webp
@@ -53,28 +53,14 @@ class RunFacts:
 
 
 def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunFacts, glb: bytes) -> str:
-    """The report as HTML. The page loads nothing from elsewhere, and names that users chose are escaped.
+    """The report on V held-out ``views`` as HTML. The page loads nothing from elsewhere, and names that users chose are escaped.
 
     It shows the key figures beside the original's, held-out views (target, result, FLIP map) with a slider, every measure by azimuth with
-    the worst views, the model in 3D, textures and a plan of the billboards, the quality from a distance, the loss, and the options.
+    the worst views, the model in 3D, textures and a plan of the billboards, the quality from a distance, the loss, and the options. Of the
+    views it shows the worst ones and at most 36 others, no wider than 512 pixels.
 
-    Parameters
-    ----------
-    report
-        The scores of ``model`` on ``views``.
-    model
-        The billboards as they are exported.
-    views
-        V held-out views. The page shows the worst ones and at most 36 others, no wider than 512 pixels.
-    facts
-        What the page shows of the run besides its result.
-    glb
-        The model for the 3D view as a GLB file, with pictures that browsers read (PNG or WebP).
-
-    Raises
-    ------
-    InputError
-        If a view cannot be read, or if there are none.
+    ``glb`` is the model for the 3D view, with pictures that browsers read (PNG or WebP). Raises InputError if a view cannot be read, or if
+    there are none.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
@@ -110,7 +96,7 @@ def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunF
         glb=base64.b64encode(glb).decode(),
         bounds=shown_bounds(cloud, spared=0.005).tolist(),
         layered=layered,
-        costs=_costs(report),
+        costs=[("vertices", report.vertices), ("file, bytes", report.bytes)],
         facts=facts,
         changed=_changed(facts),
         pareto=None if facts.pareto is None else _data("image/png", facts.pareto),
@@ -178,10 +164,6 @@ def _billboards(cloud: BillboardCloud) -> list[dict[str, Any]]:
             }
         )
     return described
-
-
-def _costs(report: Report) -> list[tuple[str, Cost]]:
-    return [("vertices", report.vertices), ("file, bytes", report.bytes)]
 
 
 def _changed(facts: RunFacts) -> list[tuple[str, Any]]:

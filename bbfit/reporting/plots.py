@@ -23,6 +23,7 @@ from bbfit.views import ViewSet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
@@ -33,22 +34,12 @@ _CELL_LEAST = 220  # pixels, for the text under a small picture
 
 
 def comparison_picture(model: ShippedModel, views: ViewSet, path: str | Path, *, count: int = 4, title: str = "") -> None:
-    """Write a PNG with one row per view: target, result, and perceived difference.
+    """Write a PNG with one row per view, completely or not at all: target, result, and perceived difference, under a heading ``title``.
 
-    Pictures are shown over white, pixel for pixel. The difference is the FLIP map (:func:`bbfit.evaluation.metrics.flip_map`) in the
-    colors of magma; black is no difference. The text under each row has the view's name, azimuth, PSNR and SSIM over white and mean FLIP.
-
-    Parameters
-    ----------
-    model : the result as it is exported.
-    views : held-out views; ``count`` of them are shown, spread evenly in azimuth (:func:`spread_views`).
-    path : the PNG to write, completely or not at all.
-    title : the heading above the pictures.
-
-    Raises
-    ------
-    InputError
-        as :func:`bbfit.evaluation.scoring.evaluate`.
+    The rows are ``count`` held-out views, spread evenly in azimuth (:func:`spread_views`). Pictures are shown over white, pixel for pixel.
+    The difference is the FLIP map (:func:`bbfit.evaluation.metrics.flip_map`) in the colors of magma; black is no difference. The text
+    under each row has the view's name, azimuth, PSNR and SSIM over white and mean FLIP. Raises InputError like
+    :func:`bbfit.evaluation.scoring.evaluate`.
     """
     from PIL import Image, ImageDraw
 
@@ -101,12 +92,8 @@ def comparison_picture(model: ShippedModel, views: ViewSet, path: str | Path, *,
 def spread_views(angles: NDArray[np.float64], count: int) -> list[int]:
     """Indices of at most ``count`` views that are spread evenly in azimuth, in order of azimuth.
 
-    Starting from the first view, view k is the unused view nearest to the k-th part of a full turn; of equally near views it is the one
-    nearest to the horizon.
-
-    Parameters
-    ----------
-    angles : azimuth and elevation in degrees, [V, 2].
+    ``angles`` holds azimuth and elevation in degrees, [V, 2]. Starting from the first view, view k is the unused view nearest to the k-th
+    part of a full turn; of equally near views it is the one nearest to the horizon.
     """
     unused = list(range(len(angles)))
     chosen: list[int] = []
@@ -119,40 +106,21 @@ def spread_views(angles: NDArray[np.float64], count: int) -> list[int]:
 
 
 def loss_plot(losses: Sequence[float], path: str | Path, *, label: str = "loss") -> None:
-    """Write a PNG of the loss of each step on a logarithmic axis, with its running mean over a fiftieth of the steps.
-
-    Parameters
-    ----------
-    losses : loss of every step, the first one first; values that are not finite and positive leave a gap.
-    path : the PNG to write, completely or not at all.
-    label : of the vertical axis.
-
-    Raises
-    ------
-    InputError
-        if there are no losses.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    """Write a PNG with :func:`draw_losses`, completely or not at all."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 5), dpi=120, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     draw_losses(axes, losses, label)
     axes.grid(True, color="#e4e7ea", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
-    buffer = io.BytesIO()
-    canvas.print_png(buffer, metadata={"Software": None})
-    write_bytes(path, buffer.getvalue())
+    write_figure(figure, path)
 
 
 def draw_losses(axes: Axes, losses: Sequence[float], label: str) -> None:
-    """Draw the content of :func:`loss_plot`.
+    """Draw the loss of each step on a logarithmic axis, with its running mean over a fiftieth of the steps; InputError without losses.
 
-    Raises
-    ------
-    InputError
-        if there are no losses.
+    Values that are not finite and positive leave a gap. ``label`` is the name of the vertical axis.
     """
     from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, StrMethodFormatter
 
@@ -184,26 +152,28 @@ def draw_losses(axes: Axes, losses: Sequence[float], label: str) -> None:
 
 
 def pareto_plot(choice: Choice, path: str | Path, *, cost: Cost = "vertices") -> None:
-    """Write a PNG of the validation PSNR of every trial against its vertices, with the front and the choice marked.
+    """Write a PNG of every trial's validation PSNR against its vertices, with the front and the choice marked, completely or not at all.
 
-    Parameters
-    ----------
-    path : the PNG to write, completely or not at all.
-    cost : what the budget limits; if that is not vertices it gets a second panel.
+    If the budget limits another ``cost`` than vertices, that gets a second panel.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     costs: list[Cost] = ["vertices"] if cost == "vertices" else ["vertices", cost]
     figure = Figure(figsize=(9 if len(costs) == 1 else 14, 5), dpi=120, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
     for axes, name in zip(figure.subplots(1, len(costs), squeeze=False)[0], costs, strict=True):
         _draw_front(axes, choice, name)
     figure.axes[0].set_ylabel("PSNR over white of validation views, dB")
     figure.axes[0].set_title("Short fits; numbers are billboards", loc="left", fontsize=11)
     figure.axes[0].legend(frameon=False, fontsize=9, loc="lower right")
+    write_figure(figure, path)
+
+
+def write_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure of matplotlib as PNG, completely or not at all."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     buffer = io.BytesIO()
-    canvas.print_png(buffer, metadata={"Software": None})
+    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
     write_bytes(path, buffer.getvalue())
 
 

@@ -13,19 +13,9 @@ if TYPE_CHECKING:
 
 @contextlib.contextmanager
 def progress_bars(console: Console, *, log_interval: float = 60.0) -> Iterator[Callable[..., None]]:
-    """Show a progress bar for each stage with its rate and remaining time. A log gets lines instead.
+    """Show a progress bar for each stage with its rate and remaining time; yield the callback, a :class:`bbfit.stages.stage.OnProgress`.
 
-    Parameters
-    ----------
-    console
-        The terminal or log.
-    log_interval
-        Seconds between two lines of a stage in a log. A finished stage always gets a line.
-
-    Yields
-    ------
-    OnProgress
-        The callback that reports progress (:class:`bbfit.stages.stage.OnProgress`).
+    A log gets lines instead: one when a stage is finished and otherwise at least ``log_interval`` seconds apart.
     """
     if not console.is_terminal:
         yield _lines(console, log_interval)

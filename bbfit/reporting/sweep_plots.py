@@ -1,23 +1,22 @@
-"""The picture of a sweep: how good each configuration is, tree by tree."""
+"""The picture of a sweep: the quality of each configuration, tree by tree."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from bbfit.files import write_bytes
+from bbfit.reporting.plots import write_figure
 from bbfit.reporting.sweep_tables import BILLBOARDS, MEASURES, SweepRow, label_names
 
 _MEASURES = (MEASURES[0], MEASURES[2])
-# A loss, or another label, has a line style; everything else has a color.
+# Line styles distinguish losses, colors the other labels.
 _STYLES = ("-", "--", ":", "-.")
 
 
 def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
     """Write a PNG: PSNR over white and FLIP against the number of billboards, a column for each tree and a line for each configuration.
 
-    Labels take the numbers' place on the axis where nothing but labels differs. Where nothing was done nothing is written.
+    If all runs have the same number of billboards, the axis shows the labels instead. Without finished runs no file is written.
     """
     done = [row for row in rows if row.reason is None]
     if not done:
@@ -28,7 +27,7 @@ def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
     dashed = next((name for name in names if name == "loss"), None)
     trees = list(dict.fromkeys(row.tree for row in done))
     counted = len({row.labels.get(BILLBOARDS) for row in done}) > 1
-    figure = Figure(figsize=(1.5 + 3.4 * len(trees), 6.6), layout="constrained")
+    figure = Figure(figsize=(1.5 + 3.4 * len(trees), 6.6), dpi=110, layout="constrained")
     axes = figure.subplots(len(_MEASURES), len(trees), squeeze=False, sharex=True)
     colors = {key: f"C{number}" for number, key in enumerate(dict.fromkeys(_key(row, names, dashed) for row in done))}
     styles = {value: _STYLES[number % 4] for number, value in enumerate(dict.fromkeys(row.labels.get(dashed or "") for row in done))}
@@ -51,18 +50,16 @@ def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
             axis.set_xlabel(BILLBOARDS)
     if counted and any(handles := axes[0][0].get_legend_handles_labels()[1]) and len(handles) > 1:
         figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=110)
-    write_bytes(path, data.getvalue())
+    write_figure(figure, path)
 
 
 def _key(row: SweepRow, names: Sequence[str], dashed: str | None) -> str:
-    """What gives a run its color."""
+    """The labels that decide the color of a run."""
     return ", ".join(row.labels.get(name, "") for name in names if name != dashed)
 
 
 def _groups(rows: Sequence[SweepRow], names: Sequence[str], dashed: str | None) -> dict[tuple[str, str | None], list[SweepRow]]:
-    """Runs that make a line."""
+    """The runs of each line, by color and line style."""
     found: dict[tuple[str, str | None], list[SweepRow]] = {}
     for row in rows:
         found.setdefault((_key(row, names, dashed), row.labels.get(dashed or "")), []).append(row)

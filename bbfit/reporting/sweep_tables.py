@@ -58,9 +58,7 @@ class Measure:
 
     def of(self, row: SweepRow) -> float | None:
         """The run's value, if it has one."""
-        value: Any = None if row.facts is None else row.facts["report"]
-        for name in self.path:
-            value = None if value is None else value[name]
+        value = _at(row.facts and row.facts["report"], self.path)
         return None if value is None else float(value)
 
     def published(self, row: SweepRow) -> float | None:
@@ -114,41 +112,15 @@ def table_csv(rows: Sequence[SweepRow]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     published = ("rmse", "ssim", "psnr", "sre")
-    counts = ("billboards_fitted", "texels")
-    writer.writerow(
-        [
-            "tree",
-            *labels,
-            "status",
-            "reason",
-            "steps",
-            *_COLUMNS,
-            *(f"published_{name}" for name in published),
-            *counts,
-            "seconds",
-            "folder",
-        ]
-    )
+    last = ("billboards_fitted", "texels", "seconds", "folder")
+    writer.writerow(["tree", *labels, "status", "reason", "steps", *_COLUMNS, *(f"published_{name}" for name in published), *last])
     for row in rows:
         facts = row.facts or {}
-        report = facts.get("report")
-        values = [_at(report, path) for path in _COLUMNS.values()]
+        start = [row.tree, *(row.labels.get(name, "") for name in labels), "failed" if row.reason else "done", row.reason or "", row.steps]
+        values = [_at(facts.get("report"), path) for path in _COLUMNS.values()]
         figures = asdict(row.published) if row.published else {}
-        writer.writerow(
-            [
-                row.tree,
-                *(row.labels.get(name, "") for name in labels),
-                "failed" if row.reason else "done",
-                row.reason or "",
-                row.steps,
-                *values,
-                *(figures.get(name) for name in published),
-                facts.get("billboards"),
-                facts.get("texels"),
-                row.seconds,
-                row.folder,
-            ]
-        )
+        end = [*map(figures.get, published), facts.get("billboards"), facts.get("texels"), row.seconds, row.folder]
+        writer.writerow([*start, *values, *end])
     return text.getvalue().encode()
 
 
@@ -162,12 +134,8 @@ def table_markdown(rows: Sequence[SweepRow]) -> str:
     parts = ["# Sweep\n", f"{len(done)} of {len(rows)} runs done, {_steps(done)} steps each. Means over the held-out views.\n"]
     if done:
         parts += ["## Measures\n", pivot(done, MEASURES)]
-        changes = effects(done)
-        if changes:
-            parts += [
-                "## Effects\n\nMean differences between runs that differ in one option only.\n",
-                effect_table(changes),
-            ]
+        if changes := effects(done):
+            parts += ["## Effects\n\nMean differences between runs that differ in one option only.\n", effect_table(changes)]
         parts += [
             "## Vertices\n\nVertices of the model, and their ratio to the tree's; the thesis's ratio is in parentheses.\n",
             vertex_table(done),
@@ -265,10 +233,10 @@ def vertex_table(rows: Sequence[SweepRow]) -> str:
     """Vertices of the models relative to those of their trees, as in table 1 of the thesis."""
     trees = list(dict.fromkeys(row.tree for row in rows))
     originals = {row.tree: _at(row.facts and row.facts["report"], ("vertices", "original")) for row in rows}
-    kinds = sorted({(int(_at(row.facts and row.facts["report"], ("vertices", "model")) or 0)) for row in rows})
+    kinds = sorted({int(_at(row.facts and row.facts["report"], ("vertices", "model")) or 0) for row in rows})
     table = [["the tree", *("" if originals[tree] is None else f"{originals[tree]:,}" for tree in trees)]]
     for count in kinds:
-        line = [f"{count}"]
+        line = [str(count)]
         for tree in trees:
             theirs = RATIOS_PERCENT.get(tree, {}).get(count)
             ours = "" if not originals[tree] else f"{100 * count / originals[tree]:.3g} %"

@@ -21,13 +21,7 @@ _UP, _DOWN, _ONE = "↑", "↓", "→ 1"
 
 def species_table(species: Sequence[Species]) -> Table:
     """A ``rich`` table of species: name, height and levels of stems."""
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("species")
-    table.add_column("height, m", justify="right")
-    table.add_column("levels of stems", justify="right")
+    table = _table(["species"], ["height, m", "levels of stems"])
     for one in species:
         table.add_row(one.name, f"{one.scale:g} ± {one.scale_v:g}", str(one.levels))
     return table
@@ -38,14 +32,9 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
 
     An arrow shows which direction is better. With ``thesis`` a last column has the thesis scale, for comparison with the thesis's figures.
     """
-    from rich import box
-    from rich.table import Table
-
     mean, count = report.mean, len(report.views)
-    table = Table(
-        title=f"{title}: mean of {count}" if count > 1 else f"{title}: one view", box=box.SIMPLE_HEAD, title_style="bold", pad_edge=False
-    )
-    table.add_column("measure")
+    table = _table(["measure"], [])
+    table.title, table.title_style = f"{title}: mean of {count}" if count > 1 else f"{title}: one view", "bold"
     table.add_column("better", justify="center", style="dim")
     for name in ("over white", "premultiplied RGBA"):
         table.add_column(name, justify="right")
@@ -92,40 +81,19 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
 
 def lod_table(levels: Sequence[LodLevel]) -> Table:
     """A ``rich`` table of levels of detail: costs, distance and error of each."""
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("level")
-    for name in ("planes", "vertices", "bytes", "from, m", "tree, px", "error, px", "held out"):
-        table.add_column(name, justify="right", no_wrap=True)
+    table = _table(["level"], ["planes", "vertices", "bytes", "from, m", "tree, px", "error, px", "held out"], no_wrap=True)
     for level in levels:
         below = "-" if level.tree_pixels is None else f"{level.tree_pixels:.0f}"
         errors = ["-"] * 2 if level.planes is None else [f"{level.error_pixels:.2f}", f"{level.held_out_error_pixels:.2f}"]
-        planes = "tree" if level.planes is None else str(level.planes)
-        table.add_row(
-            level.name.rsplit("_", 1)[-1],
-            planes,
-            _count(level.vertices),
-            _count(level.bytes),
-            f"{level.distance_meters:.1f}",
-            below,
-            *errors,
-        )
+        counts = ["tree" if level.planes is None else str(level.planes), _count(level.vertices), _count(level.bytes)]
+        table.add_row(level.name.rsplit("_", 1)[-1], *counts, f"{level.distance_meters:.1f}", below, *errors)
     return table
 
 
 def sweep_table(rows: Sequence[SweepRow]) -> Table:
     """A ``rich`` table with one line per run: measures and costs, or the reason of its failure."""
-    from rich import box
-    from rich.table import Table
-
     labels = label_names(rows)
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for name in ("tree", *labels):
-        table.add_column(name)
-    for name in ("PSNR, dB", "SSIM", "FLIP", "vertices", "bytes", "seconds"):
-        table.add_column(name, justify="right")
+    table = _table(["tree", *labels], ["PSNR, dB", "SSIM", "FLIP", "vertices", "bytes", "seconds"])
     for row in rows:
         start = [row.tree, *(row.labels.get(name, "") for name in labels)]
         if row.facts is None:
@@ -140,18 +108,23 @@ def sweep_table(rows: Sequence[SweepRow]) -> Table:
 
 def compare_table(rows: Sequence[CompareRow]) -> Table:
     """A ``rich`` table with one line per system: its measures on the held-out views and its costs."""
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("system")
-    for name in ("PSNR, dB", "SSIM", "FLIP", "planes", "vertices", "bytes", "seconds"):
-        table.add_column(name, justify="right", no_wrap=True)
+    table = _table(["system"], ["PSNR, dB", "SSIM", "FLIP", "planes", "vertices", "bytes", "seconds"], no_wrap=True)
     for row in rows:
         white = None if row.measures is None else row.measures.over_white
         scores = ["-"] * 3 if white is None else [f"{white.psnr:.2f}", f"{white.ssim:.3f}", f"{white.flip:.3f}"]
         seconds = "-" if row.seconds is None else f"{row.seconds:,.1f}"
         table.add_row(row.title, *scores, _count(row.planes), _count(row.vertices), _count(row.bytes), seconds)
+    return table
+
+
+def _table(texts: Sequence[str], numbers: Sequence[str], *, no_wrap: bool = False) -> Table:
+    """An empty table with columns of text and columns of numbers, which ``no_wrap`` keeps on one line."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(*texts, box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in numbers:
+        table.add_column(name, justify="right", no_wrap=no_wrap)
     return table
 
 

@@ -47,8 +47,8 @@ class AdamFused(AdamReference):
     def start(texels: Tensor) -> AdamFused:
         """The state before the first step, which takes over the memory of ``texels`` [P', 4], as :meth:`padded` returns them."""
         never = torch.full((len(texels) // BLOCK,), -(1 << 30), dtype=torch.int32, device=texels.device)
-        zeros = [torch.zeros_like(texels) for _ in range(3)]
-        return AdamFused(texels, zeros[0], zeros[1], zeros[2], never, occupancy(texels))
+        gradient, first, second = (torch.zeros_like(texels) for _ in range(3))
+        return AdamFused(texels, gradient, first, second, last=never, occupied=occupancy(texels))
 
     def tensors(self) -> dict[str, Tensor]:
         """As of the reference, and the last steps with a gradient."""
