@@ -75,7 +75,11 @@ def _check(name: str, value: Any, hint: Any) -> None:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         kinds = [kind for kind in arguments if kind is not NoneType]
-        if len(kinds) == 1 and not (value is None and NoneType in arguments):
+        if value is None and NoneType in arguments:
+            return
+        if all(get_origin(kind) is Literal for kind in kinds):
+            check_choice(name, value, tuple(choice for kind in kinds for choice in get_args(kind)))
+        elif len(kinds) == 1:
             _check(name, value, kinds[0])
     elif origin is tuple:
         if not isinstance(value, tuple | list):

@@ -39,7 +39,7 @@ def on_progress(done, total):
     print(done, flush=True)
     if done == int(hold):
         sys.stdin.readline()
-config = ViewsConfig(count=4, size=int(size), samples=int(samples), denoise=False, workers=int(workers))
+config = ViewsConfig(count=4, size=int(size), samples=int(samples), denoise=False, render_workers=int(workers))
 render_views(tree, out, config, on_progress=on_progress)
 """
 

@@ -151,7 +151,7 @@ def test_levels_of_wrong_sizes_are_refused(alktx2: ModuleType, sides: list[tuple
 def test_without_the_package_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "alktx2", None)  # by which Python says that a module cannot be imported
     said = r'install bbfit with its extra, pip install "bbfit\[ktx2\]".*Python 3\.11'
-    with pytest.raises(InputError, match="KTX2: the package alktx2 is not there; " + said):
+    with pytest.raises(InputError, match="KTX2: the package alktx2 is not installed; " + said):
         encode_ktx2([np.zeros((4, 4, 4), np.uint8)])
 
 
