@@ -37,7 +37,7 @@ def views() -> ViewDataset:
 @pytest.fixture(scope="module")
 def fits(views: ViewDataset) -> dict[str, BillboardCloud]:
     """Four crossing billboards fitted for either mode."""
-    config = FitConfig(billboards=4, placement="even", placement_learning_rate=0, steps=150)
+    config = FitConfig(billboards=4, placement="even", placement_learning_rate=0, steps=400)
     return {alpha: fit(views, replace(config, alpha=alpha)).cloud for alpha in ("mask", "blend")}  # type: ignore[arg-type]
 
 

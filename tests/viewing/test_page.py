@@ -30,6 +30,7 @@ def at_the_start(opened: Opened) -> Iterator[None]:
     tab.select("alpha", "mask")
     tab.select("level", "1")
     tab.do(lambda page: page.get_by_label("plane outlines").uncheck())
+    tab.evaluate("document.activeElement.blur()")  # a field that has the focus keeps what was typed
     tab.evaluate("bbfit.viewer.fitTree()")
     yield
     assert not tab.errors
