@@ -36,6 +36,7 @@ MARKED = {
     "node": ("exporting/test_formats.py", "exporting/test_lod.py", "exporting/test_model.py"),
     "ray": ("sweep/test_cluster.py",),
     "slow": (
+        "budget/test_choice.py",
         "exporting/test_atlas.py",
         "exporting/test_drawing.py",
         "exporting/test_hulls.py",
@@ -54,6 +55,8 @@ MARKED = {
         "test_budget_runs.py",
         "test_cli.py",
         "test_docs.py",
+        "test_options.py",
+        "trees/test_mesh.py",
     ),
 }
 # The same for tests that use a fixture, directly or not.
