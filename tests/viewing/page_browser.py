@@ -73,7 +73,7 @@ def open_tabs() -> Iterator[Callable[[str], Tab]]:
         yield lambda url: thread.submit(begin, url).result()
 
 
-def wait_for(condition: Callable[[], T], seconds: float = 120.0) -> T:
+def wait_for(condition: Callable[[], T], seconds: float = 400.0) -> T:
     """Wait until something is true, and return it."""
     until = time.monotonic() + seconds
     while True:
