@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.blender.config import ViewsConfig
+from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputError, check_folder, fail
 from bbfit.exporting.config import ExportConfig
 from bbfit.files import read_json
@@ -108,16 +109,12 @@ def sources(folder: Path, record: dict[str, Any]) -> list[Path | None]:
 
 def light_of(views: Path | None) -> ViewsConfig:
     """The light of a folder of views by its ``views.json``; the default light if that file has none."""
-    path = views / REQUEST_FILE if views is not None else None
-    try:
-        request = read_json("views", path) if path is not None and path.is_file() else {}
-    except InputError:
-        request = {}
-    config = request.get("config") if isinstance(request, dict) else None
+    path = None if views is None else views / REQUEST_FILE
     names = ("sun_strength", "sun_azimuth", "sun_elevation", "ambient_strength")
-    known = {name: config[name] for name in names if isinstance(config.get(name), int | float)} if isinstance(config, dict) else {}
     try:
-        return ViewsConfig(**known)
+        request = ViewsRequest.load(path) if path is not None and path.is_file() else None
+        config = request.config if request else {}
+        return ViewsConfig(**{name: config[name] for name in names if isinstance(config.get(name), int | float)})
     except InputError:
         return ViewsConfig()
 
