@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import socket
@@ -124,14 +125,12 @@ def test_foreign_pages_may_not_embed_what_is_sent(viewer: Viewer) -> None:
 )
 def test_garbage_is_refused_in_silence(viewer: Viewer, garbage: bytes, capfd: pytest.CaptureFixture[str]) -> None:
     with socket.create_connection(("127.0.0.1", viewer.port), 10) as connection:
-        connection.sendall(garbage)
-        connection.shutdown(socket.SHUT_WR)
         answer = b""
-        try:
+        with contextlib.suppress(OSError):  # the server may close the connection before it has read everything
+            connection.sendall(garbage)
+            connection.shutdown(socket.SHUT_WR)
             while part := connection.recv(65536):
                 answer += part
-        except ConnectionResetError:  # the server did not read all of it
-            pass
     assert b"200 OK" not in answer and b"101" not in answer[:20]
     assert request(viewer, "/state")[0] == 200
     assert capfd.readouterr() == ("", "")
