@@ -1,4 +1,7 @@
-"""Every notebook runs from top to bottom, as committed, and shows pictures; nothing that it prints or shows is a warning or empty."""
+"""Every notebook runs from top to bottom and shows pictures; nothing that it prints or shows is a warning or empty.
+
+Its cells run as committed, with fits that take few steps.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +27,16 @@ NAMES = [
     "05_placement_and_budgets",
     "06_into_an_engine",
 ]
+# Runs before the first cell. Notebooks choose how well to fit; here it matters only that every cell works.
+SHORT = """
+def _with_short_fits():
+    import bbfit, dataclasses
+    short = dict(steps=100, restarts=1, candidates=2, refinement_rounds=0)
+    def shortened(function):
+        return lambda views, config=bbfit.FitConfig(), *more, **named: function(views, dataclasses.replace(config, **short), *more, **named)
+    bbfit.fit, bbfit.choose = shortened(bbfit.fit), shortened(bbfit.choose)
+_with_short_fits()
+"""
 
 
 def _read(name: str) -> Any:
@@ -54,6 +67,7 @@ def test_notebook_runs_and_shows_pictures(name: str, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")  # beside other tests, threads that spin while they wait take five times as long
     before = _contents()
     notebook = _read(name)
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(SHORT))
     NotebookClient(notebook, timeout=None, kernel_name="python3", resources={"metadata": {"path": NOTEBOOKS}}).execute()
 
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
