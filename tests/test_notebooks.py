@@ -1,6 +1,6 @@
 """Every notebook runs from top to bottom and shows pictures; nothing that it prints or shows is a warning or empty.
 
-Its cells run as committed, with fits that take few steps.
+The cells run as committed, but ``bbfit.fit`` and ``bbfit.choose`` take at most 100 steps and search little for a placement.
 """
 
 from __future__ import annotations
@@ -27,15 +27,18 @@ NAMES = [
     "05_placement_and_budgets",
     "06_into_an_engine",
 ]
-# Runs before the first cell. Notebooks choose how well to fit; here it matters only that every cell works.
+# Runs before the first cell. What is tested is that every cell works; the length of a fit is the reader's choice.
 SHORT = """
-def _with_short_fits():
+def _shorten_fits():
     import bbfit, dataclasses
-    short = dict(steps=100, restarts=1, candidates=2, refinement_rounds=0)
     def shortened(function):
-        return lambda views, config=bbfit.FitConfig(), *more, **named: function(views, dataclasses.replace(config, **short), *more, **named)
+        def work(views, config=bbfit.FitConfig(), *more, **named):
+            steps = min(config.steps or 100, 100)
+            short = dataclasses.replace(config, steps=steps, restarts=1, candidates=2, refinement_rounds=0)
+            return function(views, short, *more, **named)
+        return work
     bbfit.fit, bbfit.choose = shortened(bbfit.fit), shortened(bbfit.choose)
-_with_short_fits()
+_shorten_fits()
 """
 
 
