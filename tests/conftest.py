@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from dead_workers import pytest_testnodedown, pytest_xdist_newgateway  # noqa: F401 (hooks)
-from own_process import pytest_runtest_protocol  # noqa: F401 (a hook)
+from own_process import pytest_runtest_makereport, pytest_runtest_protocol  # noqa: F401 (hooks)
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud, even_upright

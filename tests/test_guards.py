@@ -14,6 +14,7 @@ TESTS = Path(__file__).resolve().parent
 def pytest_on(source: str, folder: Path, *arguments: str, **environment: str) -> tuple[int, str]:
     """Exit status and output of pytest on one file in a process of its own."""
     (folder / "test_it.py").write_text(source)
+    (folder / "conftest.py").write_text("from own_process import pytest_runtest_makereport, pytest_runtest_protocol")
     given = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")} | environment
     given["PYTHONPATH"] = os.pathsep.join(filter(None, (str(TESTS), given.get("PYTHONPATH"))))
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments, "test_it.py"]
@@ -53,11 +54,34 @@ def test_crashes_once():
         crash()
 def test_crashes_again(): crash()
 def test_fails(): assert 1 == 2
-def test_passes(): pass
+@pytest.fixture(scope="module")
+def shared():
+    yield os.getpid()
+def test_passes(shared): assert shared == os.getpid()
+def test_is_beside_it(shared): assert shared == os.getpid()
 """
-    code, output = pytest_on(source, tmp_path, "-p", "own_process")
-    assert code == 1 and "2 failed, 2 passed" in output
-    assert "its process ended with -11" in output and "assert 1 == 2" in output
+    code, output = pytest_on(source, tmp_path)
+    assert code == 1 and "2 failed, 3 passed" in output
+    assert output.count("\nits process ended with -11") == 1 and "assert 1 == 2" in output
+
+
+def test_a_crash_at_the_end_may_happen_once(tmp_path: Path) -> None:
+    source = """
+import atexit, os, pathlib, signal, pytest
+pytestmark = pytest.mark.ray
+def crash():
+    if len(pathlib.Path("ends").read_text()) < LIMIT:
+        os.kill(os.getpid(), signal.SIGSEGV)
+def test_first(): pass
+def test_last():
+    with pathlib.Path("ends").open("a") as ends:
+        ends.write(".")
+    atexit.register(crash)
+"""
+    code, output = pytest_on(source.replace("LIMIT", "2"), tmp_path)
+    assert code == 0 and "2 passed" in output
+    code, output = pytest_on(source.replace("LIMIT", "9"), tmp_path)
+    assert code == 1 and "1 failed, 1 passed" in output
 
 
 def test_a_test_that_hangs_is_killed(tmp_path: Path) -> None:
@@ -66,5 +90,5 @@ import signal, pytest
 @pytest.mark.ray
 def test_hangs(): signal.pause()
 """
-    code, output = pytest_on(source, tmp_path, "-p", "own_process", BBFIT_TESTS_LIFE="1")
+    code, output = pytest_on(source, tmp_path, BBFIT_TESTS_LIFE="1")
     assert code == 1 and "it was killed after 1 s" in output

@@ -15,7 +15,9 @@ from multiprocessing.process import BaseProcess
 
 from bbfit.sweep.tasks import Outcome, Task, attempt
 
-_SPAWN = multiprocessing.get_context("spawn")  # a forked torch or Blender would hang
+# A fork of a process that has used torch can hang. Workers are forks of a server that only imports, or new processes on Windows.
+_CONTEXT = multiprocessing.get_context("forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn")
+_PRELOADED = ["bbfit.pipeline", "bbfit.fitting.fused_pass"]
 
 
 @dataclass
@@ -93,9 +95,10 @@ class LocalWorkers:
 
 
 def _start() -> _Worker:
-    ours, theirs = _SPAWN.Pipe()
-    held, watched = _SPAWN.Pipe()
-    process = _SPAWN.Process(target=_run_tasks, args=(theirs, watched), daemon=True)
+    _CONTEXT.set_forkserver_preload(_PRELOADED)
+    ours, theirs = _CONTEXT.Pipe()
+    held, watched = _CONTEXT.Pipe()
+    process = _CONTEXT.Process(target=_run_tasks, args=(theirs, watched, dict(os.environ)), daemon=True)
     process.start()
     theirs.close()
     watched.close()
@@ -114,10 +117,12 @@ def _stop(worker: _Worker) -> str:
     return f"{signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 
-def _run_tasks(pipe: Connection, lifeline: Connection) -> None:
+def _run_tasks(pipe: Connection, lifeline: Connection, environment: dict[str, str]) -> None:
     """The main function of a process: run tasks until the parent closes the pipe or dies."""
     import torch
 
+    os.environ.clear()
+    os.environ.update(environment)  # the server has that of its own start
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles keyboard interrupts
     threading.Thread(target=_exit_with_parent, args=(lifeline,), daemon=True).start()
     while True:

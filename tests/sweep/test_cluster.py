@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -159,6 +160,6 @@ def test_tasks_ask_for_what_was_declared(cluster: Cluster, tmp_path: Path) -> No
             workers.submit(task)
             next(starts)
             while ray.available_resources().get("CPU") != 2:  # which nodes report at intervals
-                pass
+                time.sleep(0.05)
             assert ray.cluster_resources()["memory"] - ray.available_resources()["memory"] == 50_000_000
         assert workers.next()[1].reason is None
