@@ -1,7 +1,8 @@
-"""What all tests share: one thread each, a small scene with views of it, and the folder of real trees beside the checkout."""
+"""What all tests share: one thread for each process, a small scene with views of it, and the folder of real trees beside the checkout."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +18,9 @@ from bbfit.images import to_bytes, unpremultiply, write_png
 from bbfit.layout import split_views, write_transforms
 from bbfit.operators.drawing.reference import render_reference
 
-torch.set_num_threads(1)  # the suite runs in as many processes as there are cores
+# The suite runs in as many processes as there are cores. Threads of one process that wait for each other would take the others' time.
+torch.set_num_threads(1)
+os.environ["OMP_NUM_THREADS"] = "1"  # in the processes that tests start
 
 TESTS = Path(__file__).resolve().parent
 SHARED = TESTS.parent / "../shared"

@@ -19,6 +19,8 @@ _VIEWS, _MAX_SHIFT, _BISECTIONS, _GAUSS_NEWTON_STEPS = 24, 0.3, 8, 2
 _SPREAD = 0.4
 # The derivatives of coverage are differences: largest side of the pictures that they are measured in, in pixels, and step of alpha.
 _SIDE, _STEP = 256, 0.05
+# Most pixels that are drawn at once.
+_PIXELS = 1 << 22
 
 
 def matched_coverage(cloud: BillboardCloud, views: ViewSet, backend: Backend = "auto") -> BillboardCloud:
@@ -52,8 +54,9 @@ def matched_coverage(cloud: BillboardCloud, views: ViewSet, backend: Backend = "
         return cloud.with_texels(torch.cat([rounded[:, :3], new_alpha[:, None]], 1))
 
     def coverage(shifts: Tensor, cameras: Camera) -> Tensor:
-        result = shifted(shifts)
-        return torch.stack([render(result, cameras[index], backend=backend)[..., 3].double().mean().cpu() for index in range(count)])
+        result, at_once = shifted(shifts), max(1, _PIXELS // (cameras.width * cameras.height))
+        images = (image for some in torch.arange(count).split(at_once) for image in render(result, cameras[some], backend=backend))
+        return torch.stack([image[..., 3].double().mean().cpu() for image in images])
 
     def balanced(shifts: Tensor, cameras: Camera) -> Tensor:
         return shifts + _root(lambda offset: float((coverage(shifts + offset, cameras) - target).mean()))
