@@ -9,6 +9,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -410,6 +411,7 @@ def test_a_run_killed_outright_goes_on(views_folder: Path, tmp_path: Path) -> No
     process = subprocess.Popen([*command, str(tmp_path / "broken")], stderr=subprocess.DEVNULL, env=one_thread)
     while not (tmp_path / "broken" / "fit.checkpoint").exists():
         assert process.poll() is None, "the fit ended before it was killed"
+        time.sleep(0.02)
     process.kill()
     process.wait()
     assert not (tmp_path / "broken" / "cloud.safetensors").exists()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -25,7 +27,7 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
     sizes = np.array([texture.shape[1::-1] for texture in textures], dtype=np.int64)
     unit = max(BLOCK, 1 << (padding.bit_length() - 1))
     cells = np.maximum(-(-(sizes + 2 * padding) // unit), 2)
-    places = packed(cells)
+    places = _places(cells.tobytes())
     width, height = ((places + cells).max(0) * unit).tolist()
     image = np.zeros((height, width, 4), np.uint8)
     image[..., :3] = _mean_color(textures)  # for the gaps between cells, which only the smallest mip levels mix in
@@ -33,6 +35,12 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
         (x, y), (w, h) = place.tolist(), cell.tolist()
         image[y : y + h, x : x + w] = fill_cell(texture, padding, w, h)
     return Atlas(image, places * unit + padding, sizes)
+
+
+@lru_cache(maxsize=64)  # one model is packed for its size in bytes, for its GLB and for its OBJ
+def _places(cells: bytes) -> NDArray[np.int64]:
+    """:func:`~bbfit.exporting.packing.packed` of the bytes of its argument. Do not change the result."""
+    return packed(np.frombuffer(cells, np.int64).reshape(-1, 2))
 
 
 def fill_cell(texture: NDArray[np.uint8], padding: int, width: int, height: int) -> NDArray[np.uint8]:

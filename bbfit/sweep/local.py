@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from typing import Any
 
 from bbfit.sweep.tasks import Outcome, Task, attempt
 
 # A fork of a process that has used torch can hang. Workers are forks of a server that only imports, or new processes on Windows.
-_CONTEXT = multiprocessing.get_context("forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn")
+_CONTEXT: Any = multiprocessing.get_context("forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn")
 _PRELOADED = ["bbfit.pipeline", "bbfit.fitting.fused_pass"]
 
 
