@@ -105,7 +105,7 @@ def small(words: list[str]) -> list[str]:
     if command == "views":
         return options(SMALL_VIEWS)
     page = ["--port", "0"] if "--watch" in given else []
-    few = {"vertices": 8} if command == "fit" and given & BUDGETS else {} if given & (BUDGETS | {"--billboards"}) else {"billboards": 2}
+    few = {"vertices": 4} if given & BUDGETS else {} if "--billboards" in given else {"billboards": 2}
     if command == "fit":
         return [*options(SMALL_FIT | few), *page]
     if command == "run":

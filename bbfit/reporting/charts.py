@@ -14,7 +14,7 @@ from bbfit.checks import fail
 from bbfit.evaluation.report import SizeScore, ViewScore
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import corners
-from bbfit.reporting.plots import draw_losses
+from bbfit.reporting.plots import draw_losses, plain_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,7 +66,7 @@ def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
     """
     if not views:
         fail("views", "there is none to draw")
-    figure = _figure(5.6)
+    figure = _figure(5.6, len(MEASURES))
     worst = worst_views(views)
     panels = figure.subplots(len(MEASURES), 1, sharex=True)
     rings: dict[int, list[int]] = {}
@@ -117,7 +117,7 @@ def plan_chart(cloud: BillboardCloud) -> Chart:
     """
     from matplotlib.patches import Polygon
 
-    figure = _figure(_WIDTH)
+    figure = _figure(_WIDTH, left=0.72)
     axes = figure.subplots()
     quads = corners(cloud).cpu().numpy()
     middle = (quads.min((0, 1)) + quads.max((0, 1))) / 2 if len(cloud) else np.zeros(3)
@@ -148,7 +148,7 @@ def plan_chart(cloud: BillboardCloud) -> Chart:
 
 def sizes_chart(sizes: Sequence[SizeScore]) -> Chart:
     """PSNR and coverage of the exported model in pictures of the views' size, half of it and so on."""
-    figure = _figure(3.9)
+    figure = _figure(3.9, 2)
     panels = figure.subplots(2, 1, sharex=True)
     ticks = [f"{size.width}" if number == 0 else f"1/{round(sizes[0].width / size.width)}" for number, size in enumerate(sizes)]
     places = list(range(len(sizes)))
@@ -171,17 +171,16 @@ def sizes_chart(sizes: Sequence[SizeScore]) -> Chart:
 
 def loss_chart(losses: Sequence[float]) -> Chart:
     """The loss of each step (:func:`~bbfit.reporting.plots.draw_losses`)."""
-    figure = _figure(3.4)
+    figure = _figure(3.4, left=0.72)
     axes = figure.subplots()
     draw_losses(axes, losses, "loss")
     _plain(axes)
     return Chart(_svg(figure, "loss"), {})
 
 
-def _figure(height: float) -> Figure:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(_WIDTH, height), dpi=72, layout="constrained")
+def _figure(height: float, panels: int = 1, *, left: float = 0.52) -> Figure:
+    """A figure with panels below each other and a margin of ``left`` inches."""
+    return plain_figure(_WIDTH, height, 72, rows=panels, left=left, right=0.15, bottom=0.52, top=0.33, between=0.45)
 
 
 def _plain(axes: Axes) -> None:
