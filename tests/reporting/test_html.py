@@ -6,17 +6,17 @@ import base64
 import io
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from browser import open_browser
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Page
+from playwright.sync_api import Browser, Page
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.evaluation.metrics import psnr
@@ -52,7 +52,7 @@ def result(views_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> RunR
 
 
 @pytest.fixture(scope="module")
-def visit(result: RunResult) -> Iterator[Visit]:
+def visit(result: RunResult, chromium: tuple[Browser, ThreadPoolExecutor]) -> Visit:
     """Does something with the page as it is after loading; the page may complain of nothing and ask for nothing."""
 
     def visited(
@@ -74,8 +74,8 @@ def visit(result: RunResult) -> Iterator[Visit]:
         finally:
             page.close()
 
-    with open_browser() as (browser, thread):
-        yield lambda act, **options: thread.submit(visited, act, **options).result()
+    browser, thread = chromium
+    return lambda act, **options: thread.submit(visited, act, **options).result()
 
 
 def pictures(page: Page) -> list[str]:

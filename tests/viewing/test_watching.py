@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from page_browser import Tab, wait_for
+from page_browser import Browse, wait_for
 
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
@@ -22,9 +21,9 @@ from bbfit.views import ViewDataset
 DATA = Path(__file__).resolve().parents[2] / "data"
 
 
-def test_the_page_follows_the_fit_and_ends_with_the_run(small_run: Path, browse: Callable[[str], Tab]) -> None:
-    with Viewer(port=0) as viewer:
-        tab, pictures = browse(viewer.url), list[NDArray[np.int64]]()
+def test_the_page_follows_the_fit_and_ends_with_the_run(small_run: Path, browse: Browse) -> None:
+    with Viewer(port=0) as viewer, browse(viewer.url) as tab:
+        pictures = list[NDArray[np.int64]]()
         assert "waiting for the first billboards" in tab.text("#right header")
         watched = WatchedRun(small_run, DATA / "views", DATA / "tree.glb", "mask")
         watch = Watch(viewer, watched, interval=0.0, share=1e9)
