@@ -44,6 +44,7 @@ def test_the_page_follows_the_fit_and_ends_with_the_run(small_run: Path, browse:
         tab.wait_until("bbfit.viewer.state.tree && !bbfit.viewer.state.tree.live")
         tab.picture("right")
         assert tab.text("#right header").startswith("4 billboards") and "step" not in tab.text("#status")
+        assert sum(url.endswith("/original.glb") for url in tab.requests) == 1
         assert not tab.errors
 
 
