@@ -290,13 +290,13 @@
     dirty = true;
   }
 
-  // Frames are drawn when something has changed, and some of them one after the other to measure them. The interval between two frames is
-  // at least the period of the screen; the duration ends when a pixel could be read back.
+  // Frames are drawn when something has changed, and once all is loaded some of them one after the other to measure them. The interval
+  // between two frames is at least the period of the screen; the duration ends when a pixel could be read back.
   function tick(now) {
     requestAnimationFrame(tick);
     resize();
     $("status").textContent = error || (loading ? "loading models … " : "") + status;
-    if (tree === null || !(dirty || toMeasure)) {
+    if (tree === null || !(dirty || (toMeasure && loading === 0))) {
       before = null;
       return;
     }
