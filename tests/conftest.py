@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+# The suite runs in as many processes as there are cores, and threads that wait for a core cost more than they gain. Libraries read this
+# when they are imported, child processes inherit it.
+os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import pytest
 import torch
@@ -18,9 +24,10 @@ from bbfit.images import to_bytes, unpremultiply, write_png
 from bbfit.layout import split_views, write_transforms
 from bbfit.operators.drawing.reference import render_reference
 
-# The suite runs in as many processes as there are cores. Threads of one process that wait for each other would take the others' time.
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
 torch.set_num_threads(1)
-os.environ["OMP_NUM_THREADS"] = "1"  # in the processes that tests start
 
 TESTS = Path(__file__).resolve().parent
 SHARED = TESTS.parent / "../shared"
@@ -116,6 +123,15 @@ def poison() -> Iterator[None]:
     yield
     torch.use_deterministic_algorithms(False)
     torch.utils.deterministic.fill_uninitialized_memory = before
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[tuple[Browser, ThreadPoolExecutor]]:
+    """A browser, which starts once, and the one thread that may speak to it."""
+    from browser import open_browser
+
+    with open_browser() as opened:
+        yield opened
 
 
 def smooth_texture(height: int, width: int, seed: int) -> torch.Tensor:

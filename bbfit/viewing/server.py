@@ -9,7 +9,7 @@ import re
 import socket
 import sys
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -52,6 +52,8 @@ class _Shown:
     models: ModelCache
     generation: int
     """Counts the trees that were shown; it is part of the addresses of their models."""
+    origin: int
+    """The generation that first had this original; it is part of the original's address, so that pages keep it."""
 
 
 class Viewer:
@@ -95,7 +97,10 @@ class Viewer:
         """Show a tree. ``models`` are the models of its clouds, if some are made already."""
         with self._lock:
             self._serial += 1
-            self._previous, self._shown = self._shown, _Shown(tree, models or ModelCache(tree.clouds, tree.export), self._serial)
+            before = self._shown
+            origin = self._serial if before is None or before.tree.original != tree.original else before.origin
+            self._shown = _Shown(tree, models or ModelCache(tree.clouds, tree.export), self._serial, origin)
+            self._previous = before
         if not (tree.is_measured or tree.live or tree.views is None):
             self._measuring = threading.Thread(target=self._measure, args=(tree,), daemon=True)
             self._measuring.start()
@@ -137,8 +142,11 @@ class Viewer:
         if path == "/state":
             return "application/json", json.dumps({"serial": serial, "status": status, "tree": _state(recent[0])}).encode()
         match = _MODEL.fullmatch(path) or _FIELD.fullmatch(path) or _ORIGINAL.fullmatch(path)
-        shown = next((each for each in recent if match and each and each.generation == int(match[1])), None)
-        if match is None or shown is None:
+        if match is None:
+            return None
+        number = int(match[1])
+        shown = next((each for each in recent if each and number == (each.origin if match.re is _ORIGINAL else each.generation)), None)
+        if shown is None:
             return None
         if match.re is _FIELD:
             try:
@@ -162,7 +170,7 @@ class Viewer:
         with self._lock:
             if self._shown is not None and self._shown.tree is tree:
                 self._serial += 1
-                self._shown = _Shown(measured, self._shown.models, self._shown.generation)
+                self._shown = replace(self._shown, tree=measured)
 
 
 def view(run: str | Path, *, host: str = "127.0.0.1", port: int = 8080, original_bytes: int = MAX_BYTES) -> Viewer:
@@ -271,6 +279,7 @@ def _state(shown: _Shown | None) -> dict[str, Any] | None:
     return {
         "name": tree.name,
         "generation": shown.generation,
+        "origin": shown.origin,
         "live": tree.live,
         "measuring": not tree.is_measured and tree.views is not None,
         "notes": [note for note in (*tree.notes, tree.original.note) if note],

@@ -7,16 +7,16 @@ import io
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from browser import open_browser
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Page
+from playwright.sync_api import Browser, Page
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.evaluation.metrics import psnr
@@ -52,12 +52,15 @@ def result(views_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> RunR
 
 
 @pytest.fixture(scope="module")
-def visit(result: RunResult) -> Iterator[Visit]:
-    """Does something with the page as it is after loading; the page may complain of nothing and ask for nothing."""
+def visit(result: RunResult, chromium: tuple[Browser, ThreadPoolExecutor]) -> Iterator[Visit]:
+    """Does something with a page; the page may complain of nothing and ask for nothing.
 
-    def visited(
-        act: Callable[[Page], Any], *, width: int = 1200, height: int = 800, scheme: Any = "light", path: Path | None = None
-    ) -> Any:
+    Where no options are given, it is the page that the tests before have seen, with whatever view and camera they left.
+    """
+    browser, thread = chromium
+    seen = list[tuple[Page, list[str]]]()
+
+    def load(width: int = 1200, height: int = 800, scheme: Any = "light", path: Path | None = None) -> tuple[Page, list[str]]:
         complaints: list[str] = []
         page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme, reduced_motion="reduce")
         page.on("console", lambda message: complaints.append(message.text) if message.type in ("error", "warning") else None)
@@ -67,15 +70,29 @@ def visit(result: RunResult) -> Iterator[Visit]:
         try:
             page.goto((path or result.folder / "report.html").as_uri())
             wait_until(page, "'model' in bbfit")
+        except BaseException:
+            page.close()
+            raise
+        return page, complaints
+
+    def visited(act: Callable[[Page], Any], options: dict[str, Any]) -> Any:
+        page, complaints = seen.pop() if seen and not options else load(**options)
+        try:
             found = act(page)
             # The page itself is the one file that is asked for. What SwiftShader says of its speed is not the page's.
             assert [text for text in complaints[1:] if "GPU stall" not in text and "swiftshader" not in text.lower()] == []
-            return found
-        finally:
+        except BaseException:
             page.close()
+            raise
+        if options:
+            page.close()
+        else:
+            seen.append((page, complaints))
+        return found
 
-    with open_browser() as (browser, thread):
-        yield lambda act, **options: thread.submit(visited, act, **options).result()
+    yield lambda act, **options: thread.submit(visited, act, options).result()
+    for page, _ in seen:
+        thread.submit(page.close).result()
 
 
 def pictures(page: Page) -> list[str]:

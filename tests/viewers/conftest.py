@@ -1,14 +1,16 @@
-"""A browser that is started once, and cameras around the noise."""
+"""three.js in a browser, and cameras around the noise."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from playwright.sync_api import Browser
 from three_viewer import ThreeViewer, open_three
 
 from bbfit.geometry.camera import Camera
@@ -18,9 +20,9 @@ sys.path.append(str(Path(__file__).parents[1] / "exporting"))  # for glb_viewer
 
 
 @pytest.fixture(scope="session")
-def three() -> Iterator[ThreeViewer]:
+def three(chromium: tuple[Browser, ThreadPoolExecutor]) -> Iterator[ThreeViewer]:
     """three.js in a browser."""
-    with open_three() as viewer:
+    with open_three(*chromium) as viewer:
         yield viewer
 
 

@@ -1,4 +1,4 @@
-// Loads one GLB with three.js and draws it from given cameras; three_viewer.py calls load() once and then draw() once a view.
+// Loads GLBs with three.js and draws them from given cameras; three_viewer.py calls load() once a GLB and then draw() once a view.
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { KTX2Loader } from "three/addons/loaders/KTX2Loader.js";
@@ -23,12 +23,20 @@ renderer.setClearColor(0xffffff, 1);
 renderer.outputColorSpace = THREE.SRGBColorSpace;
 renderer.toneMapping = THREE.NoToneMapping;
 const scene = new THREE.Scene();
+const loader = new GLTFLoader().setKTX2Loader(
+  new KTX2Loader().setTranscoderPath("/three/examples/jsm/libs/basis/").detectSupport(renderer),
+);
 
-// Loads the model; node is the name of the only node to show, or null. Tells the extent of what is shown and its materials.
+// Loads the model in place of the one before; node is the name of the only node to show, or null. Tells the extent of what is shown and
+// its materials.
 window.load = async (node) => {
-  const textures = new KTX2Loader().setTranscoderPath("/three/examples/jsm/libs/basis/").detectSupport(renderer);
-  const gltf = await new GLTFLoader().setKTX2Loader(textures).loadAsync("/model.glb");
-  textures.dispose();
+  scene.traverse(({ geometry, material }) => {
+    geometry?.dispose();
+    material?.map?.dispose();
+    material?.dispose();
+  });
+  scene.clear();
+  const gltf = await loader.loadAsync("/model.glb");
   scene.add(gltf.scene);
   if (node !== null) await showOnly(gltf, node);
   scene.updateMatrixWorld(true);

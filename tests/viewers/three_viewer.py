@@ -5,14 +5,13 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import open_browser
 from numpy.typing import NDArray
 from playwright.sync_api import Browser, ConsoleMessage, Page, Route
 
@@ -68,54 +67,77 @@ class ThreeShow:
 
 
 class ThreeViewer:
-    """A running browser; made by :func:`open_three`."""
+    """A page with three.js, which shows one model after another; made by :func:`open_three`."""
 
     def __init__(self, browser: Browser, thread: ThreadPoolExecutor) -> None:
         self._browser, self._thread = browser, thread
+        self._page: Page | None = None
+        self._glb = Path()
+        self._errors, self._warnings = list[str](), list[str]()
 
     def render(self, glb: Path, camera: Camera, *, node: str | None = None) -> NDArray[np.float64]:
         """Pictures over white of a batch of cameras, [V, H, W, 3]; see :meth:`show`."""
         return self.show(glb, camera, node=node).images
 
     def show(self, glb: Path, camera: Camera, *, node: str | None = None) -> ThreeShow:
-        """Load a GLB into a page of its own and draw it from a batch of V cameras.
+        """Load a GLB and draw it from a batch of V cameras.
 
         ``node`` shows only the node of that name with its descendants, in the scene or beside it, as levels of detail are.
-        Whatever the page reports as an error is an ``AssertionError``.
+        Whatever the page reports as an error is an ``AssertionError``; the next model then has a new page.
         """
         return self._thread.submit(self._show, glb, camera.batch(), node).result()
 
     def _show(self, glb: Path, camera: Camera, node: str | None) -> ThreeShow:
-        page, errors, warnings = self._browser.new_page(), list[str](), list[str]()
-
-        def hear(message: ConsoleMessage) -> None:
-            if message.type == "error":
-                errors.append(message.text)
-            elif message.type == "warning" and message.text.startswith("THREE."):  # others are the GPU driver's, on speed
-                warnings.append(message.text)
-
-        page.on("console", hear)
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.route("**/*", lambda route: _answer(route, glb))
+        self._glb = glb
+        self._warnings.clear()
+        page = self._page = self._page or self._open()
         try:
-            page.goto(f"{ORIGIN}/three.html")
-            assert not errors, errors
             found = page.evaluate("node => window.load(node)", node)
             views = [_draw(page, camera[index], np.array([found["low"], found["high"]])) for index in range(len(camera))]
-        finally:
-            page.close()
-        assert not errors, errors
+            assert not self._errors, self._errors
+        except BaseException:
+            self._close()
+            raise
         images, calls, triangles = zip(*views, strict=True)
-        return ThreeShow(np.stack(images), calls, triangles, tuple(map(_material, found["materials"])), tuple(warnings))
+        return ThreeShow(np.stack(images), calls, triangles, tuple(map(_material, found["materials"])), tuple(self._warnings))
+
+    def _open(self) -> Page:
+        page = self._browser.new_page()
+        self._errors.clear()
+        page.on("console", self._hear)
+        page.on("pageerror", lambda error: self._errors.append(str(error)))
+        page.route("**/*", lambda route: _answer(route, self._glb))
+        try:
+            page.goto(f"{ORIGIN}/three.html")
+            assert not self._errors, self._errors
+        except BaseException:
+            page.close()
+            raise
+        return page
+
+    def _hear(self, message: ConsoleMessage) -> None:
+        if message.type == "error":
+            self._errors.append(message.text)
+        elif message.type == "warning" and message.text.startswith("THREE."):  # others are the GPU driver's, on speed
+            self._warnings.append(message.text)
+
+    def _close(self) -> None:
+        if self._page is not None:
+            self._page.close()
+            self._page = None
+
+    def close(self) -> None:
+        """Close the page."""
+        self._thread.submit(self._close).result()
 
 
 @contextmanager
-def open_three() -> Iterator[ThreeViewer]:
-    """A browser for as many GLBs as wanted; the test fails where there is no browser or no three.js."""
+def open_three(browser: Browser, thread: ThreadPoolExecutor) -> Iterator[ThreeViewer]:
+    """A page for as many GLBs as wanted; the test fails where there is no three.js."""
     if not (NODE / "node_modules" / "three").is_dir():
         pytest.fail(f"three.js is not installed: install Node.js and run `npm ci` in {NODE}")
-    with open_browser() as (browser, thread):
-        yield ThreeViewer(browser, thread)
+    with closing(ThreeViewer(browser, thread)) as viewer:
+        yield viewer
 
 
 def projection_matrix(camera: Camera, near: float, far: float) -> NDArray[np.float64]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
-from page_browser import Tab, open_tabs
+from page_browser import Browse, Tab, open_tab
+from playwright.sync_api import Browser
 
 import bbfit
 from bbfit.fitting.config import FitConfig
@@ -24,16 +27,14 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def browse() -> Iterator[Callable[[str], Tab]]:
+def browse(chromium: tuple[Browser, ThreadPoolExecutor]) -> Browse:
     """Opens tabs."""
-    with open_tabs() as begin:
-        yield begin
+    return partial(open_tab, *chromium)
 
 
 @pytest.fixture(scope="module")
-def opened(small_run: Path, browse: Callable[[str], Tab]) -> Iterator[tuple[Viewer, Tab]]:
+def opened(small_run: Path, browse: Browse) -> Iterator[tuple[Viewer, Tab]]:
     """The viewer of the small run, once its billboards are measured, and a tab on it."""
-    with bbfit.view(small_run, port=0) as viewer:
-        tab = browse(viewer.url)
+    with bbfit.view(small_run, port=0) as viewer, browse(viewer.url) as tab:
         tab.wait_until("bbfit.viewer.state.tree && !bbfit.viewer.state.tree.measuring")
         yield viewer, tab

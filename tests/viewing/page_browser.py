@@ -6,19 +6,20 @@ import io
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
-from browser import open_browser
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Page
+from playwright.sync_api import Browser, Page
 
 WIDTH, HEIGHT = 900, 360
 # The darkest channel of a pixel of the tree is darker than this, those of the ground's lines are lighter.
 DARK = 140
 T = TypeVar("T")
+Browse = Callable[[str], AbstractContextManager["Tab"]]
+"""Opens a tab on an address, and closes it at the end."""
 
 
 class Tab:
@@ -49,8 +50,22 @@ class Tab:
         return self.evaluate("name => document.querySelector(name).textContent", selector)
 
     def select(self, name: str, value: str) -> None:
-        """Choose an option of a control."""
-        self.do(lambda page: page.locator(f"[name={name}]").select_option(value))
+        """Choose an option of a control, if another is chosen."""
+
+        def choose(page: Page) -> None:
+            control = page.locator(f"[name={name}]")
+            if control.input_value() != value:
+                control.select_option(value)
+
+        self.do(choose)
+
+    def resize(self, width: int, height: int) -> None:
+        """Change the size of the window, and wait until the canvas has followed."""
+        self.do(lambda page: page.set_viewport_size({"width": width, "height": height}))
+        followed = (
+            "(canvas => canvas.width === canvas.clientWidth && canvas.height === canvas.clientHeight)(document.querySelector('canvas'))"
+        )
+        self.wait_until(f"innerWidth === {width} && innerHeight === {height} && {followed}")
 
     def picture(self, pane: str) -> NDArray[np.int64]:
         """The left or right pane once everything is loaded and drawn, without its header, [H, W, 3]."""
@@ -60,17 +75,15 @@ class Tab:
 
 
 @contextmanager
-def open_tabs() -> Iterator[Callable[[str], Tab]]:
-    """A browser. What is yielded opens a tab on an address. The test fails if there is no browser."""
-    with open_browser() as (browser, thread):
-
-        def begin(url: str) -> Tab:
-            page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-            tab = Tab(thread, page)
-            page.goto(url)
-            return tab
-
-        yield lambda url: thread.submit(begin, url).result()
+def open_tab(browser: Browser, thread: ThreadPoolExecutor, url: str) -> Iterator[Tab]:
+    """A tab on an address; a tab that stays open would go on drawing."""
+    page = thread.submit(browser.new_page, viewport={"width": WIDTH, "height": HEIGHT}).result()
+    try:
+        tab = Tab(thread, page)
+        tab.do(lambda page: page.goto(url))
+        yield tab
+    finally:
+        thread.submit(page.close).result()
 
 
 def wait_for(condition: Callable[[], T], seconds: float = 400.0) -> T:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlparse
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from page_browser import Tab, colored, wait_for
+from page_browser import HEIGHT, WIDTH, Browse, Tab, colored, wait_for
 from playwright.sync_api import Page
 
+import bbfit
 from bbfit.exporting.lod import glb_counts
 from bbfit.viewing.server import Viewer
 
@@ -24,8 +25,9 @@ DATA = Path(__file__).resolve().parents[2] / "data"
 
 @pytest.fixture(autouse=True)
 def at_the_start(opened: Opened) -> Iterator[None]:
-    """Every test begins with both trees side by side, and ends without errors in the browser."""
+    """Every test begins with both trees side by side in the same window, and ends without errors in the browser."""
     _, tab = opened
+    tab.resize(WIDTH, HEIGHT)
     tab.select("show", "both")
     tab.select("alpha", "mask")
     tab.select("level", "1")
@@ -227,29 +229,28 @@ def test_ten_thousand_trees_and_the_time_of_a_frame(opened: Opened) -> None:
     assert colored(tab.picture("left")).mean() > 0.02
 
 
-def test_every_tab_has_controls_of_its_own(opened: Opened, browse: Callable[[str], Tab]) -> None:
+def test_every_tab_has_controls_of_its_own(opened: Opened, browse: Browse) -> None:
     viewer, tab = opened
-    other = browse(viewer.url)
-    other.picture("left")
-    other.select("show", "original")
-    assert tab.evaluate("document.querySelector('[name=show]').value") == "both"
-    other.do(lambda page: page.close())
+    with browse(viewer.url) as other:
+        other.picture("left")
+        other.select("show", "original")
+        assert tab.evaluate("document.querySelector('[name=show]').value") == "both"
     assert colored(tab.picture("left")).mean() > 0.02
 
 
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (700, 500), (1280, 800)])
-def test_nothing_is_covered_or_cut_off(opened: Opened, browse: Callable[[str], Tab], width: int, height: int) -> None:
+def test_nothing_is_covered_or_cut_off(opened: Opened, width: int, height: int) -> None:
     """Panes, headers and the panel's controls do not overlap on phones or screens, and the page is no wider than the window."""
-    other = browse(opened[0].url)
-    other.do(lambda page: page.set_viewport_size({"width": width, "height": height}))
+    _, tab = opened
+    tab.resize(width, height)
     for pane in ("left", "right"):
-        mask = colored(other.picture(pane))
+        mask = colored(tab.picture(pane))
         edges = box(mask)
         assert edges[0] > 0 and edges[1] < mask.shape[0] - 1 and edges[2] > 0 and edges[3] < mask.shape[1] - 1
         assert max(np.diff(edges[:2])[0] / mask.shape[0], np.diff(edges[2:])[0] / mask.shape[1]) > 0.6
-    assert other.evaluate("document.documentElement.scrollWidth") == width
+    assert tab.evaluate("document.documentElement.scrollWidth") == width
     boxes = json.loads(
-        other.evaluate("JSON.stringify([...document.querySelectorAll('header, .area, aside')].map((e) => e.getBoundingClientRect()))")
+        tab.evaluate("JSON.stringify([...document.querySelectorAll('header, .area, aside')].map((e) => e.getBoundingClientRect()))")
     )
     assert len(boxes) == 5
     for index, one in enumerate(boxes):
@@ -257,14 +258,10 @@ def test_nothing_is_covered_or_cut_off(opened: Opened, browse: Callable[[str], T
             across = min(one["right"], two["right"]) - max(one["left"], two["left"])
             down = min(one["bottom"], two["bottom"]) - max(one["top"], two["top"])
             assert min(across, down) < 0.5
-    other.do(lambda page: page.close())
 
 
-def test_the_page_reports_that_the_viewer_has_ended(small_run: Path, browse: Callable[[str], Tab]) -> None:
-    import bbfit
-
-    with bbfit.view(small_run, port=0) as viewer:
-        tab = browse(viewer.url)
+def test_the_page_reports_that_the_viewer_has_ended(small_run: Path, browse: Browse) -> None:
+    with bbfit.view(small_run, port=0) as viewer, browse(viewer.url) as tab:
         tab.picture("left")
-    wait_for(lambda: "has ended" in tab.text("#status"))
-    tab.do(lambda page: page.close())
+        viewer.close()
+        wait_for(lambda: "has ended" in tab.text("#status"))

@@ -33,8 +33,8 @@ def test_view_says_where_it_is_and_ends_by_ctrl_c(small_run: Path) -> None:
     assert (process.returncode, out, err) == (0, "", "")
 
 
-def test_watching_where_nobody_can_stop_it_ends_with_the_run(tmp_path: Path) -> None:
-    words = ["fit", str(DATA / "views"), "--out", str(tmp_path / "run"), "--watch", "--port", "0"]
+def test_watching_where_nobody_can_stop_it_ends_with_the_run(views_folder: Path, tmp_path: Path) -> None:
+    words = ["fit", str(views_folder), "--out", str(tmp_path / "run"), "--watch", "--port", "0"]
     fit = ["--billboards", "1", "--placement", "even", "--steps", "4", "--levels", "1"]
     done = subprocess.run([*BBFIT, *words, *fit], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr

@@ -1,7 +1,11 @@
 "use strict";
 // The viewer's page. It asks the server for its state and for models; everything else, such as the choice of levels, happens here.
 (async () => {
-  const SLIDER_STEPS = 200, MEASURED_FRAMES = 8, KEPT_TIMES = 60;
+  const SLIDER_STEPS = 200, KEPT_TIMES = 60;
+  // Frames that are measured after a change: at most so many, and once there is the least number, only for so many milliseconds.
+  const MEASURED_FRAMES = 8, LEAST_FRAMES = 4, MEASURED_TIME = 250;
+  // Milliseconds between two questions to the server, while its answer is about to change and otherwise.
+  const SOON = 250, LATER = 1000;
   const $ = (id) => document.getElementById(id);
   const stage = $("stage"), panes = [$("left"), $("right")], form = document.forms[0], controls = form.elements;
   const THREE = await bbfit.library($("library"));
@@ -13,7 +17,7 @@
   const models = new Map(); // by address: null while it loads, false if that failed
   const intervals = [], durations = [];
   let state = { serial: -1, tree: null }, tree = null, status = "", error = "";
-  let field = null, plantedFor = "", loading = 0, dirty = true, toMeasure = 0, before = null, fitted = false, mode = "billboards";
+  let field = null, plantedFor = "", loading = 0, dirty = true, toMeasure = 0, measuredFrom = 0, before = null, fitted = false, mode = "billboards";
   const orbit = bbfit.createOrbit(THREE, canvas, () => { dirty = true; });
   for (const name of ["pointerdown", "wheel"]) canvas.addEventListener(name, () => {
     fitted = false;
@@ -59,7 +63,7 @@
       };
       load().catch((failure) => {
         models.set(address, false);
-        error = failure.message;
+        if (address.startsWith(`/${tree.generation}/`) || address === originalAddress()) error = failure.message;
       }).finally(() => {
         loading -= 1;
         measure();
@@ -75,10 +79,12 @@
     return modelAt(address, alpha !== "mask" && !split);
   }
 
+  const originalAddress = () => `/${tree.origin}/original.glb`;
+
   // Forget the models of trees that are not shown any more.
   function forget() {
     for (const [address, model] of models) {
-      if (model === null || address.startsWith(`/${tree.generation}/`) || groups.billboards.children.includes(model.root)) continue;
+      if (model === null || address.startsWith(`/${tree.generation}/`) || address === originalAddress() || groups.billboards.children.includes(model.root)) continue;
       for (const { geometry, material } of model.meshes ?? []) {
         geometry.dispose();
         material.map?.dispose();
@@ -104,6 +110,7 @@
   // A new state of the server.
   function accept(next) {
     const first = next.tree !== null && (tree === null || (tree.live && !next.tree.live)), start = tree === null;
+    if (next.tree?.generation !== tree?.generation) error = ""; // of a model that is no longer shown
     state = next;
     status = next.status;
     tree = next.tree;
@@ -226,7 +233,7 @@
   function update() {
     const distance = orbit.camera.position.distanceTo(middle()), focal = focalLength(), scale = focal / distance;
     const chosen = controls.level.value === "distance" ? chooseLevel(tree.levels, scale) : Number(controls.level.value);
-    const level = tree.levels[chosen], original = tree.original ? modelAt(`/${tree.generation}/original.glb`, false) : null;
+    const level = tree.levels[chosen], original = tree.original ? modelAt(originalAddress(), false) : null;
     if (original !== null && groups.original.children[0] !== original.root) groups.original.clear().add(original.root);
     if (mode === "field") shareOut();
     else if (level.cloud !== null) showBillboards(level);
@@ -284,13 +291,13 @@
     dirty = true;
   }
 
-  // Frames are drawn when something has changed, and some of them one after the other to measure them. The interval between two frames is
-  // at least the period of the screen; the duration ends when a pixel could be read back.
+  // Frames are drawn when something has changed, and once all is loaded some of them one after the other to measure them. The interval
+  // between two frames is at least the period of the screen; the duration ends when a pixel could be read back.
   function tick(now) {
     requestAnimationFrame(tick);
     resize();
     $("status").textContent = error || (loading ? "loading models … " : "") + status;
-    if (tree === null || !(dirty || toMeasure)) {
+    if (tree === null || !(dirty || (toMeasure && loading === 0))) {
       before = null;
       return;
     }
@@ -298,11 +305,12 @@
     const shown = update(), begun = performance.now();
     draw(shown);
     if (toMeasure && loading === 0) {
+      if (durations.length === 0) measuredFrom = now;
       const gl = renderer.getContext();
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
       remember(durations, performance.now() - begun);
       if (before !== null) remember(intervals, now - before);
-      toMeasure -= 1;
+      toMeasure = durations.length >= LEAST_FRAMES && now - measuredFrom > MEASURED_TIME ? 0 : toMeasure - 1;
     }
     before = now;
     const { calls, triangles } = renderer.info.render, parts = [];
@@ -320,7 +328,7 @@
     } catch {
       error = "the viewer has ended";
     }
-    setTimeout(poll, 1000);
+    setTimeout(poll, tree === null || tree.live || tree.measuring ? SOON : LATER);
   }
 
   function go(distance) {
