@@ -9,6 +9,7 @@ import ast
 import base64
 import io
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +28,23 @@ NAMES = [
     "05_placement_and_budgets",
     "06_into_an_engine",
 ]
-# Runs before the first cell. What is tested is that every cell works; the length of a fit is the reader's choice.
-SHORT = """
+# Runs before the first cell of each, in the kernel that they share. What is tested is that every cell works; the length of a fit is the
+# reader's choice.
+PREPARE = """
+%reset_selective -f .
 def _shorten_fits():
-    import bbfit, dataclasses
+    import bbfit, dataclasses, functools
     def shortened(function):
+        @functools.wraps(function)
         def work(views, config=bbfit.FitConfig(), *more, **named):
             steps = min(config.steps or 100, 100)
             short = dataclasses.replace(config, steps=steps, restarts=1, candidates=2, refinement_rounds=0)
             return function(views, short, *more, **named)
         return work
-    bbfit.fit, bbfit.choose = shortened(bbfit.fit), shortened(bbfit.choose)
+    if not hasattr(bbfit.fit, "__wrapped__"):
+        bbfit.fit, bbfit.choose = shortened(bbfit.fit), shortened(bbfit.choose)
 _shorten_fits()
+del _shorten_fits
 """
 
 
@@ -64,14 +70,22 @@ def test_notebook_is_committed_clean(name: str) -> None:
             assert not (isinstance(node, ast.ImportFrom | ast.Import) and "warnings" in ast.unparse(node)), "it hides warnings"
 
 
+@pytest.fixture(scope="module")
+def kernel() -> Iterator[NotebookClient]:
+    """A Python that runs notebooks one after another. A new one for each would import everything six times."""
+    client = NotebookClient(nbformat.v4.new_notebook(), timeout=None, kernel_name="python3", resources={"metadata": {"path": NOTEBOOKS}})
+    with client.setup_kernel():
+        yield client
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of the notebook client's own dependencies
-def test_notebook_runs_and_shows_pictures(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")  # beside other tests, threads that spin while they wait take five times as long
+def test_notebook_runs_and_shows_pictures(name: str, kernel: NotebookClient) -> None:
     before = _contents()
-    notebook = _read(name)
-    notebook.cells.insert(0, nbformat.v4.new_code_cell(SHORT))
-    NotebookClient(notebook, timeout=None, kernel_name="python3", resources={"metadata": {"path": NOTEBOOKS}}).execute()
+    kernel.nb = notebook = _read(name)
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(PREPARE))
+    for index, cell in enumerate(notebook.cells):
+        kernel.execute_cell(cell, index)
 
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert [output["text"] for output in outputs if output.get("name") == "stderr"] == []

@@ -125,7 +125,7 @@ def plain_figure(
     from matplotlib.figure import Figure
 
     wide, high = (width - left - right - between * (columns - 1)) / columns, (height - bottom - top - between * (rows - 1)) / rows
-    figure = Figure(figsize=(width, height), dpi=dpi)
+    figure = Figure(figsize=(width, height), dpi=dpi, layout="none")  # whatever the settings of a notebook say
     figure.subplots_adjust(left / width, bottom / height, 1 - right / width, 1 - top / height, between / wide, between / high)
     return figure
 
