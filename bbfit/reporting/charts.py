@@ -180,7 +180,7 @@ def loss_chart(losses: Sequence[float]) -> Chart:
 
 def _figure(height: float, panels: int = 1, *, left: float = 0.52) -> Figure:
     """A figure with panels below each other and a margin of ``left`` inches."""
-    return plain_figure(_WIDTH, height, 72, rows=panels, left=left, right=0.15, bottom=0.52, top=0.33, between=0.45)
+    return plain_figure((_WIDTH, height), 72, panels=(panels, 1), margins=(left, 0.15, 0.52, 0.33), between=0.45)
 
 
 def _plain(axes: Axes) -> None:

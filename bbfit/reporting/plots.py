@@ -106,33 +106,31 @@ def spread_views(angles: NDArray[np.float64], count: int) -> list[int]:
 
 
 def plain_figure(
-    width: float,
-    height: float,
+    size: tuple[float, float],
     dpi: int,
     *,
-    rows: int = 1,
-    columns: int = 1,
-    left: float = 0.8,
-    right: float = 0.2,
-    bottom: float = 0.6,
-    top: float = 0.4,
+    panels: tuple[int, int] = (1, 1),
+    margins: tuple[float, float, float, float] = (0.8, 0.2, 0.6, 0.4),
     between: float = 0.0,
 ) -> Figure:
-    """A figure of matplotlib with margins, and gaps between its panels, in inches.
+    """A figure of matplotlib of a width and height, with left, right, lower and upper margins and gaps between its panels, in inches.
 
-    An automatic layout would measure every text several times, which takes longer than to draw the figure.
+    ``panels`` is the number of rows and of columns. An automatic layout would measure every text several times, which takes longer than to
+    draw the figure.
     """
     from matplotlib.figure import Figure
 
+    (width, height), (left, right, bottom, top), (rows, columns) = size, margins, panels
     wide, high = (width - left - right - between * (columns - 1)) / columns, (height - bottom - top - between * (rows - 1)) / rows
-    figure = Figure(figsize=(width, height), dpi=dpi, layout="none")  # whatever the settings of a notebook say
+    figure = Figure(figsize=size, dpi=dpi)
+    figure.set_layout_engine("none")  # whatever the settings of a notebook say
     figure.subplots_adjust(left / width, bottom / height, 1 - right / width, 1 - top / height, between / wide, between / high)
     return figure
 
 
 def loss_plot(losses: Sequence[float], path: str | Path, *, label: str = "loss") -> None:
     """Write a PNG with :func:`draw_losses`, completely or not at all."""
-    figure = plain_figure(9, 5, 120)
+    figure = plain_figure((9, 5), 120)
     axes = figure.add_subplot()
     draw_losses(axes, losses, label)
     axes.grid(True, color="#e4e7ea", linewidth=0.6)
@@ -180,7 +178,7 @@ def pareto_plot(choice: Choice, path: str | Path, *, cost: Cost = "vertices") ->
     If the budget limits another ``cost`` than vertices, that gets a second panel.
     """
     costs: list[Cost] = ["vertices"] if cost == "vertices" else ["vertices", cost]
-    figure = plain_figure(9 if len(costs) == 1 else 14, 5, 120, columns=len(costs), between=0.6)
+    figure = plain_figure((9 if len(costs) == 1 else 14, 5), 120, panels=(1, len(costs)), between=0.6)
     for axes, name in zip(figure.subplots(1, len(costs), squeeze=False)[0], costs, strict=True):
         _draw_front(axes, choice, name)
     figure.axes[0].set_ylabel("PSNR over white of validation views, dB")
