@@ -54,6 +54,7 @@ MARKED = {
         "exporting/test_splitting.py",
         "fitting/test_loop.py",
         "fitting/test_max_texels.py",
+        "fitting/test_moves.py",
         "fitting/test_search.py",
         "fitting/test_steps.py",
         "operators/test_fused.py",

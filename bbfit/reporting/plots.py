@@ -122,8 +122,7 @@ def plain_figure(
 
     (width, height), (left, right, bottom, top), (rows, columns) = size, margins, panels
     wide, high = (width - left - right - between * (columns - 1)) / columns, (height - bottom - top - between * (rows - 1)) / rows
-    figure = Figure(figsize=size, dpi=dpi)
-    figure.set_layout_engine("none")  # whatever the settings of a notebook say
+    figure = Figure(figsize=size, dpi=dpi, layout="none")  # type: ignore[arg-type]  # whatever a notebook's settings say
     figure.subplots_adjust(left / width, bottom / height, 1 - right / width, 1 - top / height, between / wide, between / high)
     return figure
 
