@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 torch.set_num_threads(1)
+gc.disable()  # until the tests are collected: most of what that makes stays, and to look for garbage in it takes a third of the time
 
 TESTS = Path(__file__).resolve().parent
 SHARED = TESTS.parent / "../shared"
@@ -92,15 +95,26 @@ FIRST = (
 assert all((TESTS / place).exists() for place in (*FIRST, *sum(MARKED.values(), ()))), "a module has moved"
 
 
+@cache
+def markers_of(path: Path) -> list[str]:
+    """Markers of all tests in a file."""
+    place = path.relative_to(TESTS) if path.is_relative_to(TESTS) else path
+    return [marker for marker, folders in MARKED.items() if any(place.is_relative_to(folder) for folder in folders)]
+
+
+def pytest_collection_finish() -> None:
+    """Look for garbage from now on."""
+    gc.freeze()
+    gc.enable()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark tests by what they need, and put those that take long first."""
-    places = [TESTS / place for place in FIRST]
-    items.sort(key=lambda item: places.index(item.path) if item.path in places else len(places))
+    places = {TESTS / place: index for index, place in enumerate(FIRST)}
+    items.sort(key=lambda item: places.get(item.path, len(places)))
     for item in items:
-        place = item.path.relative_to(TESTS) if item.path.is_relative_to(TESTS) else item.path
-        for marker, folders in MARKED.items():
-            if any(place.is_relative_to(folder) for folder in folders):
-                item.add_marker(marker)
+        for marker in markers_of(item.path):
+            item.add_marker(marker)
         for fixture, marker in MARKED_FIXTURES.items():
             if fixture in getattr(item, "fixturenames", ()):
                 item.add_marker(marker)

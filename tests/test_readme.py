@@ -233,7 +233,7 @@ def run_mkdocs(words: list[str], place: Place) -> None:
 
 
 DONE: dict[tuple[str, ...], Path] = {}
-"""Commands that were run before, on another page, and where: with the same stand-ins they would do the same."""
+"""Commands that were run before without the values of ``--out``, and what they wrote: with the same stand-ins they would do the same."""
 RUNNERS: dict[str, Callable[[list[str], Place], None]] = {
     "bbfit": run_bbfit,
     "pip": run_pip,
@@ -275,15 +275,15 @@ def test_commands_run(page: Path, place: Place) -> None:
     for block in blocks(page):
         for words in block.commands if block.language == "sh" else []:
             assert words[0] in RUNNERS, f"{block}: nobody knows how to run {' '.join(words)}"
-            earlier = DONE.get(tuple(words))
+            number = words.index("--out") + 1 if "--out" in words else None
+            same = tuple(word for index, word in enumerate(words) if index != number)
+            earlier = DONE.get(same)
             if earlier is None:
                 RUNNERS[words[0]](words[1:], place)
-                DONE[tuple(words)] = place.folder
-            elif "--out" in words:  # for the commands that follow
-                out = words[words.index("--out") + 1]
-                copy = shutil.copytree if (earlier / out).is_dir() else shutil.copy
-                if not Path(out).exists():
-                    copy(earlier / out, out)
+                DONE[same] = place.folder / words[number] if number else place.folder
+            elif number and not Path(words[number]).exists():  # for the commands that follow
+                Path(words[number]).parent.mkdir(parents=True, exist_ok=True)
+                (shutil.copytree if earlier.is_dir() else shutil.copy)(earlier, words[number])
 
 
 @with_code("python")
