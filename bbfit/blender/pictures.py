@@ -18,9 +18,9 @@ from bbfit.blender.config import ViewsConfig
 from bbfit.blender.processes import BlenderPool, require_bpy
 from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputError, check_range, fail
-from bbfit.files import output_folder
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, camera_to_nerf
 from bbfit.images import read_rgba
+from bbfit.outputs import claimed_folder
 from bbfit.tree_files.tree_file import TreeFile
 
 PICTURES_FILE = "pictures.json"
@@ -96,9 +96,8 @@ def render_pictures(
     if not missing:
         return paths
     require_bpy()
-    with BlenderPool(worker_settings(tree, config, size, len(missing))) as pool:
+    with claimed_folder("out", out), BlenderPool(worker_settings(tree, config, size, len(missing))) as pool:
         points = to_y_up(pool.load()["payload"])
-        output_folder("out", out)
         request.save(out / PICTURES_FILE)
         visible = clips or [clip_distances(points, position) for position in cameras.position]
         report, finished = on_progress, count - len(missing)

@@ -204,7 +204,7 @@ def render(frame: dict[str, Any]) -> None:
     lens.clip_start, lens.clip_end = frame["clip"]
     scene.camera.matrix_world = Matrix(frame["camera_to_world"])
     scene.cycles.seed = frame["seed"]
-    part = path.with_name(f".{path.name}.part")
+    part = path.with_name(f".bbfit-{path.stem}.part")
     scene.render.filepath = str(part).replace("{", "{{").replace("}", "}}")  # Blender would replace {names}
     try:
         bpy.ops.render.render(write_still=True)

@@ -78,7 +78,7 @@ def grow_command(
         list: List the species and the file of their parameters, and grow nothing.
         grow: How it is grown.
     """
-    from bbfit.model_files import check_model_path
+    from bbfit.model_files import check_model_path, names_beside
     from bbfit.trees import growth
     from bbfit.trees.species import figures_file, known_species, load_species
 
@@ -88,14 +88,16 @@ def grow_command(
         out_console.print(species_table([load_species(name, grow.species_file) for name in known_species(grow.species_file)]))
         out_console.print(f"figures in {grow.species_file or figures_file()}", soft_wrap=True, highlight=False)
         return
+    from bbfit.outputs import single_files
     from bbfit.trees.tree_writer import write_tree
 
     figures = load_species(species, grow.species_file)
     if out is None:
         fail("out", "a file to write the tree to is missing", f"for example --out {figures.name}.glb")
     check_model_path("tree", out)
-    scene = growth.grow(figures, seed=grow.seed, detail=grow.detail, leaves=grow.leaves, max_vertices=grow.max_vertices)
-    paths = write_tree(scene, out)
+    with single_files("bbfit grow", out.parent, names_beside(out), [grow.species_file] if grow.species_file else []):
+        scene = growth.grow(figures, seed=grow.seed, detail=grow.detail, leaves=grow.leaves, max_vertices=grow.max_vertices)
+        paths = write_tree(scene, out)
     out_console.print(f"{figures.name}: {sum(len(mesh.vertices) for mesh in scene.geometry.values()):,} vertices")
     for path in paths:
         out_console.print(f"{path}  {path.stat().st_size:,} bytes", soft_wrap=True)
@@ -186,8 +188,8 @@ def evaluate_command(
     """
     from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
-    from bbfit.files import output_folder
     from bbfit.geometry.cloud import BillboardCloud
+    from bbfit.outputs import claimed_folder, single_files, used_folder
     from bbfit.reporting.tables import report_table
     from bbfit.stages.results import original_tree
     from bbfit.tree_files.tree_file import TreeFile
@@ -196,12 +198,15 @@ def evaluate_command(
     billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
     out, earlier = out or cloud.with_name("metrics.json"), cloud.with_name("metrics.json")
     seconds = Report.load(earlier).seconds if earlier.is_file() else {}
-    output_folder("out", out.parent)
-    with progress() as on_progress:
-        original = original_tree(dataset, None if tree is None else TreeFile.open(tree))
-        report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=partial(on_progress, "evaluate"))
-    report = replace(report, seconds={**seconds, **report.seconds})
-    report.save(out)
+    mesh = None if tree is None else TreeFile.open(tree)
+    inputs = [cloud, *dataset.train.paths, *dataset.test.paths, *(mesh.files if mesh else ())]
+    use = claimed_folder if out == earlier else used_folder  # no other process may be at work in the run's folder
+    with use("out", out.parent) as folder, single_files("evaluate", folder, [out.name], inputs):
+        with progress() as on_progress:
+            original = original_tree(dataset, mesh)
+            report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=partial(on_progress, "evaluate"))
+        report = replace(report, seconds={**seconds, **report.seconds})
+        report.save(out)
     out_console.print(report_table(report, thesis=False))
     out_console.print(f"measures in {out}", soft_wrap=True)
 
@@ -223,8 +228,14 @@ def export_command(
     """
     from bbfit.exporting import model
     from bbfit.geometry.cloud import BillboardCloud
+    from bbfit.model_files import check_model_path, names_beside
+    from bbfit.outputs import single_files
 
-    for path in model.export(BillboardCloud.load(cloud), out, export):
+    billboards, out = BillboardCloud.load(cloud), check_model_path("model file", out)
+    names = names_beside(out, texture=True, mip_files=export.resolve().mip_files)
+    with single_files("bbfit export", out.parent, names, [cloud]):
+        paths = model.export(billboards, out, export)
+    for path in paths:
         out_console.print(f"{path}  {path.stat().st_size:,} bytes")
     show_missing_encoder(export)
 

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.checks import InputError
-from bbfit.files import output_folder, read_json, write_json
+from bbfit.files import read_json, remove_parts, write_json
+from bbfit.outputs import output_folder
 from bbfit.sweep.tasks import Outcome
 
 
@@ -17,6 +18,7 @@ class Results:
     def __init__(self, folder: Path) -> None:
         """Create the folder if it does not exist."""
         self._folder = output_folder("out", folder)
+        remove_parts(folder)
 
     def get(self, key: str) -> Outcome | None:
         """The stored outcome with a key. ``None`` if its file is missing or damaged."""
