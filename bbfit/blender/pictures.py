@@ -133,12 +133,17 @@ def vertical_axis(low: NDArray[np.floating], high: NDArray[np.floating], axis: s
     return target
 
 
+def tree_settings(tree: TreeFile) -> dict[str, Any]:
+    """The worker's settings for a tree: its main file, and all files that Blender may read for it."""
+    return {"tree": str(tree.path.resolve()), "files": [str(file.resolve()) for file in tree.files]}
+
+
 def worker_settings(tree: TreeFile, config: ViewsConfig, size: int, count: int) -> dict[str, Any]:
     """The worker's settings for ``count`` pictures of ``size`` x ``size`` pixels."""
     azimuth, elevation = math.radians(config.sun_azimuth), math.radians(config.sun_elevation)
     across = math.cos(elevation)
     return {
-        "tree": str(tree.path.resolve()),
+        **tree_settings(tree),
         "size": size,
         "samples": config.samples,
         "denoise": config.denoise,

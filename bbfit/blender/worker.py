@@ -87,7 +87,7 @@ def _listen(requests: queue.Queue[dict[str, Any]]) -> None:
 def convert(settings: dict[str, Any], answer: Any) -> None:
     """Load the tree and write it as a GLB file."""
     tree, path, triangles = settings["tree"], settings["convert"]["path"], settings["convert"]["triangles"]
-    _, facts = SCENE.open_tree(tree)
+    _, facts = SCENE.open_tree(tree, settings["files"])
     try:
         count = import_beside("worker_glb").write(path, triangles)
     except RuntimeError as error:  # any failure of the exporter
@@ -102,7 +102,7 @@ def prepare(settings: dict[str, Any], answer: Any) -> None:
     """Load the tree, set up light, camera and renderer, and report the measurements of the tree."""
     import bpy
 
-    points, facts = SCENE.open_tree(settings["tree"])
+    points, facts = SCENE.open_tree(settings["tree"], settings["files"])
     add_light(settings)
     set_up_cycles(settings)
     camera = bpy.data.objects.new("bbfit camera", bpy.data.cameras.new("bbfit camera"))

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from bbfit.checks import MissingFileError, fail
 from bbfit.glb import gltf_parts
+from bbfit.inputs import InputLimits
 
 _FLOAT = 5126
 
 
-def read_gltf(path: Path) -> tuple[list[Path], list[NDArray[np.float32]]]:
+def read_gltf(path: Path, limits: InputLimits) -> tuple[list[Path], list[NDArray[np.float32]]]:
     """The files that a .gltf or .glb refers to, and the vertex positions of its primitives, [P, 3] each.
 
     Packed, sparse and damaged positions are omitted. The program that loads the file checks those. Raises ``MissingFileError`` or
@@ -35,7 +36,7 @@ def read_gltf(path: Path) -> tuple[list[Path], list[NDArray[np.float32]]]:
             elif not isinstance(uri, str):
                 fail("tree", f"{path} has a damaged list of {kind}", "export the tree again")
             elif not uri.startswith("data:"):
-                files.append(_inside_folder(path, uri))
+                files.append(_referenced(path, uri, limits))
                 data = files[-1].read_bytes() if kind == "buffers" else b""
             elif kind == "buffers":
                 data = _decode_data_uri(path, uri)
@@ -51,14 +52,12 @@ def _entries(content: dict[str, Any], kind: str) -> list[dict[str, Any]]:
     return [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
 
 
-def _inside_folder(path: Path, uri: str) -> Path:
-    """The file that a URI of a glTF refers to. It must lie in the folder of the glTF or below it."""
+def _referenced(path: Path, uri: str, limits: InputLimits) -> Path:
+    """The file that a URI of a glTF refers to."""
     name = unquote(uri).replace("\\", "/")
-    folder = path.parent.resolve()
-    scheme = re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", name)
-    if scheme or name.startswith("/") or not (folder / name).resolve().is_relative_to(folder):
-        fail("tree", f"{path} refers to {uri}, outside its own folder", "export the tree as one .glb file")
-    target = path.parent / name
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", name):
+        fail("tree", f"{path} refers to {uri}, which is no file", "export the tree as one .glb file")
+    target = limits.referenced("tree", path, name, path.parent)
     if not target.is_file():
         raise MissingFileError(f"tree: {path} refers to {uri}, which does not exist; export the tree as one .glb file")
     return target

@@ -10,10 +10,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from bbfit.checks import check_file, fail
+from bbfit.inputs import InputLimits, reading
 from bbfit.provenance import digest_files
+from bbfit.tree_files.blend import blend_files
+from bbfit.tree_files.fbx import fbx_files
 from bbfit.tree_files.gltf import read_gltf
 from bbfit.tree_files.obj import obj_files
 from bbfit.tree_files.ply import ply_positions
+from bbfit.tree_files.usd import usd_files
 
 if TYPE_CHECKING:
     import trimesh
@@ -24,6 +28,8 @@ UP_AXES: dict[str, UpAxis] = {
     **dict.fromkeys((".ply", ".stl", ".blend"), "z"),
 }
 """The formats of trees, and the axis that points up in each. An FBX or a USD file can declare another axis, which its importer uses."""
+_REFERENCES = {".obj": obj_files, ".fbx": fbx_files, ".blend": blend_files}
+_REFERENCES |= dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), usd_files)
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 """The formats whose triangles can be read without Blender."""
 
@@ -33,14 +39,14 @@ class TreeFile:
     """A tree on disk, opened and checked once by :meth:`open`. Trees with the same digest have the same contents."""
 
     files: tuple[Path, ...]
-    """All files of the tree: the main file first, then the files that it refers to (glTF, OBJ)."""
+    """All files of the tree: the main file first, then the files that it refers to."""
     digest: str
     """SHA-256 over the contents of all files (:func:`bbfit.provenance.digest_files`)."""
     bytes: int
     """Total size of the files."""
 
     @staticmethod
-    def open(tree: str | Path | TreeFile) -> TreeFile:
+    def open(tree: str | Path | TreeFile, limits: InputLimits = InputLimits()) -> TreeFile:  # noqa: B008
         """Find the files of a tree, check them, and compute the digest. This loads no geometry.
 
         Parameters
@@ -48,14 +54,17 @@ class TreeFile:
         tree
             The path of a .glb, .gltf, .obj, .fbx, .usd, .usda, .usdc, .usdz, .ply, .stl or .blend file. A ``TreeFile`` is returned
             unchanged.
+        limits
+            What the tree may refer to, and how large it may be.
 
         Raises
         ------
         MissingFileError
             If the file is missing, or a file that a glTF refers to.
         InputError
-            If the file is empty, of an unknown format, or a damaged glTF. If a glTF refers to a file outside its folder. If a glTF or PLY
-            has vertices that are NaN or infinite. Blender's importers of these two formats would silently replace them by 0.
+            If the file is empty, of an unknown format, or damaged. If it exceeds ``limits``, or refers to a file outside its folder that
+            they do not allow. If a glTF or PLY has vertices that are NaN or infinite. Blender's importers of these two formats would
+            silently replace them by 0.
         """
         if isinstance(tree, TreeFile):
             return tree
@@ -65,15 +74,18 @@ class TreeFile:
             fail("tree", f"{path} has an unknown format", f"expected one of {' '.join(UP_AXES)}")
         others, positions = list[Path](), list[np.ndarray]()
         if suffix in (".glb", ".gltf"):
-            others, positions = read_gltf(path)
-        elif suffix == ".obj":
-            others = obj_files(path)
+            others, positions = read_gltf(path, limits)
+        elif suffix in _REFERENCES:
+            with reading("tree", path, "export the tree again"):
+                others = _REFERENCES[suffix](path, limits)
         elif suffix == ".ply" and (points := ply_positions(path.read_bytes())) is not None:
             positions = [points]
         if not all(np.isfinite(points).all() for points in positions):
             fail("tree", f"{path} has vertices that are NaN or infinite", "export the tree again")
         files = (path, *others)
-        return TreeFile(files, digest_files(files, path.parent), sum(file.stat().st_size for file in files))
+        size = sum(file.stat().st_size for file in files)
+        limits.at_most("max_input_bytes", "tree", path, size, "bytes")
+        return TreeFile(files, digest_files(files, path.parent), size)
 
     @property
     def path(self) -> Path:
