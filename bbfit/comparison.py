@@ -111,7 +111,7 @@ def compare(
         If the tree cannot be used or a file cannot be written. If a package is missing, the row of the system has no scores but a note.
     """
     config, stages, on_progress = config or CompareConfig(), stages or RunConfig(), on_progress or silent
-    tree = TreeFile.open(tree)
+    tree = TreeFile.open(tree, stages.limits)
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "the comparison sets their numbers", "omit billboards and budgets")
     with claimed_folder("out", out) as folder:

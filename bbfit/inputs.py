@@ -12,6 +12,8 @@ from pathlib import Path
 from bbfit.checks import Count, InputError, check_fields, check_folder, fail
 
 _LONGEST_REASON = 200
+_HINTS = {"tree": "export the tree as one .glb file, or ", "views": "copy the pictures into the folder of the views, or "}
+_ALLOW = "allow the other folder with --allow-folders"
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,7 @@ class InputLimits:
             admitted = self.admits(path, folder)
             kind = path.stat().st_mode if path.exists() else None
         if not admitted:
-            hint = "put all files into one folder, or allow theirs with --allow-folders"
-            fail(name, f"{source} refers to {reference}, outside its own folder", hint)
+            fail(name, f"{source} refers to {reference}, outside its own folder", _HINTS.get(name, "") + _ALLOW)
         if kind is not None and not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
             fail(name, f"{source} refers to {reference}, which is a device or a pipe", "replace it by a file")
         return path

@@ -85,7 +85,7 @@ def build_lod(
         fail("out", f"{out} ends in {out.suffix or 'nothing'}", "give a name that ends in .glb")
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "planes sets the number of billboards of each level", "omit billboards and budgets")
-    tree = TreeFile.open(tree)
+    tree = TreeFile.open(tree, stages.limits)
     with used_folder("out's folder", out.parent), claimed_folder("work", work or out.with_suffix("")) as folder:
         return _built(tree, out, config, stages, folder, on_progress)
 

@@ -181,6 +181,13 @@ class Written:
             self._begun.pop(by, None)
             self._files |= {path: {"by": by, "sha256": digest} for path, digest in digests.items()}
 
+    def abandon(self, by: str, names: Sequence[str]) -> None:
+        """Record that work which was begun ended without a result. Files that it wrote still count as its own."""
+        left = (self._relative(path) for path in self._existing(names))
+        if all(path in self._files and self._files[path]["sha256"] == digest_file(self._folder / path) for path in left):
+            with contextlib.suppress(InputError), self._changing():  # the folder may be gone, which was the reason
+                self._begun.pop(by, None)
+
     def _existing(self, names: Sequence[str]) -> list[Path]:
         paths = [path for name in names for path in (sorted(self._folder.glob(name)) if "*" in name else [self._folder / name])]
         return [path for path in paths if path.is_file()]

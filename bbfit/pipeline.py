@@ -18,6 +18,7 @@ from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.inputs import InputLimits
 from bbfit.outputs import claimed_folder
 from bbfit.stages.billboards import BUDGET_OUTPUTS, FIT_OUTPUTS, budget_stage, fit_stage, read_choice
 from bbfit.stages.results import (
@@ -55,6 +56,8 @@ class RunConfig:
     """Limits of the result. They determine the options of the fit that ``fit`` does not set."""
     export: ExportConfig = field(default_factory=ExportConfig)
     """Options for writing the model."""
+    limits: InputLimits = field(default_factory=InputLimits)
+    """What the tree and the views may refer to, and how large they may be."""
 
     def seeded(self, seed: int) -> RunConfig:
         """The same options with one seed for growing, rendering and fitting."""
@@ -175,12 +178,12 @@ def prepare(
         fail("run", f"{path} is given, so no tree is grown", "omit the species and the options for growing")
     elif views_folder is not None:
         views = ViewDataset.load(views_folder, seed=config.fit.seed)  # check the inputs before creating the output folder
-        mesh = None if config.tree is None else TreeFile.open(config.tree)
+        mesh = None if config.tree is None else TreeFile.open(config.tree, config.limits)
         head = _head(str(views_folder.resolve()), config, rendered=False)
         with _record(out, head, config, [*views.train.paths, *views.test.paths, *(mesh.files if mesh else ())]) as record:
             yield Prepared(record, mesh, views)
     else:
-        tree = TreeFile.open(source)
+        tree = TreeFile.open(source, config.limits)
         head = _head(str(tree.path.resolve()), config, rendered=True)
         with _record(out, head, config, [*tree.files, config.views.hdri]) as record:
             yield _rendered(record, tree, config, on_progress)

@@ -212,11 +212,23 @@ def render(frame: dict[str, Any]) -> None:
         reason = " ".join(str(error).split()).removeprefix("Error: ")
         raise SCENE.InputRefused("views", f"{path} could not be rendered ({reason})", RESUME_HINT) from error
     try:
-        if not part.read_bytes().endswith(b"IEND\xaeB`\x82"):
+        picture = part.read_bytes()
+        if not picture.endswith(b"IEND\xaeB`\x82"):
             raise SCENE.InputRefused("views", f"{path} could not be written completely", RESUME_HINT)
+        part.write_bytes(without_texts(picture))
         part.replace(path)
     except OSError as error:
         raise SCENE.InputRefused("views", f"{path} could not be written ({error.strerror})", RESUME_HINT) from error
+
+
+def without_texts(png: bytes) -> bytes:
+    """A PNG without texts: Cycles writes its seconds into them, so that no two renders would have the same bytes."""
+    kept, start = png[:8], 8
+    while start < len(png):
+        end = start + 12 + int.from_bytes(png[start : start + 4], "big")
+        kept += b"" if png[start + 4 : start + 8] == b"tEXt" else png[start:end]
+        start = end
+    return kept
 
 
 if __name__ == "__main__":

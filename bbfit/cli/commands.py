@@ -16,6 +16,7 @@ from bbfit.cli.console import out_console, progress, show, show_missing_encoder
 from bbfit.cli.viewing import WatchConfig, watched
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.fitting.config import FitConfig
+from bbfit.inputs import InputLimits
 from bbfit.trees.config import GrowConfig
 
 
@@ -30,6 +31,7 @@ def run_command(
     fit: FitConfig = FitConfig(),  # noqa: B008
     budget: BudgetConfig = BudgetConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
     page: WatchConfig = WatchConfig(),  # noqa: B008
 ) -> None:
     """Do everything: take a tree or grow one, render views of it, fit billboards to them, write the models and a report with the scores.
@@ -48,11 +50,12 @@ def run_command(
         fit: How the billboards are fitted. The preset decides options that are not given.
         budget: What the result may cost. With any limit, short fits choose the number of billboards.
         export: How the models are written.
+        limits: What the tree and the views may refer to, and how large they may be.
         page: Watching the fit in a browser.
     """
     from bbfit.pipeline import RunConfig, run
 
-    config = RunConfig(species=species, grow=grow, views=views, fit=fit, budget=budget, export=export)
+    config = RunConfig(species=species, grow=grow, views=views, fit=fit, budget=budget, export=export, limits=limits)
     with watched(page, out, tree, None, fit) as display:
         with display.progress() as on_progress:
             result = run(tree, out, config, on_progress=on_progress, on_step=display.on_step)
@@ -108,6 +111,7 @@ def views_command(
     /,
     out: Path,
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
 ) -> None:
     """Render views of a tree from all around with Blender, into a folder in the NeRF-synthetic layout.
 
@@ -119,11 +123,13 @@ def views_command(
         tree: The tree's file (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
         out: Folder for the views; one with a part of them is completed.
         views: How the tree is rendered.
+        limits: What the tree and the views may refer to, and how large they may be.
     """
     from bbfit.blender.views_folder import render_views
+    from bbfit.tree_files.tree_file import TreeFile
 
     with progress() as on_progress:
-        render_views(tree, out, views, on_progress=lambda done, total: on_progress("views", done, total))
+        render_views(TreeFile.open(tree, limits), out, views, on_progress=lambda done, total: on_progress("views", done, total))
     out_console.print(f"{views.count} views in {out}")
 
 
@@ -135,6 +141,7 @@ def fit_command(
     fit: FitConfig = FitConfig(),  # noqa: B008
     budget: BudgetConfig = BudgetConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
     page: WatchConfig = WatchConfig(),  # noqa: B008
 ) -> None:
     """Fit billboards to a folder of views, write the models and a report with the scores. Needs no Blender.
@@ -150,6 +157,7 @@ def fit_command(
         fit: How the billboards are fitted. The preset decides options that are not given.
         budget: What the result may cost. With any limit, short fits choose the number of billboards.
         export: How the models are written.
+        limits: What the tree and the views may refer to, and how large they may be.
         page: Watching the fit in a browser.
     """
     from bbfit.checks import check_folder
@@ -158,7 +166,7 @@ def fit_command(
     if views.is_file():
         fail("views", f"{views} is a file", "give a folder of views; bbfit run takes a tree")
     check_folder("views", views)
-    stages = RunConfig(tree=tree, fit=fit, budget=budget, export=export)
+    stages = RunConfig(tree=tree, fit=fit, budget=budget, export=export, limits=limits)
     with watched(page, out, views, tree, fit) as display:
         with display.progress() as on_progress:
             result = run(views, out, stages, on_progress=on_progress, on_step=display.on_step)
@@ -174,6 +182,7 @@ def evaluate_command(
     out: Path | None = None,
     tree: Path | None = None,
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
 ) -> None:
     """Score fitted billboards on the held-out views of a folder, which they were not fitted to.
 
@@ -185,6 +194,7 @@ def evaluate_command(
         out: File for the measures as JSON. Default: metrics.json beside the cloud, which replaces the one of its run.
         tree: The mesh that the views show, for its vertices and bytes, if the views were not rendered by bbfit.
         export: How the model is exported, if not by default. The scores are those of the exported model.
+        limits: What the tree and the views may refer to, and how large they may be.
     """
     from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
@@ -198,7 +208,7 @@ def evaluate_command(
     billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
     out, earlier = out or cloud.with_name("metrics.json"), cloud.with_name("metrics.json")
     seconds = Report.load(earlier).seconds if earlier.is_file() else {}
-    mesh = None if tree is None else TreeFile.open(tree)
+    mesh = None if tree is None else TreeFile.open(tree, limits)
     inputs = [cloud, *dataset.train.paths, *dataset.test.paths, *(mesh.files if mesh else ())]
     use = claimed_folder if out == earlier else used_folder  # no other process may be at work in the run's folder
     with use("out", out.parent) as folder, single_files("evaluate", folder, [out.name], inputs):
@@ -250,6 +260,7 @@ def lod_command(
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
 ) -> None:
     """Make levels of detail: the tree and fewer and fewer billboards in one GLB, with the distance from which each looks the same.
 
@@ -266,13 +277,15 @@ def lod_command(
         views: How the tree is rendered.
         fit: How the billboards are fitted. The preset decides options that are not given.
         export: How they are written.
+        limits: What the tree and the views may refer to, and how large they may be.
     """
     from bbfit.lod import build_lod
     from bbfit.pipeline import RunConfig
     from bbfit.reporting.tables import lod_table
 
+    stages = RunConfig(views=views, fit=fit, export=export, limits=limits)
     with progress() as on_progress:
-        result = build_lod(tree, out, lod, RunConfig(views=views, fit=fit, export=export), work=work, on_progress=on_progress)
+        result = build_lod(tree, out, lod, stages, work=work, on_progress=on_progress)
     out_console.print(lod_table(result.levels))
     show_missing_encoder(export)
     out_console.print(

@@ -110,10 +110,14 @@ class Record:
         if self._is_current(stage.name, key):
             self.skipped.append(stage.name)
             return False
-        if stage.claims:
-            self._written.begin(stage.name, (*stage.outputs, *stage.temporary), self._inputs)
+        names = (*stage.outputs, *stage.temporary) if stage.claims else ()
+        self._written.begin(stage.name, names, self._inputs)
         started = time.perf_counter()
-        seconds = stage.work(on_progress)
+        try:
+            seconds = stage.work(on_progress)
+        except BaseException:
+            self._written.abandon(stage.name, names)
+            raise
         elapsed = time.perf_counter() - started if seconds is None else seconds
         digests = self._written.digests(stage.outputs)
         self.stages[stage.name] = {"inputs": key, "outputs": digests, "seconds": round(elapsed, 3)}
@@ -122,8 +126,7 @@ class Record:
         self._written.finish(RECORD_FILE, self._written.digests((RECORD_FILE,)))
         for name in stage.temporary:
             (self.folder / name).unlink(missing_ok=True)
-        if stage.claims:
-            self._written.finish(stage.name, digests)
+        self._written.finish(stage.name, digests)
         return True
 
 

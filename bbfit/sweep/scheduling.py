@@ -191,7 +191,7 @@ class _Sweep:
             return
         grow, views = self._stages.grow, self._stages.views
         try:
-            tree = None if source.tree is None else TreeFile.open(source.tree)
+            tree = None if source.tree is None else TreeFile.open(source.tree, self._stages.limits)
         except InputError as error:
             self._submit_runs(source, Outcome(None, str(error), ""), workers)
             return
@@ -223,7 +223,7 @@ class _Sweep:
             self._outcomes |= {(source, cell): (None, failed) for cell in range(len(self._cells))}
             return
         path = self._folder_of(source) / "tree.glb" if source.species else source.tree
-        mesh = TreeFile.open(path) if path and (outcome.facts or {}).get("mesh") else None
+        mesh = TreeFile.open(path, self._stages.limits) if path and (outcome.facts or {}).get("mesh") else None
         for number in range(len(self._cells)):
             self._submit_run(source, number, views, mesh, workers)
 
@@ -244,7 +244,9 @@ class _Sweep:
         folder = source.views or self._folder_of(source) / "views"
         inputs = {"views": (folder,)} | ({"tree": mesh.files} if fit.placement == "clusters" and mesh else {})
         self._pending[key] = key, identity(request)
-        workers.submit(Task(key, fit_tree, inputs, self._folder / "runs" / key, (RunConfig(fit=fit, export=export),)))
+        workers.submit(
+            Task(key, fit_tree, inputs, self._folder / "runs" / key, (RunConfig(fit=fit, export=export, limits=self._stages.limits),))
+        )
 
     def _is_final(self, outcome: Outcome) -> bool:
         return outcome.reason is None or not self._config.retry_failed

@@ -56,7 +56,7 @@ def _referenced(path: Path, uri: str, limits: InputLimits) -> Path:
     """The file that a URI of a glTF refers to."""
     name = unquote(uri).replace("\\", "/")
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", name):
-        fail("tree", f"{path} refers to {uri}, which is no file", "export the tree as one .glb file")
+        fail("tree", f"{path} refers to {uri}, outside its own folder", "export the tree as one .glb file")
     target = limits.referenced("tree", path, name, path.parent)
     if not target.is_file():
         raise MissingFileError(f"tree: {path} refers to {uri}, which does not exist; export the tree as one .glb file")
