@@ -116,7 +116,7 @@ def compare(
         fail("billboards", "the comparison sets their numbers", "omit billboards and budgets")
     with claimed_folder("out", out) as folder:
         record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
-        record.check({"convert": ("tree.glb",), "tables": _TABLES})
+        record.check({"tables": _TABLES} | ({} if tree.suffix in _READABLE else {"convert": ("tree.glb",)}))
         return CompareResult(folder, _compared(tree, record, config, stages, on_progress))
 
 

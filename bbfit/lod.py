@@ -93,7 +93,7 @@ def build_lod(
 def _built(tree: TreeFile, out: Path, config: LodConfig, stages: RunConfig, folder: Path, on_progress: OnProgress) -> LodResult:
     """Build the levels in a claimed folder."""
     record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
-    record.check({"convert": (ORIGINAL,), "join": _outputs(out, folder)})
+    record.check({"join": _outputs(out, folder)} | ({"convert": (ORIGINAL,)} if _converts(tree, config) else {}))
     record.run(views_stage(folder, tree, stages.views), on_progress)
     views = ViewDataset.load(folder / "views")
     original = _original(record, tree, config, on_progress) if config.original else None
@@ -162,10 +162,15 @@ def _fitted(folder: Path, stages: RunConfig, planes: int, on_progress: OnProgres
 
 def _original(record: Record, tree: TreeFile, config: LodConfig, on_progress: OnProgress) -> Path:
     """The tree as a GLB that others can be joined to."""
-    if config.triangles is None and is_self_contained(tree.path):
+    if not _converts(tree, config):
         return tree.path
     record.run(convert_stage(record.folder, tree, ORIGINAL, triangles=config.triangles), on_progress)
     return record.folder / ORIGINAL
+
+
+def _converts(tree: TreeFile, config: LodConfig) -> bool:
+    """Whether the finest level is a converted tree."""
+    return config.original and not (config.triangles is None and is_self_contained(tree.path))
 
 
 def _switches(views: ViewDataset, runs: list[RunResult], config: LodConfig) -> list[_Switch]:

@@ -192,8 +192,8 @@ def prepare(
 @contextlib.contextmanager
 def _record(out: str | Path, head: dict[str, Any], config: RunConfig, inputs: Iterable[Path | None]) -> Iterator[Record]:
     """The record of a run's folder, which no other process can write to until the context ends, and which has room for the results."""
-    outputs = {"fit": FIT_OUTPUTS, "export": export_outputs(config.export), "evaluate": EVALUATE_OUTPUTS, "report": REPORT_OUTPUTS}
-    outputs |= {"grow": GROW_OUTPUTS} if head["config"]["grow"] else {}
+    outputs = {"grow": GROW_OUTPUTS} if head["config"]["grow"] else {}
+    outputs |= {"fit": FIT_OUTPUTS, "export": export_outputs(config.export), "evaluate": EVALUATE_OUTPUTS, "report": REPORT_OUTPUTS}
     outputs |= {"budget": BUDGET_OUTPUTS} if config.budget.given else {}
     with claimed_folder("out", out) as folder:
         record = Record(folder, head, [path for path in inputs if path is not None])
