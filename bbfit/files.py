@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,3 +89,22 @@ def output_folder(name: str, path: str | Path) -> Path:
     except OSError as error:
         fail(name, f"{path} cannot be written to ({error.strerror})", "choose another output folder or free the disk")
     return path
+
+
+@contextmanager
+def removed_if_unused(path: str | Path) -> Iterator[None]:
+    """A context that leaves no new empty folder behind if its work fails.
+
+    If ``path`` does not exist yet, an error removes the folders that are empty by then: ``path``, those in it, and those above it that did
+    not exist either. Folders that contain a file stay, and so does everything that existed before.
+    """
+    path = Path(path)
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        yield
+    except BaseException:
+        below = [Path(place) for place, _, _ in os.walk(path, topdown=False)][:-1] if missing else []
+        for folder in (*below, *missing):
+            with suppress(OSError):  # it contains a file, or was never created
+                folder.rmdir()
+        raise

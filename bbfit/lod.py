@@ -7,14 +7,15 @@ import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from bbfit.checks import fail
+from bbfit.blender.requirements import check_blender
+from bbfit.checks import check_output_file, fail
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.model import ShippedModel, shipped_model
-from bbfit.files import output_folder, read_json, write_bytes, write_json
+from bbfit.files import output_folder, read_json, removed_if_unused, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_per_meter
-from bbfit.pipeline import RunConfig, RunResult, run
+from bbfit.pipeline import RunConfig, RunResult, needs_blender, run
 from bbfit.provenance import digest_file
 from bbfit.reporting.plots import lod_picture
 from bbfit.stages.results import export_config
@@ -79,11 +80,24 @@ def build_lod(
     out = Path(out)
     if out.suffix.lower() != ".glb":
         fail("out", f"{out} ends in {out.suffix or 'nothing'}", "give a name that ends in .glb")
-    output_folder("out's folder", out.parent)
+    check_output_file("out", out)
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "planes sets the number of billboards of each level", "omit billboards and budgets")
-    tree = TreeFile.open(tree)
-    folder = output_folder("work", work or out.with_suffix(""))
+    if config.triangles is not None and not config.original:
+        fail("triangles", f"{config.triangles} are requested of a tree that is no level", "leave out one of triangles and no-original")
+    tree, work = TreeFile.open(tree), Path(work or out.with_suffix(""))
+    for planes in config.planes:
+        fit = replace(stages.fit, billboards=planes)
+        replace(stages, fit=fit).check(mesh=tree.is_mesh, rendered=True, blender=False)
+    if needs_blender(work):
+        check_blender(stages.views)
+    with removed_if_unused(out.parent), removed_if_unused(work):
+        output_folder("out's folder", out.parent)
+        return _built(tree, out, output_folder("work", work), config, stages, on_progress)
+
+
+def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: RunConfig, on_progress: OnProgress) -> LodResult:
+    """The stages of :func:`build_lod`, whose options were checked."""
     record = Record(folder)
     record.run(views_stage(folder, tree, stages.views), on_progress)
     views = ViewDataset.load(folder / "views")

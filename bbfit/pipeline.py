@@ -9,16 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.blender.config import ViewsConfig
+from bbfit.blender.requirements import check_blender
+from bbfit.budget.choice import check_budget
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import fail
 from bbfit.evaluation.report import Report
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
-from bbfit.files import output_folder
+from bbfit.files import output_folder, removed_if_unused
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step
+from bbfit.fitting.requirements import check_device
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.layout import TEST_FILE
 from bbfit.stages.billboards import budget_stage, fit_stage, read_choice, remove_checkpoint
+from bbfit.stages.requirements import check_planned_views, check_training
 from bbfit.stages.results import evaluate_stage, export_config, export_stage, report_stage
 from bbfit.stages.stage import OnProgress, Record, Stage, record_head, silent
 from bbfit.stages.trees import grow_stage, views_stage
@@ -47,6 +52,35 @@ class RunConfig:
     export: ExportConfig = field(default_factory=ExportConfig)
     """Options for writing the model."""
 
+    def check(self, *, mesh: bool, rendered: bool, blender: bool) -> None:
+        """Check all options together, before a folder is made or a tree is grown or rendered.
+
+        Parameters
+        ----------
+        mesh
+            Whether the triangles of a mesh place the billboards.
+        rendered
+            Whether the views are those of ``views``, and not given.
+        blender
+            Whether Blender has to render them here.
+
+        Raises
+        ------
+        MissingFileError, InputError
+            If options contradict each other, the device of the fit or of Blender is not available, a package is not installed, or the
+            views would not suffice for the fit.
+        """
+        self.export.check()
+        if self.budget.given:
+            check_budget(self.fit, self.budget)
+        else:
+            self.fit.resolve()
+        check_device(self.fit)
+        if rendered:
+            check_planned_views(self.views, self.fit, mesh=mesh, budget=self.budget.given)
+        if blender:
+            check_blender(self.views)
+
     def seeded(self, seed: int) -> RunConfig:
         """The same options with one seed for growing, rendering and fitting."""
         views, fit = replace(self.views, seed=seed), replace(self.fit, seed=seed)
@@ -71,7 +105,7 @@ class RunResult:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A run's folder with the tree and its views."""
+    """A run's folder with the tree and its views, whose pictures were checked."""
 
     record: Record
     """The record of the folder."""
@@ -114,11 +148,14 @@ def run(
         If an input cannot be used or the folder cannot be written to. Earlier results stay as they were.
     """
     config, on_progress = config or RunConfig(), on_progress or silent
-    prepared = prepare(source, out, config, on_progress=on_progress)
+    with removed_if_unused(out):
+        return _finished(prepare(source, out, config, on_progress=on_progress), config, on_progress, on_step)
+
+
+def _finished(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on_step: Callable[[Step], None] | None) -> RunResult:
+    """The stages of :func:`run` after the views."""
     record, tree, views = prepared.record, prepared.tree, prepared.views
     folder = record.folder
-    views.train.check()
-    views.test.check()
     fit_config, missed, export = config.fit, None, export_config(views, config.export)
     if config.budget.given:
         record.run(budget_stage(folder, views, tree, fit_config, config.budget, export), on_progress)
@@ -143,26 +180,43 @@ def prepare(
     source: str | Path | TreeFile | None, out: str | Path, config: RunConfig | None = None, *, on_progress: OnProgress | None = None
 ) -> Prepared:
     """Run the first stages of :func:`run`, with the same arguments and errors: grow a tree if none is given, and render its views."""
-    config, on_progress = config or RunConfig(), on_progress or silent
+    with removed_if_unused(out):
+        return _prepared(source, Path(out), config or RunConfig(), on_progress or silent)
+
+
+def _prepared(source: str | Path | TreeFile | None, out: Path, config: RunConfig, on_progress: OnProgress) -> Prepared:
+    """The results of :func:`prepare`. All inputs and options are checked before the folder is made."""
     path = source.path if isinstance(source, TreeFile) else source
     views_folder = Path(path) if path is not None and Path(path).is_dir() else None
     if config.tree is not None and views_folder is None:
         fail("tree", f"{config.tree} is given together with {path or 'a tree to grow'}", "give a mesh only with a folder of views")
     if source is None:
         species = load_species(config.species or (None if config.grow.species_file else "quaking_aspen"), config.grow.species_file)
+        config.check(mesh=True, rendered=True, blender=needs_blender(out))
         record = Record(output_folder("out", out), _head(species.name, config, grown=species, rendered=True))
         tree = _grown(record, grow_stage(record.folder, species, config.grow), on_progress)
     elif config.species is not None or replace(config.grow, seed=0) != RunConfig().grow:
         fail("run", f"{path} is given, so no tree is grown", "omit the species and the options for growing")
     elif views_folder is not None:
-        views = ViewDataset.load(views_folder, seed=config.fit.seed)  # check the inputs before creating the output folder
+        views = ViewDataset.load(views_folder, seed=config.fit.seed)
         mesh = None if config.tree is None else TreeFile.open(config.tree)
+        config.check(mesh=mesh is not None, rendered=False, blender=False)
+        check_training(views.train.cameras, config.fit, mesh=mesh is not None, budget=config.budget.given)
+        views.check()
         return Prepared(Record(output_folder("out", out), _head(str(views_folder.resolve()), config, rendered=False)), mesh, views)
     else:
         tree = TreeFile.open(source)
+        config.check(mesh=tree.is_mesh, rendered=True, blender=needs_blender(out))
         record = Record(output_folder("out", out), _head(str(tree.path.resolve()), config, rendered=True))
     record.run(views_stage(record.folder, tree, config.views), on_progress)
-    return Prepared(record, tree if tree.is_mesh else None, ViewDataset.load(record.folder / "views"))
+    views = ViewDataset.load(record.folder / "views")
+    views.check()
+    return Prepared(record, tree if tree.is_mesh else None, views)
+
+
+def needs_blender(folder: Path) -> bool:
+    """Whether Blender has to render views for a folder: the transforms, which are written last, are not there."""
+    return not (folder / "views" / TEST_FILE).is_file()
 
 
 def _grown(record: Record, stage: Stage, on_progress: OnProgress) -> TreeFile:

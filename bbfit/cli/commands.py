@@ -184,21 +184,25 @@ def evaluate_command(
         tree: The mesh that the views show, for its vertices and bytes, if the views were not rendered by bbfit.
         export: How the model is exported, if not by default. The scores are those of the exported model.
     """
+    from bbfit.checks import check_output_file
     from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
-    from bbfit.files import output_folder
+    from bbfit.files import output_folder, removed_if_unused
     from bbfit.geometry.cloud import BillboardCloud
     from bbfit.reporting.tables import report_table
     from bbfit.stages.results import original_tree
     from bbfit.tree_files.tree_file import TreeFile
     from bbfit.views import ViewDataset
 
+    export.check()
+    out = check_output_file("out", out or cloud.with_name("metrics.json"))
     billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
-    out, earlier = out or cloud.with_name("metrics.json"), cloud.with_name("metrics.json")
+    original = original_tree(dataset, None if tree is None else TreeFile.open(tree))
+    dataset.test.check(may_be_empty=True)
+    earlier = cloud.with_name("metrics.json")
     seconds = Report.load(earlier).seconds if earlier.is_file() else {}
-    output_folder("out", out.parent)
-    with progress() as on_progress:
-        original = original_tree(dataset, None if tree is None else TreeFile.open(tree))
+    with removed_if_unused(out.parent), progress() as on_progress:
+        output_folder("out", out.parent)
         report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=partial(on_progress, "evaluate"))
     report = replace(report, seconds={**seconds, **report.seconds})
     report.save(out)
@@ -223,7 +227,10 @@ def export_command(
     """
     from bbfit.exporting import model
     from bbfit.geometry.cloud import BillboardCloud
+    from bbfit.model_files import check_model_path
 
+    check_model_path("model file", out)
+    export.check()
     for path in model.export(BillboardCloud.load(cloud), out, export):
         out_console.print(f"{path}  {path.stat().st_size:,} bytes")
     show_missing_encoder(export)

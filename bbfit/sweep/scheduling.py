@@ -10,11 +10,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from bbfit.blender.requirements import check_blender
 from bbfit.checks import InputError, check_file, check_folder, fail
-from bbfit.files import output_folder, write_bytes
+from bbfit.exporting.config import ExportConfig
+from bbfit.files import output_folder, removed_if_unused, write_bytes
 from bbfit.fitting.loop import fit_inputs
 from bbfit.layout import TEST_FILE
-from bbfit.pipeline import RunConfig
+from bbfit.pipeline import RunConfig, needs_blender
 from bbfit.provenance import VERSIONS, cache_key, identity
 from bbfit.reporting.sweep_plots import sweep_plot
 from bbfit.reporting.sweep_tables import SweepRow, table_csv, table_markdown
@@ -25,7 +27,7 @@ from bbfit.sweep.grid import Cell, Grid
 from bbfit.sweep.local import LocalWorkers
 from bbfit.sweep.results import Results
 from bbfit.sweep.tasks import Outcome, Task, Workers, fit_tree, prepare_tree
-from bbfit.tree_files.tree_file import TreeFile
+from bbfit.tree_files.tree_file import MESH_SUFFIXES, TreeFile
 from bbfit.trees.species import load_species
 from bbfit.views import ViewDataset
 
@@ -103,11 +105,28 @@ def run_sweep(
     grid = Grid.load(config.grid).narrowed(config)
     cells = grid.cells(stages.fit)
     all_sources = sources(species if species or trees or views else grid.trees, trees, views, stages.grow.species_file)
-    sweep = _Sweep(output_folder("out", out), all_sources, cells, config, stages)
-    workers: Workers = LocalWorkers(config.workers, config.retries) if config.ray is None else RayWorkers(config)
-    with workers:
-        sweep.run(workers, on_progress or silent)
-    return sweep.result()
+    _check(Path(out), all_sources, cells, config, stages)
+    with removed_if_unused(out):
+        sweep = _Sweep(output_folder("out", out), all_sources, cells, config, stages)
+        workers: Workers = LocalWorkers(config.workers, config.retries) if config.ray is None else RayWorkers(config)
+        with workers:
+            sweep.run(workers, on_progress or silent)
+        return sweep.result()
+
+
+def _check(folder: Path, sources: list[Source], cells: list[Cell], config: SweepConfig, stages: RunConfig) -> None:
+    """Check the options of all runs before the first one. Devices and packages of a cluster are not known here."""
+    to_render = [source for source in sources if source.views is None]
+    mesh = all(source.tree is None or source.tree.suffix.lower() in MESH_SUFFIXES for source in to_render)
+    for cell in cells:
+        fit, export = (cell.config, stages.export) if config.ray is None else (replace(cell.config, device="cpu"), ExportConfig())
+        replace(stages, fit=fit, export=export).check(mesh=mesh, rendered=bool(to_render), blender=False)
+    if config.ray is None and any(needs_blender(_tree_folder(folder, source)) for source in to_render):
+        check_blender(stages.views)
+
+
+def _tree_folder(folder: Path, source: Source) -> Path:
+    return folder / "trees" / source.name
 
 
 def sources(
@@ -242,7 +261,7 @@ class _Sweep:
         return outcome.reason is None or not self._config.retry_failed
 
     def _folder_of(self, source: Source) -> Path:
-        return self._folder / "trees" / source.name
+        return _tree_folder(self._folder, source)
 
     def _rows(self) -> list[SweepRow]:
         return [
