@@ -200,6 +200,8 @@ def _prepared(source: str | Path | TreeFile | None, out: Path, config: RunConfig
     elif views_folder is not None:
         views = ViewDataset.load(views_folder, seed=config.fit.seed)
         mesh = None if config.tree is None else TreeFile.open(config.tree)
+        if mesh is not None:
+            mesh.check_is_mesh()
         config.check(mesh=mesh is not None, rendered=False, blender=False)
         check_training(views.train.cameras, config.fit, mesh=mesh is not None, budget=config.budget.given)
         views.check()

@@ -197,7 +197,8 @@ def evaluate_command(
     export.check()
     out = check_output_file("out", out or cloud.with_name("metrics.json"))
     billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
-    original = original_tree(dataset, None if tree is None else TreeFile.open(tree))
+    mesh = None if tree is None else TreeFile.open(tree)
+    original = original_tree(dataset, mesh)
     dataset.test.check(may_be_empty=True)
     earlier = cloud.with_name("metrics.json")
     seconds = Report.load(earlier).seconds if earlier.is_file() else {}
