@@ -12,7 +12,7 @@ from full_disk import FULL, full_disk
 from safetensors import safe_open
 
 from bbfit.checks import InputError
-from bbfit.files import output_folder, read_json, write_bytes, write_json, write_pieces, write_tensors
+from bbfit.files import output_folder, read_json, removed_if_unused, write_bytes, write_json, write_pieces, write_tensors
 
 
 def names(folder: Path) -> list[str]:
@@ -133,3 +133,28 @@ def test_an_output_folder_that_cannot_be_written_to_is_refused() -> None:
     """The system's own folder of processes holds no files of ours."""
     with pytest.raises(InputError, match=r"^out: .* cannot be written to \(.*\); choose"):
         output_folder("out", "/proc")
+
+
+def test_a_failure_leaves_no_new_empty_folder(tmp_path: Path) -> None:
+    """Those that existed before stay, and so does every folder with a file in it."""
+    (tmp_path / "old").mkdir()
+
+    def fails(folder: Path, *made: str, file: str | None = None) -> None:
+        with pytest.raises(KeyboardInterrupt), removed_if_unused(folder):
+            for name in ("", *made):
+                (folder / name).mkdir(parents=True, exist_ok=True)
+            if file:
+                (folder / file).write_text("kept")
+            raise KeyboardInterrupt
+
+    fails(tmp_path / "old" / "a" / "b", "c", "d/e")
+    assert names(tmp_path / "old") == []
+    fails(tmp_path / "old", "c")
+    assert names(tmp_path / "old") == ["c"]
+    fails(tmp_path / "new" / "a", "c", "d", file="d/file")
+    assert sorted(str(path.relative_to(tmp_path / "new")) for path in (tmp_path / "new").rglob("*")) == ["a", "a/d", "a/d/file"]
+    with pytest.raises(KeyboardInterrupt), removed_if_unused(tmp_path / "never"):
+        raise KeyboardInterrupt
+    with removed_if_unused(tmp_path / "good"):
+        (tmp_path / "good").mkdir()
+    assert names(tmp_path) == ["good", "new", "old"]

@@ -21,7 +21,7 @@ COUNT = 20_000
 _AGREEMENT = 0.95
 # Pixels that cover less of the mesh than this can be empty in a picture: its few samples miss thin parts. Such points of the mesh must be
 # within a few pixels of the tree; all others within one.
-_FAINT, _NEAR_FAINT, _NEAR = 0.125, 4, 1
+_FAINT, _NEAR_FAINT, _NEAR = 0.5, 3, 1
 # Largest difference between the corners of the mesh and of the rendered tree, as a fraction of its size.
 _SAME_BOUNDS = 1e-3
 # Pixels by which silhouettes without a common point are dilated, one after the other, because samples can miss parts thinner than a pixel;

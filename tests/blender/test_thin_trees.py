@@ -131,6 +131,16 @@ def test_small_pictures_and_wide_angles_show_the_tree_where_it_is(fov: float, si
         assert len(run(tree, tmp_path / f"out of {tree.name}", RunConfig(views=views, fit=FIT)).cloud)
 
 
+def test_a_sparse_tree_in_few_pixels_is_where_its_views_show_it(tmp_path: Path) -> None:
+    """Single samples miss the top of this fir in all views."""
+    write_tree(grow("douglas_fir", seed=0, detail=0.15, leaves=0.1), tmp_path / "fir.glb")
+    views = ViewsConfig(count=4, size=16, samples=1, denoise=False)
+    result = run(tmp_path / "fir.glb", tmp_path / "out", RunConfig(views=views, fit=FIT))
+    trimesh.load(tmp_path / "fir.glb", force="mesh").export(tmp_path / "fir.obj")
+    for tree in ("fir.glb", "fir.obj"):
+        assert len(run(result.folder / "views", tmp_path / tree[-3:], RunConfig(tree=tmp_path / tree, fit=FIT)).cloud)
+
+
 def test_a_mesh_that_was_converted_is_recognized_in_small_pictures(tmp_path: Path) -> None:
     """Its digest is not that of the rendered tree, so that the pictures themselves must show it; elsewhere they do not."""
     write_tree(grow("acer", seed=3, detail=0.1, leaves=0.02), tmp_path / "acer.glb")
