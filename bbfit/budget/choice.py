@@ -149,9 +149,9 @@ def check_budget(config: FitConfig, budget: BudgetConfig) -> None:
         )
     if config.preset != "default":
         fail("preset", f"{config.preset!r} cannot be combined with a budget", "leave out one of them")
-    config.resolve()
     if budget.vertices is not None and budget.vertices < _vertices(config):
         fail("vertices", f"{budget.vertices} are too few for one billboard of sides {config.sides!r}", "allow more, or sides one")
+    config.resolve()
 
 
 def validation_split(count: int, hint: str = "") -> tuple[list[int], list[int]]:

@@ -225,8 +225,7 @@ class _Sweep:
         if reason is None:
             try:
                 views = ViewDataset.load(folder)
-                views.train.check()
-                views.test.check()
+                views.check()
             except InputError as error:
                 reason = str(error)
         if reason is not None:
