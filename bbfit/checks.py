@@ -142,6 +142,14 @@ def check_file(name: str, path: str | Path) -> Path:
     return path
 
 
+def check_output_file(name: str, path: str | Path) -> Path:
+    """Require that a file to be written is not a folder; return it as a ``Path``."""
+    path = Path(path)
+    if path.is_dir():
+        fail(name, f"{path} is a folder", "choose another name")
+    return path
+
+
 def check_folder(name: str, path: str | Path) -> Path:
     """Require an existing folder; return it as a ``Path``."""
     path = Path(path)

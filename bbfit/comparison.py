@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bbfit.blender.conversion import tree_as_glb
 from bbfit.blender.pictures import render_pictures
+from bbfit.blender.requirements import check_blender
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, fail
 from bbfit.evaluation.report import Measures, mean_measures
@@ -24,8 +25,8 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, read_rgba, to_bytes, unpremultiply, write_png
-from bbfit.outputs import claimed_folder, output_folder
-from bbfit.pipeline import RunConfig, run
+from bbfit.outputs import claimed_folder, output_folder, used_folder
+from bbfit.pipeline import RunConfig, needs_blender, run
 from bbfit.provenance import VERSIONS
 from bbfit.reporting.comparison_tables import CompareRow, compare_csv, compare_markdown, compare_picture, compare_plot
 from bbfit.rivals.baking import BakeConfig
@@ -114,18 +115,26 @@ def compare(
     tree = TreeFile.open(tree, stages.limits)
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "the comparison sets their numbers", "omit billboards and budgets")
+    systems = [system for system in SYSTEMS if system in config.systems or not config.systems]
+    for system, (fit, budget) in _fits(config, stages.fit).items():
+        if system == "bbfit" or system in systems:  # others take its size
+            replace(stages, fit=fit, budget=budget).check(mesh=False, rendered=True, blender=False)
+    if needs_blender(Path(out)):
+        check_blender(stages.views)
     with claimed_folder("out", out) as folder:
         record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
         record.check({"tables": _TABLES} | ({} if tree.suffix in _READABLE else {"convert": ("tree.glb",)}))
-        return CompareResult(folder, _compared(tree, record, config, stages, on_progress))
+        return CompareResult(folder, _compared(tree, record, systems, config, stages, on_progress))
 
 
-def _compared(tree: TreeFile, record: Record, config: CompareConfig, stages: RunConfig, on_progress: OnProgress) -> tuple[CompareRow, ...]:
-    """Compare the systems in a claimed folder."""
+def _compared(
+    tree: TreeFile, record: Record, systems: list[str], config: CompareConfig, stages: RunConfig, on_progress: OnProgress
+) -> tuple[CompareRow, ...]:
+    """Compare the systems in a claimed folder. The options were checked."""
     folder = record.folder
     record.run(views_stage(folder, tree, stages.views), on_progress)
     views = ViewDataset.load(folder / "views")
-    systems = [system for system in SYSTEMS if system in config.systems or not config.systems]
+    views.check()
     if tree.suffix not in _READABLE:
         record.run(convert_stage(folder, tree, "tree.glb"), on_progress)
         tree = TreeFile.open(folder / "tree.glb")
@@ -147,6 +156,26 @@ def _compared(tree: TreeFile, record: Record, config: CompareConfig, stages: Run
     return tuple(rows)
 
 
+def _fits(config: CompareConfig, shared: FitConfig) -> dict[str, tuple[FitConfig, BudgetConfig]]:
+    """The options of the systems that are fits of bbfit. Fields that a system does not set come from the shared options."""
+    default, count = FitConfig(), config.billboards
+    own = {
+        "bbfit": FitConfig(billboards=count),
+        "bbfit-blend": FitConfig(alpha="blend", billboards=count),
+        "bbfit-many": FitConfig(alpha="blend", billboards=config.many),
+        "thesis": FitConfig(preset="thesis", billboards=4, sides="pair"),
+    }
+    open_fields = {
+        system: [entry.name for entry in fields(FitConfig) if getattr(fit, entry.name) == getattr(default, entry.name)]
+        for system, fit in own.items()
+    }
+    fits = {
+        system: (replace(fit, **{name: getattr(shared, name) for name in open_fields[system]}), BudgetConfig())
+        for system, fit in own.items()
+    }
+    return fits | {"bbfit-bytes": (replace(shared, alpha="blend", max_texels=None), BudgetConfig(bytes=1))}  # the size is known later
+
+
 class _Comparison:
     """A tree with its views, and the systems that simplify it."""
 
@@ -156,16 +185,13 @@ class _Comparison:
         self._tree, self._views, self._record, self._config, self._stages = tree, views, record, config, stages
         self._folder, self._on_progress = record.folder, on_progress
         self._bake = BakeConfig(float(pixels_per_meter(views.train.cameras)), views=stages.views)
-        count, many, crossed = config.billboards, config.many, config.crossed
+        count, many, crossed, self._fits = config.billboards, config.many, config.crossed, _fits(config, stages.fit)
         self._systems: dict[str, tuple[str, Callable[[Path], _SystemResult]]] = {
-            "bbfit": (f"bbfit, {count} billboards, mask", partial(self._fitted, FitConfig(billboards=count))),
-            "bbfit-blend": (f"bbfit, {count} billboards, blend", partial(self._fitted, FitConfig(alpha="blend", billboards=count))),
-            "bbfit-many": (f"bbfit, {many} billboards, blend", partial(self._fitted, FitConfig(alpha="blend", billboards=many))),
+            "bbfit": (f"bbfit, {count} billboards, mask", partial(self._fitted, "bbfit")),
+            "bbfit-blend": (f"bbfit, {count} billboards, blend", partial(self._fitted, "bbfit-blend")),
+            "bbfit-many": (f"bbfit, {many} billboards, blend", partial(self._fitted, "bbfit-many")),
             "bbfit-bytes": ("bbfit, blend, in bbfit's bytes", self._budgeted),
-            "thesis": (
-                "the thesis, 4 double billboards, L2",
-                partial(self._fitted, FitConfig(preset="thesis", billboards=4, sides="pair")),
-            ),
+            "thesis": ("the thesis, 4 double billboards, L2", partial(self._fitted, "thesis")),
             "crossed": (f"{crossed} crossed planes, baked", partial(self._baked, partial(crossed_planes, count=crossed))),
             "slicing": (f"slicing and blending, {config.directions} x {config.slices} slices", self._sliced),
             "cloud": (f"billboard cloud, {count} planes, baked", partial(self._baked, partial(billboard_cloud, count=count))),
@@ -181,8 +207,7 @@ class _Comparison:
     def row(self, system: str) -> CompareRow:
         """The score and the costs of a system."""
         title, simplify = self._systems[system]
-        folder = output_folder("out", self._folder / system)
-        remove_parts(folder)
+        folder = self._folder / system
 
         def work(on_progress: OnProgress) -> None:
             result = simplify(folder)
@@ -197,7 +222,9 @@ class _Comparison:
         inputs = (system, self._tree.digest, self._views.fingerprint, settings, self._stages.fit, self._stages.export, _VERSIONS)
         outputs = (f"{system}/result.json", f"{system}/model*.glb", f"{system}/held_out/*.png")
         try:
-            self._record.run(Stage(system, inputs, outputs, work, algorithm="compare"))
+            with used_folder("out", folder):
+                remove_parts(folder)
+                self._record.run(Stage(system, inputs, outputs, work, algorithm="compare"))
         except InputError as error:
             if "is not installed" not in str(error) and "LLVM" not in str(error):
                 raise
@@ -215,16 +242,13 @@ class _Comparison:
         on_view = partial(self._on_progress, f"{system} score")
         return mean_measures(score_views(draw_and_save, self._views.test, on_view=on_view))
 
-    def _fitted(self, fit: FitConfig, folder: Path) -> _SystemResult:
-        """Run bbfit with ``fit``. Fields that ``fit`` does not set come from the shared options."""
-        default, shared = FitConfig(), self._stages.fit
-        names = [entry.name for entry in fields(FitConfig) if getattr(fit, entry.name) == getattr(default, entry.name)]
-        fit = replace(fit, **{name: getattr(shared, name) for name in names})
-        return self._run(RunConfig(fit=fit, export=self._stages.export), folder)
+    def _fitted(self, system: str, folder: Path) -> _SystemResult:
+        """Run bbfit with the options of a system."""
+        return self._run(RunConfig(fit=self._fits[system][0], export=self._stages.export), folder)
 
     def _budgeted(self, folder: Path) -> _SystemResult:
         """Run bbfit with a budget of as many bytes as the model of the ``bbfit`` system has."""
-        fit = replace(self._stages.fit, alpha="blend")
+        fit, _ = self._fits["bbfit-bytes"]
         return self._run(RunConfig(fit=fit, budget=BudgetConfig(bytes=self._bytes), export=self._stages.export), folder)
 
     def _run(self, stages: RunConfig, folder: Path) -> _SystemResult:

@@ -7,7 +7,8 @@ import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from bbfit.checks import fail
+from bbfit.blender.requirements import check_blender
+from bbfit.checks import check_output_file, fail
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
@@ -15,7 +16,7 @@ from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import read_json, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.outputs import claimed_folder, used_folder
-from bbfit.pipeline import RunConfig, RunResult, run
+from bbfit.pipeline import RunConfig, RunResult, needs_blender, run
 from bbfit.provenance import digest_file
 from bbfit.reporting.plots import lod_picture
 from bbfit.stages.results import export_config
@@ -83,15 +84,23 @@ def build_lod(
     out = Path(out)
     if out.suffix.lower() != ".glb":
         fail("out", f"{out} ends in {out.suffix or 'nothing'}", "give a name that ends in .glb")
+    check_output_file("out", out)
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "planes sets the number of billboards of each level", "omit billboards and budgets")
-    tree = TreeFile.open(tree, stages.limits)
-    with used_folder("out's folder", out.parent), claimed_folder("work", work or out.with_suffix("")) as folder:
-        return _built(tree, out, config, stages, folder, on_progress)
+    if config.triangles is not None and not config.original:
+        fail("triangles", f"{config.triangles} are requested of a tree that is no level", "leave out one of triangles and no-original")
+    tree, work = TreeFile.open(tree, stages.limits), Path(work or out.with_suffix(""))
+    for planes in config.planes:
+        fit = replace(stages.fit, billboards=planes)
+        replace(stages, fit=fit).check(mesh=tree.is_mesh, rendered=True, blender=False)
+    if needs_blender(work):
+        check_blender(stages.views)
+    with used_folder("out's folder", out.parent), claimed_folder("work", work) as folder:
+        return _built(tree, out, folder, config, stages, on_progress)
 
 
-def _built(tree: TreeFile, out: Path, config: LodConfig, stages: RunConfig, folder: Path, on_progress: OnProgress) -> LodResult:
-    """Build the levels in a claimed folder."""
+def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: RunConfig, on_progress: OnProgress) -> LodResult:
+    """The stages of :func:`build_lod` in a claimed folder. The options were checked."""
     record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
     record.check({"join": _outputs(out, folder)} | ({"convert": (ORIGINAL,)} if _converts(tree, config) else {}))
     record.run(views_stage(folder, tree, stages.views), on_progress)

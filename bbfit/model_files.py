@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bbfit.checks import check_folder, fail
+from bbfit.checks import check_folder, check_output_file, fail
 from bbfit.provenance import installed_version
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def check_model_path(name: str, path: str | Path) -> Path:
     if path.suffix.lower() not in SUFFIXES:
         fail(name, f"{path} ends in {path.suffix or 'nothing'}", f"choose an ending of {' or '.join(SUFFIXES)}")
     check_folder(f"{name}'s folder", path.parent)
-    return path
+    return check_output_file(name, path)
 
 
 def names_beside(path: Path, *, texture: bool = False, mip_files: bool = False) -> list[str]:

@@ -53,13 +53,17 @@ def output_folder(name: str, path: str | Path) -> Path:
 
 @contextlib.contextmanager
 def used_folder(name: str, path: str | Path) -> Iterator[Path]:
-    """Create an output folder as :func:`output_folder` does. If it is still empty at the end, remove it with the parents created for it."""
+    """Create an output folder as :func:`output_folder` does, for the work in this context.
+
+    If the folder did not exist before, those of its folders and of the parents created for it that are empty at the end are removed.
+    """
     path = Path(path)
     created = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield output_folder(name, path)
     finally:
-        for folder in created:  # the innermost first
+        below = [Path(place) for place, _, _ in os.walk(path, topdown=False)][:-1] if created else []
+        for folder in (*below, *created):  # the innermost first
             with contextlib.suppress(OSError):
                 folder.rmdir()  # which fails if it is not empty
 

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.blender.config import ViewsConfig
+from bbfit.blender.requirements import check_blender
+from bbfit.budget.choice import check_budget
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import fail
 from bbfit.evaluation.report import Report
@@ -17,10 +19,13 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step
+from bbfit.fitting.requirements import check_device
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.inputs import InputLimits
+from bbfit.layout import TEST_FILE
 from bbfit.outputs import claimed_folder
 from bbfit.stages.billboards import BUDGET_OUTPUTS, FIT_OUTPUTS, budget_stage, fit_stage, read_choice
+from bbfit.stages.requirements import check_planned_views, check_training
 from bbfit.stages.results import (
     EVALUATE_OUTPUTS,
     REPORT_OUTPUTS,
@@ -59,6 +64,35 @@ class RunConfig:
     limits: InputLimits = field(default_factory=InputLimits)
     """What the tree and the views may refer to, and how large they may be."""
 
+    def check(self, *, mesh: bool, rendered: bool, blender: bool) -> None:
+        """Check all options together, before a folder is made or a tree is grown or rendered.
+
+        Parameters
+        ----------
+        mesh
+            Whether the triangles of a mesh place the billboards.
+        rendered
+            Whether the views are those of ``views``, and not given.
+        blender
+            Whether Blender has to render them here.
+
+        Raises
+        ------
+        MissingFileError, InputError
+            If options contradict each other, the device of the fit or of Blender is not available, a package is not installed, or the
+            views would not suffice for the fit.
+        """
+        self.export.check()
+        if self.budget.given:
+            check_budget(self.fit, self.budget)
+        else:
+            self.fit.resolve()
+        check_device(self.fit)
+        if rendered:
+            check_planned_views(self.views, self.fit, mesh=mesh, budget=self.budget.given)
+        if blender:
+            check_blender(self.views)
+
     def seeded(self, seed: int) -> RunConfig:
         """The same options with one seed for growing, rendering and fitting."""
         views, fit = replace(self.views, seed=seed), replace(self.fit, seed=seed)
@@ -83,7 +117,7 @@ class RunResult:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A run's folder with the tree and its views."""
+    """A run's folder with the tree and its views, whose pictures were checked."""
 
     record: Record
     """The record of the folder."""
@@ -134,8 +168,6 @@ def _fitted(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on_s
     """The stages of a run after its views."""
     record, tree, views = prepared.record, prepared.tree, prepared.views
     folder = record.folder
-    views.train.check()
-    views.test.check()
     fit_config, missed, export = config.fit, None, export_config(views, config.export)
     if config.budget.given:
         record.run(budget_stage(folder, views, tree, fit_config, config.budget, export), on_progress)
@@ -171,19 +203,26 @@ def prepare(
     if source is None:
         species = load_species(config.species or (None if config.grow.species_file else "quaking_aspen"), config.grow.species_file)
         head = _head(species.name, config, grown=species, rendered=True)
+        config.check(mesh=True, rendered=True, blender=needs_blender(Path(out)))
         with _record(out, head, config, [config.grow.species_file, config.views.hdri]) as record:
             tree = _grown(record, grow_stage(record.folder, species, config.grow), on_progress)
             yield _rendered(record, tree, config, on_progress)
     elif config.species is not None or replace(config.grow, seed=0) != RunConfig().grow:
         fail("run", f"{path} is given, so no tree is grown", "omit the species and the options for growing")
     elif views_folder is not None:
-        views = ViewDataset.load(views_folder, seed=config.fit.seed)  # check the inputs before creating the output folder
+        views = ViewDataset.load(views_folder, seed=config.fit.seed)
         mesh = None if config.tree is None else TreeFile.open(config.tree, config.limits)
+        if mesh is not None:
+            mesh.check_is_mesh()
+        config.check(mesh=mesh is not None, rendered=False, blender=False)
+        check_training(views.train.cameras, config.fit, mesh=mesh is not None, budget=config.budget.given)
+        views.check()
         head = _head(str(views_folder.resolve()), config, rendered=False)
         with _record(out, head, config, [*views.train.paths, *views.test.paths, *(mesh.files if mesh else ())]) as record:
             yield Prepared(record, mesh, views)
     else:
         tree = TreeFile.open(source, config.limits)
+        config.check(mesh=tree.is_mesh, rendered=True, blender=needs_blender(Path(out)))
         head = _head(str(tree.path.resolve()), config, rendered=True)
         with _record(out, head, config, [*tree.files, config.views.hdri]) as record:
             yield _rendered(record, tree, config, on_progress)
@@ -192,7 +231,7 @@ def prepare(
 @contextlib.contextmanager
 def _record(out: str | Path, head: dict[str, Any], config: RunConfig, inputs: Iterable[Path | None]) -> Iterator[Record]:
     """The record of a run's folder, which no other process can write to until the context ends, and which has room for the results."""
-    outputs = {"grow": GROW_OUTPUTS} if head["config"]["grow"] else {}
+    outputs: dict[str, tuple[str, ...]] = {"grow": GROW_OUTPUTS} if head["config"]["grow"] else {}
     outputs |= {"fit": FIT_OUTPUTS, "export": export_outputs(config.export), "evaluate": EVALUATE_OUTPUTS, "report": REPORT_OUTPUTS}
     outputs |= {"budget": BUDGET_OUTPUTS} if config.budget.given else {}
     with claimed_folder("out", out) as folder:
@@ -204,7 +243,14 @@ def _record(out: str | Path, head: dict[str, Any], config: RunConfig, inputs: It
 def _rendered(record: Record, tree: TreeFile, config: RunConfig, on_progress: OnProgress) -> Prepared:
     """Render the views of a run's tree."""
     record.run(views_stage(record.folder, tree, config.views), on_progress)
-    return Prepared(record, tree if tree.is_mesh else None, ViewDataset.load(record.folder / "views"))
+    views = ViewDataset.load(record.folder / "views")
+    views.check()
+    return Prepared(record, tree if tree.is_mesh else None, views)
+
+
+def needs_blender(folder: Path) -> bool:
+    """Whether Blender has to render views for a folder: the transforms, which are written last, are not there."""
+    return not (folder / "views" / TEST_FILE).is_file()
 
 
 def _grown(record: Record, stage: Stage, on_progress: OnProgress) -> TreeFile:

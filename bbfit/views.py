@@ -74,8 +74,8 @@ class ViewSet:
     def image(self, index: int) -> Tensor:
         """One picture, uint8 [H, W, 4], straight alpha. Do not write to it: it may be cached.
 
-        Raises ``MissingFileError`` or ``InputError`` if the file is missing, damaged, without alpha, fully transparent or not of the
-        others' size.
+        Raises ``MissingFileError`` or ``InputError`` if the file is missing, damaged, without alpha or not of the others' size, or fully
+        transparent in views from elsewhere.
         """
         path = self.paths[index]
         picture = self.read(path)
@@ -101,11 +101,23 @@ class ViewSet:
             digest.update(sha256(self.image(index).numpy().tobytes()).digest())
         return digest.hexdigest()
 
-    def check(self) -> None:
-        """Decode every picture once, so that a bad one is reported before long work begins."""
+    def shows(self, index: int) -> bool:
+        """Whether a picture has a pixel that is not fully transparent. Raises the errors of :meth:`image`."""
+        return bool(self.image(index)[..., 3].any())
+
+    def check(self, *, may_be_empty: bool = False) -> None:
+        """Decode every picture once, so that a bad one is reported before long work begins.
+
+        Raises the errors of :meth:`image`, and ``InputError`` if all pictures are fully transparent, unless they may be.
+        """
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # each thread keeps memory of its own
-            for _ in pool.map(self.image, range(len(self))):
-                pass
+            shown = list(pool.map(self.shows, range(len(self))))
+        if not any(shown) and not may_be_empty:
+            fail(
+                "views",
+                f"none of {len(self)} training pictures shows anything of the tree",
+                "it is thinner than their pixels or its materials are transparent; give a larger --size or more --samples, or mend them",
+            )
 
 
 @dataclass(frozen=True)
@@ -127,6 +139,8 @@ class ViewDataset:
     @staticmethod
     def load(folder: str | Path, *, seed: int = 0, cache_bytes: int = CACHE_BYTES) -> ViewDataset:
         """Read a folder of views: bbfit's own, any NeRF-synthetic scene, or one with nerfstudio's intrinsics.
+
+        Of bbfit's own pictures some may be fully transparent: a flat tree is invisible to a camera that sees it edge-on.
 
         Parameters
         ----------
@@ -152,17 +166,19 @@ class ViewDataset:
         width, height = _common_size([*train, *test])
         _check_size("views", f"pictures in {folder}", width, height)
 
+        request = ViewsRequest.load(folder / REQUEST_FILE) if (folder / REQUEST_FILE).is_file() else None
+        own = _is_own(request)
+
         @cached(LRUCache(cache_bytes, getsizeof=Tensor.numel), lock=threading.Lock())
         def read(path: Path) -> Tensor:
             picture = torch.from_numpy(read_rgba(path))
-            if not picture[..., 3].any():
+            if not own and not picture[..., 3].any():
                 fail("views", f"{path} is fully transparent", "render it anew or take it out of the transforms file")
             return picture
 
         def view_set(frames: list[Frame]) -> ViewSet:
             return ViewSet(tuple(frame.image for frame in frames), cameras_of(frames, width, height), read)
 
-        request = ViewsRequest.load(folder / REQUEST_FILE) if (folder / REQUEST_FILE).is_file() else None
         return ViewDataset(folder, view_set(train), view_set(test), request)
 
     @staticmethod
@@ -196,9 +212,23 @@ class ViewDataset:
         return ViewDataset(None, views.take(rest), views.take(held))
 
     @property
+    def own(self) -> bool:
+        """Whether bbfit rendered the views."""
+        return _is_own(self.request)
+
+    def check(self) -> None:
+        """Decode every picture once. Raises the errors of :meth:`ViewSet.check`. Of the held-out pictures, all may be empty."""
+        self.train.check()
+        self.test.check(may_be_empty=True)
+
+    @property
     def fingerprint(self) -> str:
         """SHA-256 over both splits' fingerprints."""
         return sha256((self.train.fingerprint + self.test.fingerprint).encode()).hexdigest()
+
+
+def _is_own(request: ViewsRequest | None) -> bool:
+    return request is not None and request.complete and request.camera is not None
 
 
 def _check_size(name: str, pictures: str, width: int, height: int) -> None:

@@ -60,6 +60,7 @@ def test_a_folder_that_stays_empty_is_removed_with_the_parents_that_were_made_fo
         assert (tmp_path / "mine").is_dir()
     with claimed_folder("out", tmp_path / "a" / "b") as folder:
         (folder / "cloud").write_text("kept")
+        (folder / "empty" / "inside").mkdir(parents=True)
     assert names(tmp_path / "a" / "b") == ["cloud"]
 
 

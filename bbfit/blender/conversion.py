@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bbfit.blender.pictures import tree_settings
 from bbfit.blender.processes import BlenderPool, require_bpy
-from bbfit.checks import check_count, check_folder, fail
+from bbfit.checks import check_count, check_folder, check_output_file, fail
 from bbfit.files import write_pieces
 from bbfit.tree_files.tree_file import TreeFile
 
@@ -57,8 +57,7 @@ def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int 
     if out.suffix.lower() != ".glb":
         fail("out", f"{out} ends in {out.suffix or 'nothing'}", "choose a name that ends in .glb")
     check_folder("out's folder", out.parent)
-    if out.is_dir():
-        fail("out", f"{out} is a folder", "choose another name")
+    check_output_file("out", out)
     if out.exists() and any(out.samefile(file) for file in tree.files):
         fail("out", f"{out} is the tree itself", "choose another name")
     require_bpy()

@@ -150,6 +150,13 @@ class BlenderPool:
         self._start_first("converting", measure=False)
         return path
 
+    def check(self) -> None:
+        """Start a process that checks the device and the panorama of the settings, without a tree. Raises ``InputError`` if not usable."""
+        self._start(measure=False)
+        worker, event = self._next()
+        if event["event"] == "exit":
+            raise BlenderError(f"Blender: crashed while checking the device and the panorama ({worker.exit_reason()}); choose others")
+
     def _start_first(self, activity: str, *, measure: bool) -> dict[str, Any]:
         """Start a process and return its first answer."""
         self._start(measure=measure)

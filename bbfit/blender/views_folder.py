@@ -25,6 +25,9 @@ from bbfit.tree_files.tree_file import TreeFile
 
 __all__ = ["BlenderError", "render_views"]
 
+# A tree is invisible from the side from which it is less wide than this.
+_LEAST_PIXELS = 1e-4
+
 
 def render_views(
     tree: str | Path | TreeFile,
@@ -144,4 +147,16 @@ def _cameras(points: NDArray[np.float64], config: ViewsConfig) -> tuple[Camera, 
         fov_x_degrees=None if config.orthographic else config.fov_degrees,
         margin=max(0.02, FILTER_REACH / config.size),  # so that the outermost pixels stay empty
     )
+    if max(_least_width(points, camera[index]) for index in range(config.count)) < _LEAST_PIXELS:
+        fail(
+            "elevations",
+            f"the tree is flat, and all {config.count} cameras see it edge-on, so that no picture would show it",
+            "add a ring of another elevation, as in --elevations 0 30",
+        )
     return camera, target, float((camera.position[0] - target).norm())
+
+
+def _least_width(points: NDArray[np.float64], camera: Camera) -> float:
+    """The standard deviation of the points, [P, 3], in the picture of a camera, across the direction in which it is least, in pixels."""
+    pixels = camera.project(torch.from_numpy(points))
+    return float(torch.linalg.svdvals((pixels - pixels.mean(0)) / len(pixels) ** 0.5)[1])

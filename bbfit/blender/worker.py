@@ -4,7 +4,8 @@ The parent starts this file by path. It imports only the files beside it, not bb
 lines of JSON. On standard input, the first line contains the settings. Each further line requests a picture. On standard output, the worker
 answers ``ready`` (followed by the vertices as raw float32 if the settings request them), then ``done`` for each picture. It answers
 ``refused`` with a reason if an input cannot be used. If the settings contain ``convert``, ``worker_glb.py`` writes the tree as a GLB file,
-and the worker answers ``converted`` or ``refused``. The output of Blender itself goes to standard error. Standard input ends when the
+and the worker answers ``converted`` or ``refused``. If they contain ``check``, it checks the device and the panorama without a tree, and
+answers ``usable`` or ``refused``. The output of Blender itself goes to standard error. Standard input ends when the
 parent closes it or dies. The worker then ends too, if need be in the middle of a render.
 
 One process renders one picture at a time, because two simultaneous renders crash Blender.
@@ -58,6 +59,10 @@ def main() -> NoReturn:
 
     settings = requests.get()
     try:
+        if "check" in settings:
+            check(settings)
+            answer("usable")
+            os._exit(0)
         if "convert" in settings:
             convert(settings, answer)
             os._exit(0)
@@ -82,6 +87,16 @@ def _listen(requests: queue.Queue[dict[str, Any]]) -> None:
     for line in sys.stdin.buffer:
         requests.put(json.loads(line))
     os._exit(1)
+
+
+def check(settings: dict[str, Any]) -> None:
+    """Refuse a device that Blender does not find, and a panorama that it cannot read."""
+    import bpy
+
+    bpy.context.scene.render.engine = "CYCLES"
+    use_device(settings["device"])
+    if settings["hdri"]:
+        load_panorama(settings["hdri"])
 
 
 def convert(settings: dict[str, Any], answer: Any) -> None:
@@ -125,13 +140,7 @@ def add_light(settings: dict[str, Any]) -> None:
     background.inputs["Strength"].default_value = settings["ambient_strength"]
     if settings["hdri"]:
         panorama = tree.nodes.new("ShaderNodeTexEnvironment")
-        unreadable = SCENE.InputRefused("hdri", f"{settings['hdri']} cannot be read", "give an .hdr or .exr file")
-        try:
-            panorama.image = bpy.data.images.load(settings["hdri"])
-        except RuntimeError as error:
-            raise unreadable from error
-        if not panorama.image.size[0]:
-            raise unreadable
+        panorama.image = load_panorama(settings["hdri"])
         tree.links.new(panorama.outputs["Color"], background.inputs["Color"])
     if settings["sun_strength"] > 0:
         lamp = bpy.data.lights.new("bbfit sun", "SUN")
@@ -139,6 +148,20 @@ def add_light(settings: dict[str, Any]) -> None:
         sun = bpy.data.objects.new("bbfit sun", lamp)
         sun.rotation_euler = Vector(settings["sun_direction"]).to_track_quat("Z", "Y").to_euler()
         scene.collection.objects.link(sun)
+
+
+def load_panorama(path: str) -> Any:
+    """Load a panorama, and refuse a file that is none."""
+    import bpy
+
+    unreadable = SCENE.InputRefused("hdri", f"{path} cannot be read", "give an .hdr or .exr file")
+    try:
+        image = bpy.data.images.load(path)
+    except RuntimeError as error:
+        raise unreadable from error
+    if not image.size[0]:
+        raise unreadable
+    return image
 
 
 def set_up_cycles(settings: dict[str, Any]) -> None:
@@ -180,10 +203,10 @@ def use_device(name: str) -> None:
     try:
         preferences.compute_device_type = kind
     except TypeError as error:
-        raise SCENE.InputRefused("device", f"this Blender does not support {name}", "choose another device, or cpu") from error
+        raise SCENE.InputRefused("render_device", f"this Blender does not support {name}", "choose another device, or cpu") from error
     preferences.refresh_devices()
     if not any(device.type == kind for device in preferences.devices):
-        raise SCENE.InputRefused("device", f"this machine has no {name} device", "choose another device, or cpu")
+        raise SCENE.InputRefused("render_device", f"this machine has no {name} device", "choose another device, or cpu")
     for device in preferences.devices:
         device.use = device.type == kind
     scene.cycles.device = "GPU"

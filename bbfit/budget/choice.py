@@ -29,8 +29,8 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """Numbers of billboards to try, in addition to the largest number that the limit of vertices allows, up to the last number."""
 MIN_GAIN_DB = 0.75
 """Least gain, in dB, for which ``auto`` doubles the number of billboards."""
-# Every fifth training view is for validation.
-_VALIDATION_EVERY = 5
+LEAST_VIEWS = 5
+"""Least number of training views. Every fifth of them is for validation."""
 # Options of short fits that the configuration leaves open.
 _SHORT: dict[str, Any] = {"steps": 160, "views_per_step": 2, "restarts": 1}
 # Number of larger counts without a gain after which the trials of a budget of texels or bytes end.
@@ -129,20 +129,40 @@ def choose(
     Raises
     ------
     InputError
-        If ``config`` sets the number of billboards or a preset other than ``default``, there are fewer than five training views, or no
-        trial is within the budget.
+        If ``config`` sets the number of billboards or of texels or a preset other than ``default``, there are fewer than five training
+        views, or no trial is within the budget.
     """
-    if config.billboards is not None:
-        fail("billboards", f"{config.billboards} are requested in addition to a budget", "leave out one of them")
-    if config.preset != "default":
-        fail("preset", f"{config.preset!r} cannot be combined with a budget", "leave out one of them")
-    train = range(len(views.train))
-    validation = [index for index in train if index % _VALIDATION_EVERY == _VALIDATION_EVERY // 2]
-    if len(views.train) < _VALIDATION_EVERY:
-        fail("views", f"{len(views.train)} training views are too few for a validation split", f"give at least {_VALIDATION_EVERY}")
-    split = replace(views, train=views.train.take([index for index in train if index not in validation]), test=views.train.take(validation))
+    check_budget(config, budget)
+    train, validation = validation_split(len(views.train))
+    split = replace(views, train=views.train.take(train), test=views.train.take(validation))
     mesh = None if tree is None else TreeFile.open(tree)
     return _Trials(split, config, budget, mesh, export or ExportConfig(), known, on_trial).choice()
+
+
+def check_budget(config: FitConfig, budget: BudgetConfig) -> None:
+    """Require that a fit and a budget do not contradict each other. Raises the errors of :func:`choose` that do not depend on the views."""
+    if config.billboards is not None:
+        fail("billboards", f"{config.billboards} are requested in addition to a budget", "leave out one of them")
+    if config.max_texels is not None:
+        fail(
+            "max_texels", f"{config.max_texels} are requested in addition to a budget", "leave them out, or limit --texels in place of them"
+        )
+    if config.preset != "default":
+        fail("preset", f"{config.preset!r} cannot be combined with a budget", "leave out one of them")
+    if budget.vertices is not None and budget.vertices < _vertices(config):
+        fail("vertices", f"{budget.vertices} are too few for one billboard of sides {config.sides!r}", "allow more, or sides one")
+    config.resolve()
+
+
+def validation_split(count: int, hint: str = "") -> tuple[list[int], list[int]]:
+    """The indices of the training views that a budget fits to, and of those that it compares on, out of ``count``.
+
+    Raises ``InputError`` with the ``hint`` if there are too few.
+    """
+    if count < LEAST_VIEWS:
+        fail("views", f"{count} training views are too few for a validation split", hint or f"give at least {LEAST_VIEWS}")
+    validation = [index for index in range(count) if index % LEAST_VIEWS == LEAST_VIEWS // 2]
+    return [index for index in range(count) if index not in validation], validation
 
 
 def lookup(trials: Sequence[Trial]) -> Callable[[FitConfig], Trial | None]:
@@ -179,6 +199,11 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
+def _vertices(config: FitConfig) -> int:
+    """Vertices of a billboard."""
+    return 4 if config.sides == "one" else 8
+
+
 class _Trials:
     def __init__(
         self,
@@ -193,10 +218,7 @@ class _Trials:
         self._views, self._config, self._budget, self._tree, self._export = views, config, budget, tree, export
         self._known, self._on_trial = known or (lambda config: None), on_trial or (lambda trials, total: None)
         self._trials: list[Trial] = []
-        vertices = 4 if config.sides == "one" else 8
-        max_count = COUNTS[-1] if budget.vertices is None else min(COUNTS[-1], budget.vertices // vertices)
-        if max_count < 1:
-            fail("vertices", f"{budget.vertices} are too few for one billboard of sides {config.sides!r}", "allow more, or sides one")
+        max_count = COUNTS[-1] if budget.vertices is None else min(COUNTS[-1], budget.vertices // _vertices(config))
         self._counts = sorted({count for count in COUNTS if count < max_count} | {max_count})
         self._total = len(self._counts) + 2 + len(_CURVE_FRACTIONS) * (budget.texels is not None or budget.bytes is not None)
 

@@ -196,6 +196,7 @@ def evaluate_command(
         export: How the model is exported, if not by default. The scores are those of the exported model.
         limits: What the tree and the views may refer to, and how large they may be.
     """
+    from bbfit.checks import check_output_file
     from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
     from bbfit.geometry.cloud import BillboardCloud
@@ -205,15 +206,18 @@ def evaluate_command(
     from bbfit.tree_files.tree_file import TreeFile
     from bbfit.views import ViewDataset
 
+    export.check()
+    out = check_output_file("out", out or cloud.with_name("metrics.json"))
     billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
-    out, earlier = out or cloud.with_name("metrics.json"), cloud.with_name("metrics.json")
+    mesh = None if tree is None else TreeFile.open(tree)
+    original = original_tree(dataset, mesh)
+    dataset.test.check(may_be_empty=True)
+    earlier = cloud.with_name("metrics.json")
     seconds = Report.load(earlier).seconds if earlier.is_file() else {}
-    mesh = None if tree is None else TreeFile.open(tree, limits)
     inputs = [cloud, *dataset.train.paths, *dataset.test.paths, *(mesh.files if mesh else ())]
     use = claimed_folder if out == earlier else used_folder  # no other process may be at work in the run's folder
     with use("out", out.parent) as folder, single_files("evaluate", folder, [out.name], inputs):
         with progress() as on_progress:
-            original = original_tree(dataset, mesh)
             report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=partial(on_progress, "evaluate"))
         report = replace(report, seconds={**seconds, **report.seconds})
         report.save(out)
@@ -241,7 +245,9 @@ def export_command(
     from bbfit.model_files import check_model_path, names_beside
     from bbfit.outputs import single_files
 
-    billboards, out = BillboardCloud.load(cloud), check_model_path("model file", out)
+    out = check_model_path("model file", out)
+    export.check()
+    billboards = BillboardCloud.load(cloud)
     names = names_beside(out, texture=True, mip_files=export.resolve().mip_files)
     with single_files("bbfit export", out.parent, names, [cloud]):
         paths = model.export(billboards, out, export)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from bbfit.checks import fail
+from bbfit.checks import Range, check_fields, fail
 from bbfit.cli.console import err_console, out_console, progress
 from bbfit.fitting.config import FitConfig
 
@@ -33,10 +33,13 @@ class WatchConfig:
     """Show the fit in the browser while it runs. In a terminal the viewer stays until Ctrl-C, elsewhere it ends with the run."""
     host: str = "127.0.0.1"
     """Address that the viewer listens on: only this machine can reach 127.0.0.1, everybody on the network can reach 0.0.0.0."""
-    port: int = 8080
+    port: Annotated[int, Range(0, 65535)] = 8080
     """Port of the viewer; the next free one if it is taken."""
     open: Flag = False
     """Open the viewer in this machine's browser."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def view_command(

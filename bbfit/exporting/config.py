@@ -74,6 +74,11 @@ class ExportConfig:
             chosen["textures"] = "png" if ktx2_missing() else "ktx2"
         return ResolvedExport(**chosen)
 
+    def check(self) -> None:
+        """Require that the encoder of the requested textures is installed."""
+        if self.textures == "ktx2" and (missing := ktx2_missing()):
+            fail("textures", "the encoder of ktx2, the package alktx2, is not installed", missing)
+
     @property
     def missing_encoder(self) -> str | None:
         """What to install for textures that were requested with ``auto``; None if nothing is missing."""

@@ -34,12 +34,13 @@ def facing_view_bounds(planes: BillboardCloud, views: ViewSet, *, pairs: bool) -
     """Bound every billboard by the silhouette in the view that it faces best (thesis, section 6.3).
 
     The billboards, of any extent, have a common center. With ``pairs``, odd ones are the backs of pairs, which face the opposite direction.
-    Returns left, right, bottom and top along the billboard's axes from its center, in meters, [N, 4].
+    Empty views do not count; at least one view is not empty. Returns left, right, bottom and top along the billboard's axes from its
+    center, in meters, [N, 4].
     """
     cosines = facing_cosines(views.cameras, planes.normals, planes.centers[0])
     if pairs:
         cosines = cosines * torch.tensor([1.0, -1.0]).repeat(len(planes) // 2)
-    best = cosines.argmax(0).tolist()
+    best = [next(filter(views.shows, order)) for order in cosines.sort(dim=0, descending=True, stable=True).indices.T.tolist()]
     return torch.stack([_bounds_on_plane(planes, n, views.cameras[view], _box(views, view)) for n, view in enumerate(best)])
 
 
@@ -52,6 +53,8 @@ def silhouette_bounds(planes: BillboardCloud, views: ViewSet) -> Tensor:
     cosines = facing_cosines(views.cameras, planes.normals, planes.centers[0]).abs()
     bounds = torch.tensor([math.inf, -math.inf, math.inf, -math.inf], dtype=planes.centers.dtype).repeat(len(planes), 1)
     for view, row in enumerate(cosines):
+        if not views.shows(view):
+            continue
         outline = _outline(views, view)
         # A view halfway between two billboards bounds both, and a view of a pair bounds both of its rectangles.
         for n in torch.nonzero((row > row.max() - _TIE) & (row > _OBLIQUE))[:, 0].tolist():

@@ -54,7 +54,8 @@ def pixels_per_meter(camera: Camera) -> Tensor:
 
 def tree_radius(views: ViewSet) -> float:
     """Estimate the root mean square distance of the tree from its center in meters, from a few views, as if as deep as wide."""
-    alphas = torch.stack([views.image(i)[..., 3].double() for i in range(0, len(views), max(1, len(views) // 8))])
+    shown = [i for i in range(0, len(views), max(1, len(views) // 8)) if views.shows(i)] or list(filter(views.shows, range(len(views))))
+    alphas = torch.stack([views.image(i)[..., 3].double() for i in shown])
     variance = 0.0
     for weights, dimensions in ((alphas.sum(1), 2.0), (alphas.sum(2), 1.0)):
         weights = weights / weights.sum(-1, keepdim=True)

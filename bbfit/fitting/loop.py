@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bbfit.checks import InputTypeError, fail
+from bbfit.checks import InputTypeError
 from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
 from bbfit.fitting.config import FitConfig, ResolvedFit
@@ -23,6 +23,7 @@ from bbfit.fitting.initialize import bounded, pixels_per_meter, random_textures,
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.points import hull_points, mesh_points
+from bbfit.fitting.requirements import check_cameras, check_device
 from bbfit.fitting.search import find_placement
 from bbfit.fitting.steps import BLEND, HARDEST, Stepper
 from bbfit.geometry.alpha import AlphaMode
@@ -124,14 +125,16 @@ def fit(
     MissingFileError
         If the mesh is missing.
     InputError
-        If a view cannot be read or is empty, the mesh is not of the tree that the views show, or the device is not available.
+        If a view cannot be read, all are empty, or they look along one line. If the mesh is not of the tree that the views show, or the
+        device is not available.
     """
     if not isinstance(views, ViewDataset):
         raise InputTypeError(f"views: expected a ViewDataset, got {views!r}; ViewDataset.load(folder) reads one")
     config = (config or FitConfig()).resolve()
-    device = _device(config.device)
+    device = check_device(config)
     started = time.perf_counter()
     views.train.check()
+    check_cameras(views.train.cameras, config, mesh=tree is not None)
     tree_file = None if tree is None or config.placement == "even" else TreeFile.open(tree)
     key = cache_key("fit", *fit_inputs(views, config, tree_file))
     checkpoint = Path(checkpoint) if checkpoint is not None else None
@@ -192,7 +195,11 @@ def _initial_state(
     """Place the billboards evenly, or search for a placement."""
     if config.placement == "even":
         return _FitState([], start_cloud(views.train, config), None, {}, 0.0)
-    points = hull_points(views.train, seed=config.seed) if tree is None else mesh_points(tree, views.train, seed=config.seed)
+    rendered = views.request.tree if views.request else None
+    if tree is None:
+        points = hull_points(views.train, seed=config.seed, own=views.own)
+    else:
+        points = mesh_points(tree, views.train, rendered=rendered, seed=config.seed)
     placement = find_placement(views.train, points, config, on_place)
     density = config.texel_density * float(pixels_per_meter(views.train.cameras))
     return _FitState([], sized(placement, density, config.max_texels), placement, {}, 0.0)
@@ -257,14 +264,6 @@ def sample_views(config: ResolvedFit, count: int, index: int, halvings: int = 0)
     batches = count // batch  # of one permutation
     permutation = np.random.default_rng([config.seed, index // batches]).permutation(count)
     return permutation[index % batches * batch :][:batch].tolist()
-
-
-def _device(name: str) -> torch.device:
-    try:
-        torch.empty(0, device=name)
-    except (RuntimeError, AssertionError):
-        fail("device", f"{name!r} is not available", "use cpu, or cuda on a machine with a GPU and a CUDA build of torch")
-    return torch.device(name)
 
 
 def _save(path: Path, key: str, state: _FitState) -> None:

@@ -6,8 +6,9 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
+from bbfit.blender.request import RenderedTree
 from bbfit.checks import fail
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, convergence_point
@@ -18,44 +19,88 @@ COUNT = 20_000
 """Default number of points."""
 # Least fraction of the mesh's points, averaged over views, that must project onto the tree in the views.
 _AGREEMENT = 0.95
+# Pixels that cover less of the mesh than this can be empty in a picture: its few samples miss thin parts. Such points of the mesh must be
+# within a few pixels of the tree; all others within one.
+_FAINT, _NEAR_FAINT, _NEAR = 0.5, 3, 1
+# Largest difference between the corners of the mesh and of the rendered tree, as a fraction of its size.
+_SAME_BOUNDS = 1e-3
+# Pixels by which silhouettes without a common point are dilated, one after the other, because samples can miss parts thinner than a pixel;
+# and further ones for views that bbfit rendered, whose cameras are right.
+_DILATIONS, _FURTHER_DILATIONS = (0, 1, 2), (4, 8, 16, 32)
 # Most batches of random points.
 _ROUNDS = 64
 # Least side of the silhouettes that carve the hull, in pixels.
 _HULL_SIDE = 256
 
 
-def mesh_points(tree: TreeFile, views: ViewSet, *, count: int = COUNT, seed: int = 0) -> Tensor:
+def mesh_points(tree: TreeFile, views: ViewSet, *, rendered: RenderedTree | None = None, count: int = COUNT, seed: int = 0) -> Tensor:
     """Sample ``count`` points on the triangles of a tree's mesh, uniformly by area, float64 [P, 3] in the world of the views.
 
-    The views verify that the mesh, which must be readable without Blender, lies where they show the tree. Raises MissingFileError if the
-    file is missing, and InputError if it cannot be read, has no triangles, or is not of the tree that the views show.
+    The mesh must be readable without Blender. If it is the file that the views were ``rendered`` from, its bounds verify that bbfit reads
+    it as Blender does. Otherwise the views verify that the mesh lies where they show the tree. Raises MissingFileError if the file is
+    missing, and InputError if it cannot be read, has no triangles, or is not of the tree that the views show.
     """
     import trimesh
 
-    samples, _ = trimesh.sample.sample_surface(tree.mesh(), count, seed=seed)
-    points = torch.tensor(samples, dtype=torch.float64)
+    mesh = tree.mesh()
+    samples, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    points, bounds = torch.tensor(samples, dtype=torch.float64), torch.tensor(mesh.bounds, dtype=torch.float64)
     if tree.up_axis == "z":
-        points = points @ torch.tensor(Z_UP_TO_Y_UP, dtype=torch.float64)[:3, :3].mT
-    fractions = []
-    for index in range(0, len(views), max(1, len(views) // 8)):
-        # Dilate the silhouette by one pixel, because the few samples of a pixel can miss thin parts.
-        mask = max_pool2d((views.image(index)[..., 3] > 0).float()[None], 3, 1, 1)[0] > 0
-        fractions.append(_inside(points, views.cameras[index], mask, outside=True).double().mean())
-    if float(torch.stack(fractions).mean()) < _AGREEMENT:
+        y_up = torch.tensor(Z_UP_TO_Y_UP, dtype=torch.float64)[:3, :3].mT
+        points, bounds = points @ y_up, (bounds @ y_up).sort(0).values
+    known = rendered if rendered is not None and rendered.sha256 == tree.digest else None
+    if known and known.bounds:
+        difference = (bounds - torch.tensor(known.bounds, dtype=torch.float64)).abs().amax()
+        if float(difference) <= _SAME_BOUNDS * float((bounds[1] - bounds[0]).norm()):
+            return points
+    if _agreement(points, float(mesh.area), views) < _AGREEMENT:
+        if known:
+            fail("tree", f"bbfit finds the triangles of {tree.path} elsewhere than Blender", "export it from Blender as .glb")
         fail("tree", f"{tree.path} is not where the views show a tree", "give the mesh that they were rendered from, or no mesh")
     return points
 
 
-def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0, batch: int = 1 << 18) -> Tensor:
+def _agreement(points: Tensor, area: float, views: ViewSet) -> float:
+    """The fraction of points on a mesh of ``area`` square meters that project onto the tree in the views, averaged over some views."""
+    fractions = []
+    for index in range(0, len(views), max(1, len(views) // 8)):
+        camera = views.cameras[index]
+        mask = (views.image(index)[..., 3] > 0).float()[None]
+        near, nearby = (max_pool2d(mask, 2 * reach + 1, 1, reach)[0] > 0 for reach in (_NEAR, _NEAR_FAINT))
+        # The expected coverage of the 3 x 3 pixels around each pixel: a surface shows half of its area on average.
+        pixel, inside = pixels_of(points, camera)
+        scale = torch.full_like(points[:, 0], float(camera.intrinsics[0, 0]))
+        if not camera.orthographic:
+            scale = scale / (points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3])
+        shown = torch.where(inside, scale.square() * area / len(points) / 2, 0).float()
+        covered = torch.zeros(mask.numel()).index_add_(0, pixel, shown).view_as(mask)
+        faint = avg_pool2d(covered, 3, 1, 1)[0] < _FAINT
+        fractions.append(_inside(points, camera, near | (nearby & faint), outside=True).double().mean())
+    return float(torch.stack(fractions).mean())
+
+
+def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0, batch: int = 1 << 18, own: bool = False) -> Tensor:
     """Sample at most ``count`` points uniformly in the visual hull of the views, float64 [P, 3].
 
     The visual hull (Laurentini 1994) is the space that no view shows as background. The views carve ``batch`` random points at a time.
-    Raises InputError if the silhouettes have no point in common, because the cameras or the pictures are wrong.
+    Empty views do not carve. If the silhouettes have no point in common, they are dilated by one or two pixels, because samples can miss
+    thin parts, and further if the views are bbfit's ``own``. Raises InputError if they still have none, because the cameras or the pictures
+    are wrong.
     """
+    for pixels in _DILATIONS + (_FURTHER_DILATIONS if own else ()):
+        if len(hull := _carved(views, count, seed, batch, pixels)):
+            return hull
+    fail("views", "the silhouettes have no point in common", "check the cameras, or give the tree's mesh")
+
+
+def _carved(views: ViewSet, count: int, seed: int, batch: int, dilation: int) -> Tensor:
+    """The points of :func:`hull_points`, of silhouettes that are dilated by some pixels."""
+    views = views.take(list(filter(views.shows, range(len(views)))))
     cameras = views.cameras
     halvings = max(0, int(math.log2(min(cameras.width, cameras.height) / _HULL_SIDE)))
     side = 1 << halvings
     masks = [max_pool2d((views.image(i)[..., 3] > 0).float()[None], side, ceil_mode=True)[0] > 0 for i in range(len(views))]
+    masks = [max_pool2d(mask.float()[None], 2 * dilation + 1, 1, dilation)[0] > 0 for mask in masks] if dilation else masks
     # Space outside a picture is background too, unless the border of the picture cuts off the tree.
     cropped = [bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()) for mask in masks]
     cameras = cameras.resized(masks[0].shape[1], masks[0].shape[0])
@@ -72,10 +117,7 @@ def hull_points(views: ViewSet, *, count: int = COUNT, seed: int = 0, batch: int
         if len(batches) == 1 and len(points):  # restrict the next rounds to the surroundings of the hull
             margin = 0.02 * extent
             low, high = torch.maximum(low, points.amin(0) - margin), torch.minimum(high, points.amax(0) + margin)
-    hull = torch.cat(batches)[:count]
-    if not len(hull):
-        fail("views", "the silhouettes have no point in common", "check the cameras, or give the tree's mesh")
-    return hull
+    return torch.cat(batches)[:count]
 
 
 def point_colors(pixels: list[tuple[Tensor, Tensor]], pictures: Tensor) -> Tensor:

@@ -163,7 +163,8 @@ def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) ->
 
 def _around(alpha: Tensor) -> tuple[int, int, int, int]:
     """Left, top, right and bottom of a square around the visible part of an alpha channel [H, W], with a margin of a tenth, inside the
-    picture if that is large enough."""
+    picture if that is large enough. If nothing is visible, it is the whole picture."""
+    alpha = alpha if alpha.any() else torch.ones_like(alpha)
     rows, columns = (torch.nonzero(alpha.amax(axis) > 0)[:, 0] for axis in (1, 0))
     middle = [(int(line[0]) + int(line[-1]) + 1) / 2 for line in (columns, rows)]
     half = 0.6 * max(int(line[-1]) - int(line[0]) + 1 for line in (columns, rows))

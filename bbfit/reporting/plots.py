@@ -231,16 +231,17 @@ def lod_picture(levels: Sequence[tuple[LodLevel, ShippedModel]], views: ViewSet,
     from PIL import Image, ImageDraw
 
     width, height = views.cameras.width, views.cameras.height
-    alpha = views.targets([0])[0][..., 3]
-    tall = int(np.ptp(np.flatnonzero(alpha.amax(1).numpy() > 0))) + 1
+    index = next(filter(views.shows, range(len(views))), 0)
+    alpha = views.targets([index])[0][..., 3]
+    tall = int(np.ptp(np.flatnonzero(alpha.amax(1).numpy() > 0))) + 1 if views.shows(index) else height
     side, gap, text = 384, 16, 14
     sheet = Image.new("RGB", (gap + len(levels) * (side + gap), 2 * (side + gap) + gap + 3 * text), PAPER)
     draw, font, bold = ImageDraw.Draw(sheet), picture_font("DejaVuSans.ttf", text), picture_font("DejaVuSans-Bold.ttf", text)
     for column, (level, model) in enumerate(levels):
         share = min(1.0, (level.tree_pixels or tall) / tall)
         size = max(metrics.SSIM_WINDOW, round(width * share)), max(metrics.SSIM_WINDOW, round(height * share))
-        target = shrunk(views.targets([0])[0], *size)
-        image = model.draw(views.cameras[0].resized(*size))
+        target = shrunk(views.targets([index])[0], *size)
+        image = model.draw(views.cameras[index].resized(*size))
         left = gap + column * (side + gap)
         draw.text((left, gap // 2), level.name, INK, bold)
         draw.text((left, gap // 2 + text * 5 // 4), f"the tree is {tall * share:.0f} pixels high", FAINT, font)

@@ -65,6 +65,8 @@ def _carve(views: ViewSet, start: NDArray[np.float64], side: float, counts: NDAr
     kept, left = torch.ones(len(centers)), torch.arange(len(centers))
     for index in range(len(views)):
         camera = views.cameras[index]
+        if not views.shows(index):
+            continue  # the tree is too thin to be seen, but not absent
         alpha = views.image(index)[..., 3].float() / 255
         distance = 1.0 if camera.orthographic else float((camera.position - centers.mean(0)).norm())
         footprint = max(1, round(side * float(camera.intrinsics[0, 0]) / distance) | 1)

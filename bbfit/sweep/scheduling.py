@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from bbfit.blender.requirements import check_blender
 from bbfit.checks import InputError, check_file, check_folder, fail
+from bbfit.exporting.config import ExportConfig
 from bbfit.files import write_bytes
 from bbfit.fitting.loop import fit_inputs
 from bbfit.layout import TEST_FILE
 from bbfit.outputs import Written, claimed_folder
-from bbfit.pipeline import RunConfig
+from bbfit.pipeline import RunConfig, needs_blender
 from bbfit.provenance import VERSIONS, cache_key, identity
 from bbfit.reporting.sweep_plots import sweep_plot
 from bbfit.reporting.sweep_tables import SweepRow, table_csv, table_markdown
@@ -26,7 +28,7 @@ from bbfit.sweep.grid import Cell, Grid
 from bbfit.sweep.local import LocalWorkers
 from bbfit.sweep.results import Results
 from bbfit.sweep.tasks import Outcome, Task, Workers, fit_tree, prepare_tree
-from bbfit.tree_files.tree_file import TreeFile
+from bbfit.tree_files.tree_file import MESH_SUFFIXES, TreeFile
 from bbfit.trees.species import load_species
 from bbfit.views import ViewDataset
 
@@ -106,6 +108,7 @@ def run_sweep(
     grid = Grid.load(config.grid).narrowed(config)
     cells = grid.cells(stages.fit)
     all_sources = sources(species if species or trees or views else grid.trees, trees, views, stages.grow.species_file)
+    _check(Path(out), all_sources, cells, config, stages)
     with claimed_folder("out", out) as folder:
         written = Written(folder)
         written.begin("tables", TABLES, [*map(Path, trees)])
@@ -116,6 +119,21 @@ def run_sweep(
         result = sweep.result()
         written.finish("tables", written.digests(TABLES))
         return result
+
+
+def _check(folder: Path, sources: list[Source], cells: list[Cell], config: SweepConfig, stages: RunConfig) -> None:
+    """Check the options of all runs before the first one. Devices and packages of a cluster are not known here."""
+    to_render = [source for source in sources if source.views is None]
+    mesh = all(source.tree is None or source.tree.suffix.lower() in MESH_SUFFIXES for source in to_render)
+    for cell in cells:
+        fit, export = (cell.config, stages.export) if config.ray is None else (replace(cell.config, device="cpu"), ExportConfig())
+        replace(stages, fit=fit, export=export).check(mesh=mesh, rendered=bool(to_render), blender=False)
+    if config.ray is None and any(needs_blender(_tree_folder(folder, source)) for source in to_render):
+        check_blender(stages.views)
+
+
+def _tree_folder(folder: Path, source: Source) -> Path:
+    return folder / "trees" / source.name
 
 
 def sources(
@@ -214,8 +232,7 @@ class _Sweep:
         if reason is None:
             try:
                 views = ViewDataset.load(folder)
-                views.train.check()
-                views.test.check()
+                views.check()
             except InputError as error:
                 reason = str(error)
         if reason is not None:
@@ -252,7 +269,7 @@ class _Sweep:
         return outcome.reason is None or not self._config.retry_failed
 
     def _folder_of(self, source: Source) -> Path:
-        return self._folder / "trees" / source.name
+        return _tree_folder(self._folder, source)
 
     def _rows(self) -> list[SweepRow]:
         return [

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bbfit.checks import InputError
+from bbfit.fitting.config import FitConfig
 from bbfit.pipeline import RunConfig
 
 Facts = dict[str, Any]
@@ -85,10 +86,12 @@ def prepare_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig, sp
     from bbfit.pipeline import prepare
 
     grow = RunConfig().grow if species is None else replace(stages.grow, species_file=inputs.get("species_file"))
-    stages = replace(stages, species=species, grow=grow, views=replace(stages.views, hdri=inputs.get("hdri")))
+    views = replace(stages.views, hdri=inputs.get("hdri"))
+    # Without the options of the runs.
+    stages = RunConfig(species=species, grow=grow, views=views, fit=FitConfig(seed=stages.fit.seed), limits=stages.limits)
     with prepare(inputs.get("tree"), folder, stages) as prepared:
-        tree, views = prepared.tree, prepared.views
-        return {"mesh": None if tree is None else tree.path.name, "views": len(views.train) + len(views.test)}
+        tree = prepared.tree
+        return {"mesh": None if tree is None else tree.path.name, "views": len(prepared.views.train) + len(prepared.views.test)}
 
 
 def fit_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig) -> Facts:

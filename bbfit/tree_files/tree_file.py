@@ -112,6 +112,11 @@ class TreeFile:
         """The number of vertices of :meth:`mesh`, whose errors are raised."""
         return len(self.mesh().vertices)
 
+    def check_is_mesh(self) -> None:
+        """Require that the triangles can be read without Blender."""
+        if not self.is_mesh:
+            fail("tree", f"only Blender can read the triangles of {self.path}", f"give one of {' '.join(MESH_SUFFIXES)}, or no tree")
+
     def scene(self) -> trimesh.Scene:
         """The meshes of the tree with their materials, in the axes and the order of the file. Vertices are not merged.
 
@@ -122,8 +127,7 @@ class TreeFile:
         """
         import trimesh
 
-        if not self.is_mesh:
-            fail("tree", f"only Blender can read the triangles of {self.path}", f"give one of {' '.join(MESH_SUFFIXES)}, or no tree")
+        self.check_is_mesh()
         try:
             scene = trimesh.load_scene(self.path, process=False)
         except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:

@@ -16,7 +16,7 @@ from bbfit.geometry.camera import Camera, convergence_point
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.homography import texel_to_pixel
 from bbfit.operators.drawing.reference import render_reference
-from bbfit.views import ViewDataset
+from bbfit.views import ViewDataset, ViewSet
 
 
 @pytest.fixture(scope="module")
@@ -267,3 +267,15 @@ def test_trimming_leaves_a_billboard_where_none_shows_anything(known_cloud: Bill
     texels[:, 3] = 0.001
     cut = trimmed(known_cloud.with_texels(texels))
     assert len(cut) == 1 and cut.texture_sizes.tolist() == [[1, 1]]
+
+
+@pytest.mark.parametrize("bounds", ["thesis", "silhouette"])
+def test_empty_views_bound_nothing(views: ViewDataset, bounds: str) -> None:
+    """A cloud gets the bounds of the views that show something, wherever the empty ones stand."""
+    config = FitConfig(billboards=2, placement="even", bounds=bounds, texel_density=1)
+    pictures = views.train.images(range(len(views.train))).clone()
+    pictures[:2] = 0
+    cloud = start_cloud(ViewSet.from_arrays(pictures, views.train.cameras), config)
+    expected = start_cloud(views.train, config)
+    assert cloud.half_extents.isfinite().all() and (cloud.half_extents > 0).all()
+    torch.testing.assert_close(cloud.half_extents, expected.half_extents, rtol=0.2, atol=0)

@@ -87,3 +87,12 @@ def test_alpha_is_that_of_bytes_and_what_is_clear_stays_so(views: ViewSet) -> No
 def test_no_billboards_are_no_trouble(views: ViewSet) -> None:
     none = leafy().take([])
     assert matched_coverage(none, views) is none
+
+
+def test_empty_views_do_not_count(views: ViewSet) -> None:
+    pictures = views.images(range(len(views))).clone()
+    seen, cloud = list(range(2, len(views))), moved(leafy(), [0.1] * COUNT)
+    pictures[:2] = 0
+    with_empty = matched_coverage(cloud, ViewSet.from_arrays(pictures, views.cameras)).texels
+    assert torch.equal(with_empty, matched_coverage(cloud, views.take(seen)).texels)
+    assert matched_coverage(cloud, ViewSet.from_arrays(torch.zeros_like(pictures), views.cameras)) is cloud

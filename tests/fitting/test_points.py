@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from bbfit.blender.request import RenderedTree
 from bbfit.checks import InputError, MissingFileError
 from bbfit.fitting.points import hull_points, mesh_points, pixels_of, point_colors
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
@@ -220,7 +222,64 @@ def test_a_mesh_of_another_tree_is_refused(views: ViewSet, tree: trimesh.Trimesh
         mesh_points(TreeFile.open(tmp_path / "other.glb"), views)
 
 
+def test_the_file_that_was_rendered_needs_no_silhouette(views: ViewSet, tree: trimesh.Trimesh) -> None:
+    """A tree so thin that its pictures miss most of it is where Blender measured it. Another digest or other bounds prove nothing."""
+    file = TreeFile.open(DATA / "tree.glb")
+    low, high = (tuple(corner) for corner in tree.bounds.tolist())
+    alpha = views.images(range(len(views))).clone()
+    alpha[:, : alpha.shape[1] // 2] = 0  # nothing is seen of the crown
+    half = viewset(alpha, views.cameras)
+    rendered = RenderedTree(sha256=file.digest, bounds=(low, high))
+    assert torch.equal(mesh_points(file, half, rendered=rendered), mesh_points(file, views))
+    moved = (low, tuple(value + 0.1 for value in high))
+    for other, said in (
+        (replace(rendered, sha256="0"), "is not where the views show a tree"),
+        (None, "is not where the views show a tree"),
+        (replace(rendered, bounds=moved), r"bbfit finds the triangles of .* elsewhere than Blender; export it from Blender as \.glb"),
+        (replace(rendered, bounds=None), "elsewhere than Blender"),
+    ):
+        with pytest.raises(InputError, match=said):
+            mesh_points(file, half, rendered=other)
+
+
+@pytest.mark.parametrize(("shift", "same"), [(0.0, True), (3.0, False)])
+def test_a_twig_that_samples_miss_is_where_the_views_show_its_trunk(shift: float, same: bool, tmp_path: Path) -> None:
+    """Of twigs of a hundredth of a pixel no sample sees anything; near the trunk that is no contradiction, far from it it is."""
+    cameras = ring_around_origin(8, 16, 16)
+    pixel = 0.15  # meters
+    trunk = box((-pixel, -1.0, -pixel), (pixel, 1.0, pixel))
+    pictures = torch.zeros(8, 16, 16, 4, dtype=torch.uint8)
+    for index in range(8):
+        x, y = cameras[index].project(torch.from_numpy(trunk.vertices)).round().long().unbind(-1)
+        pictures[index, int(y.amin()) : int(y.amax()) + 1, int(x.amin()) : int(x.amax()) + 1] = 255
+    twigs = [box((0.0, y, 0.0), (0.6, y + 1e-3, 1e-3)) for y in np.linspace(-0.9, 0.9, 40)]
+    mesh = trimesh.util.concatenate([box((-0.01, -1.0, -0.01), (0.01, 1.0, 0.01)), *twigs])
+    mesh.apply_translation([shift, 0, 0]).export(tmp_path / "tree.glb")
+    if same:
+        assert len(mesh_points(TreeFile.open(tmp_path / "tree.glb"), viewset(pictures, cameras))) == 20_000
+    else:
+        with pytest.raises(InputError, match="is not where the views show a tree"):
+            mesh_points(TreeFile.open(tmp_path / "tree.glb"), viewset(pictures, cameras))
+
+
 # Hull
+
+
+def test_a_pole_with_gaps_has_a_hull_and_empty_views_do_not_carve() -> None:
+    """Every view of a thin pole shows other rows of it, as few samples do; without the gaps it would be the same pole."""
+    cameras = ring_around_origin(6, 33, 33)
+    pictures = torch.zeros(6, 33, 33, 4, dtype=torch.uint8)
+    for index in range(5):
+        pictures[index, 4 + index % 2 : 29 : 2, 16] = 255
+    views = viewset(pictures, cameras)
+    points = hull_points(views, count=500)
+    assert len(points) == 500 and points[:, ::2].norm(dim=-1).max() < 0.3 and points[:, 1].abs().max() < 1.25
+    pictures = torch.zeros(6, 33, 33, 4, dtype=torch.uint8)
+    for index in range(5):
+        pictures[index, 4 + 5 * index, 16] = 255
+    with pytest.raises(InputError, match="the silhouettes have no point in common"):
+        hull_points(viewset(pictures, cameras), count=10, batch=1 << 14)
+    assert len(hull_points(viewset(pictures, cameras), count=10, batch=1 << 14, own=True)) == 10
 
 
 def on_background(points: Tensor, views: ViewSet, index: int) -> Tensor:
