@@ -86,7 +86,7 @@ def grow_command(
         from bbfit.reporting.tables import species_table
 
         out_console.print(species_table([load_species(name, grow.species_file) for name in known_species(grow.species_file)]))
-        out_console.print(f"figures in {grow.species_file or figures_file()}", soft_wrap=True, highlight=False)
+        out_console.print(f"figures in {grow.species_file or figures_file()}", soft_wrap=True)
         return
     from bbfit.trees.tree_writer import write_tree
 
@@ -122,7 +122,7 @@ def views_command(
 
     with progress() as on_progress:
         render_views(tree, out, views, on_progress=lambda done, total: on_progress("views", done, total))
-    out_console.print(f"{views.count} views in {out}")
+    out_console.print(f"{views.count} views in {out}", soft_wrap=True)
 
 
 def fit_command(
@@ -225,7 +225,7 @@ def export_command(
     from bbfit.geometry.cloud import BillboardCloud
 
     for path in model.export(BillboardCloud.load(cloud), out, export):
-        out_console.print(f"{path}  {path.stat().st_size:,} bytes")
+        out_console.print(f"{path}  {path.stat().st_size:,} bytes", soft_wrap=True)
     show_missing_encoder(export)
 
 

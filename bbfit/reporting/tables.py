@@ -33,6 +33,8 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
     An arrow shows which direction is better. With ``thesis`` a last column has the thesis scale, for comparison with the thesis's figures.
     """
     mean, count = report.mean, len(report.views)
+    from rich.text import Text
+
     table = _table(["measure"], [])
     table.title, table.title_style = f"{title}: mean of {count}" if count > 1 else f"{title}: one view", "bold"
     table.add_column("better", justify="center", style="dim")
@@ -63,12 +65,12 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
 
     if report.sizes:
         table.add_section()
-        table.add_row("[bold]as exported[/]", "", "[bold]PSNR, dB[/]", "[bold]coverage[/]", "")
+        table.add_row("as exported", "", "PSNR, dB", "coverage", "", style="bold")
         for size in report.sizes:
             table.add_row(f"{size.width} x {size.height} pixels", f"{_UP} {_ONE}", f"{size.psnr:.2f}", _share(size.coverage), "")
 
     table.add_section()
-    table.add_row("[bold]cost[/]", "", "[bold]model[/]", "[bold]original[/]", "[bold not dim]ratio[/]")
+    table.add_row("cost", "", "model", "original", Text("ratio", style="not dim"), style="bold")
     for name, cost in (("vertices", report.vertices), ("file, bytes", report.bytes)):
         table.add_row(name, _DOWN, _count(cost.model), _count(cost.original), _percent(cost))
     if report.overdraw is not None:

@@ -9,14 +9,14 @@ from __future__ import annotations
 import os
 import re
 import socket
-import tempfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bbfit.checks import fail
+from bbfit.checks import fail, in_words
 from bbfit.files import output_folder, write_bytes
+from bbfit.scratch import ScratchFolder
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.tasks import Outcome, Task, attempt
 
@@ -109,8 +109,9 @@ def _check_address(address: str) -> None:
         return  # auto, local, or another name that Ray knows
     try:
         socket.create_connection((host.rpartition("/")[2], int(port)), timeout=10).close()
-    except OSError as error:
-        fail("ray", f"no cluster answers at {address} ({error.strerror or error})", "start one with ray start, or use local")
+    except (OSError, UnicodeError, OverflowError) as error:
+        reason = in_words(error) if isinstance(error, OSError) else "it is not an address"
+        fail("ray", f"no cluster answers at {address} ({reason})", "start one with ray start, or use local")
 
 
 def read_files(*paths: Path) -> Files:
@@ -140,13 +141,13 @@ def _run_remotely(task: Task, cores: int, main_files: dict[str, str], *contents:
     import torch
 
     torch.set_num_threads(cores)
-    with tempfile.TemporaryDirectory(prefix="bbfit-") as scratch:
+    with ScratchFolder() as scratch:
         inputs = {}
         for (name, main_file), files in zip(main_files.items(), contents, strict=True):
-            folder = Path(scratch) / name
+            folder = scratch / name
             write_files(files, folder)
             inputs[name] = folder / main_file
-        out = output_folder("out", Path(scratch) / "out")
+        out = output_folder("out", scratch / "out")
         where = f"node {ray.get_runtime_context().get_node_id()}"
         outcome = attempt(partial(task.work, inputs, out, *task.arguments), where)
         return outcome, read_files(out) if outcome.reason is None else {}
