@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from bbfit.pipeline import RunResult
     from bbfit.stages.stage import OnProgress
 
+
 class OutputError(InputError):
     """Standard output cannot be written to."""
 
@@ -88,5 +89,11 @@ def take_any_text() -> None:
 def _similar(error: UnicodeError) -> tuple[str | bytes, int]:
     assert isinstance(error, UnicodeEncodeError)
     text = error.object[error.start : error.end].translate(_PLAIN)
-    # Python keeps the bytes of a path that are not UTF-8 in a range of its own.
-    return "".join(f"\\x{ord(c) - 0xDC00:02x}" if 0xDC80 <= ord(c) <= 0xDCFF else c for c in text).encode("ascii", "backslashreplace").decode(), error.end
+    return "".join(map(_escaped, text)), error.end
+
+
+def _escaped(letter: str) -> str:
+    code = ord(letter)
+    if 0xDC80 <= code <= 0xDCFF:  # where Python keeps the bytes of a path that are not UTF-8
+        return f"\\x{code - 0xDC00:02x}"
+    return letter.encode("ascii", "backslashreplace").decode()

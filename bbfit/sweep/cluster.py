@@ -8,7 +8,11 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -49,10 +53,11 @@ class RayWorkers:
         _check_address(address)
         if not ray.is_initialized():
             try:
-                if address == "local":
-                    ray.init(**_QUIET)
-                else:
-                    ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+                with _same_handlers():
+                    if address == "local":
+                        ray.init(**_QUIET)
+                    else:
+                        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
             except (ConnectionError, ValueError, RuntimeError) as error:
                 fail(
                     "ray",
@@ -100,6 +105,19 @@ class RayWorkers:
         if paths not in self._references:
             self._references[paths] = self._ray.put(read_files(*paths))
         return self._references[paths]
+
+
+@contextmanager
+def _same_handlers() -> Iterator[None]:
+    """Keep the handlers of signals. Ray's own one for SIGTERM prints a stack trace and ends the process."""
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in before.items():
+                if callable(handler):
+                    signal.signal(number, handler)
 
 
 def _check_address(address: str) -> None:
