@@ -127,7 +127,7 @@ def compare(
         rows.append(comparison.row(system))
         on_progress("systems", number, len(systems), system)
     write_bytes(folder / "compare.csv", compare_csv(rows))
-    write_bytes(folder / "compare.md", compare_markdown(rows, original_tree(views)).encode())
+    write_bytes(folder / "compare.md", compare_markdown(rows, original_tree(views)).encode(errors="backslashreplace"))
     write_json(folder / "compare.json", [row.to_json() for row in rows])
     compare_plot(rows, folder / "quality.png")
     compare_picture(rows, views.test, folder)

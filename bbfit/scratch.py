@@ -10,6 +10,7 @@ import contextlib
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
@@ -45,6 +46,26 @@ class ScratchFolder:
         lock, self._lock = self._lock, None
         if lock is not None:
             os.close(lock)
+
+
+@contextlib.contextmanager
+def named_in_utf8(path: Path) -> Iterator[Path]:
+    """The path of a file for libraries that take only UTF-8: a link to the file where its own path is something else."""
+    if not _has_other_bytes(path):
+        yield path
+        return
+    with ScratchFolder() as folder:
+        link = folder / "file"
+        link.symlink_to(path.resolve())
+        yield link
+
+
+def _has_other_bytes(path: Path) -> bool:
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return True
+    return False
 
 
 def remove_own() -> None:

@@ -236,7 +236,7 @@ def test_a_terminal_that_knows_ascii_alone(words: list[str]) -> None:
 @pytest.mark.parametrize("name", [b"c/[/b].glb", b"[red]:evergreen_tree:.glb", b"caf\xe9.glb"], ids=["markup", "emoji", "latin"])
 def test_odd_names_are_shown_as_they_are(name: bytes, tmp_path: Path) -> None:
     path = os.fsencode(tmp_path) + b"/" + name
-    os.makedirs(os.path.dirname(path), exist_ok=True)
+    Path(os.fsdecode(path)).parent.mkdir(parents=True, exist_ok=True)
     shown = path.replace(b"\xe9", rb"\xe9")
     code, out, err = said_by([b"grow", b"acer", b"--out", path, b"--detail", b"0.1", b"--leaves", b"0"])
     assert code == 0 and shown + b"  " in out and not err

@@ -24,7 +24,7 @@ def obj_files(path: Path) -> list[Path]:
 
 def _existing(folder: Path, names: list[bytes]) -> Iterator[Path]:
     for name in names:
-        text = name.decode(errors="replace").replace("\\", "/")
+        text = name.decode(errors="surrogateescape").replace("\\", "/")
         words = text.split()
         readings = [text, *(" ".join(words[start:]) for start in range(1, len(words))), *words]
         yield from (folder / reading for reading in readings if "\0" not in reading and (folder / reading).is_file())
