@@ -279,3 +279,27 @@ def test_without_a_home_the_variable_for_kernels_is_named(tmp_path: Path, views_
     done = subprocess.run([*BBFIT, *words], capture_output=True, text=True, env=environment)
     assert done.returncode == 2
     assert "WARP_CACHE_PATH" in done.stderr.splitlines()[-1] and "Traceback" not in done.stderr and "[Errno" not in done.stderr
+
+
+def test_libraries_say_nothing_of_their_own(tmp_path: Path) -> None:
+    """Unless the user asks for it."""
+    code = """
+import logging, sys, types, warnings
+from bbfit.cli import main
+
+def run(*arguments, **options):
+    import cv2
+    warnings.warn("a warning")
+    logging.getLogger("trimesh").warning("another")
+    cv2.imread("nowhere.png")
+    raise SystemExit(7)
+
+sys.modules["bbfit.pipeline"] = types.SimpleNamespace(RunConfig=dict, run=run)
+sys.exit(main())
+"""
+    words = ["fit", str(DATA / "views"), "--out", str(tmp_path / "out")]
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONWARNINGS", "OPENCV_LOG_LEVEL")}
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stderr) == (7, "")
+    asked = subprocess.run([sys.executable, "-W", "default", "-c", code, *words], capture_output=True, text=True, env=environment)
+    assert "UserWarning: a warning" in asked.stderr

@@ -29,7 +29,7 @@ class CacheError(InputError, ImportError):
 
 
 @contextmanager
-def _cache() -> Iterator[None]:
+def cache_of_kernels() -> Iterator[None]:
     """Within this block Warp uses its cache of compiled kernels. If it cannot be written to, this raises :class:`CacheError`."""
     try:
         yield
@@ -47,7 +47,7 @@ def _initialize() -> None:
     try:
         kept = os.dup(2)
     except OSError:  # there is no standard error
-        with _cache():
+        with cache_of_kernels():
             wp.init()
         return
     if sys.stderr is not None:
@@ -55,7 +55,7 @@ def _initialize() -> None:
     try:
         with Path(os.devnull).open("wb") as nowhere:
             os.dup2(nowhere.fileno(), 2)
-        with _cache():
+        with cache_of_kernels():
             wp.init()
     finally:
         os.dup2(kept, 2)
@@ -70,7 +70,7 @@ def launch(kernel: Any, count: int, least: int, arguments: Sequence[Any], output
 
     Warp runs a CPU launch in the calling thread; the pieces share all cores. The kernel's first argument is where its piece begins.
     """
-    with _cache():
+    with cache_of_kernels():
         kernel.module.load(on)  # or every thread would compile it
 
     def piece(begin: int, end: int) -> None:

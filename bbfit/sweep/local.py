@@ -52,6 +52,8 @@ class LocalWorkers:
 
     def __exit__(self, *_: object) -> None:
         for worker in self._workers:
+            worker.lifeline.close()  # all of them end at the same time
+        for worker in self._workers:
             _stop(worker)
         self._workers.clear()
 

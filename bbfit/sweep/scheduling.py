@@ -120,15 +120,15 @@ def sources(
     there are no trees, one does not exist, or two have the same name.
     """
     result = [Source(load_species(name, species_file).name, species=name) for name in species]
-    on_disk = [(path, Source(_readable(path.stem), tree=check_file("tree", path))) for path in map(Path, trees)]
+    on_disk = [(path, Source(_plain(path.stem), tree=check_file("tree", path))) for path in map(Path, trees)]
     for folder in views:
         path = check_folder("views", folder).resolve()
         path = path.parent if path.name == "views" else path  # a run calls its folder of views so
-        on_disk.append((path, Source(_readable(path.name), views=Path(folder))))
+        on_disk.append((path, Source(_plain(path.name), views=Path(folder))))
     names = [source.name for source in result] + [source.name for _, source in on_disk]
     for path, source in on_disk:  # tree libraries often have a folder for each tree, with the same file name in all folders
         result.append(
-            source if names.count(source.name) == 1 else replace(source, name=f"{_readable(path.resolve().parent.name)}_{source.name}")
+            source if names.count(source.name) == 1 else replace(source, name=f"{_plain(path.resolve().parent.name)}_{source.name}")
         )
     if not result:
         fail("sweep", "there are no trees", "give species, trees or views")
@@ -138,7 +138,7 @@ def sources(
     return result
 
 
-def _readable(name: str) -> str:
+def _plain(name: str) -> str:
     """A name in which bytes that are not UTF-8 are written as numbers."""
     return os.fsencode(name).decode(errors="backslashreplace")
 
