@@ -21,9 +21,11 @@ _UP, _DOWN, _ONE = "↑", "↓", "→ 1"
 
 def species_table(species: Sequence[Species]) -> Table:
     """A ``rich`` table of species: name, height and levels of stems."""
+    from rich.text import Text
+
     table = _table(["species"], ["height, m", "levels of stems"])
     for one in species:
-        table.add_row(one.name, f"{one.scale:g} ± {one.scale_v:g}", str(one.levels))
+        table.add_row(Text(one.name), f"{one.scale:g} ± {one.scale_v:g}", str(one.levels))
     return table
 
 
@@ -94,12 +96,14 @@ def lod_table(levels: Sequence[LodLevel]) -> Table:
 
 def sweep_table(rows: Sequence[SweepRow]) -> Table:
     """A ``rich`` table with one line per run: measures and costs, or the reason of its failure."""
+    from rich.text import Text  # of names and reasons, in which brackets are no markup
+
     labels = label_names(rows)
     table = _table(["tree", *labels], ["PSNR, dB", "SSIM", "FLIP", "vertices", "bytes", "seconds"])
     for row in rows:
-        start = [row.tree, *(row.labels.get(name, "") for name in labels)]
+        start = [Text(row.tree), *(Text(row.labels.get(name, "")) for name in labels)]
         if row.facts is None:
-            table.add_row(*start, f"failed: {row.reason}", style="yellow")
+            table.add_row(*start, Text(f"failed: {row.reason}"), style="yellow")
             continue
         report = row.facts["report"]
         measures = [f"{measure.of(row):{measure.digits}}" for measure in MEASURES[:3]]
