@@ -27,15 +27,15 @@ class Stopped(KeyboardInterrupt):
 class Stopping:
     """Within this context a signal ends the command in an orderly way: it raises :class:`Stopped`, and leaving the context says so.
 
-    In a ``program``, which owns its process, a signal that comes where an exception would do harm ends the process at once: before
-    :meth:`begin`, during an import, and again while the first one is answered. This still holds after the context, until the process
-    ends. Signals that the process ignores, as under nohup, and those that somebody else handles, stay as they are.
+    A signal that comes where an exception would do harm ends the process at once: before :meth:`begin`, during an import, and again while
+    the first one is answered. This still holds after the context, until the process ends. Signals that the process ignores, as under
+    nohup, stay as they are. If the command is no ``program``, which owns its process, all signals do, and only Ctrl-C ends the command.
     """
 
     def __init__(self, *, program: bool) -> None:
         self._program, self._begun, self._said = program, False, False
         self._number: int | None = None
-        self._before = dict[int, Any]()
+        self._handled = list[int]()
 
     @property
     def code(self) -> int:
@@ -43,12 +43,11 @@ class Stopping:
         return 128 + (self._number or signal.SIGINT)
 
     def __enter__(self) -> Stopping:
-        if threading.current_thread() is threading.main_thread():
+        if self._program and threading.current_thread() is threading.main_thread():
             self._hook, sys.unraisablehook = sys.unraisablehook, self._raise_again
             for number in SIGNALS:
-                before = signal.getsignal(number)
-                if before in (signal.SIG_DFL, signal.default_int_handler):
-                    self._before[number] = before
+                if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+                    self._handled.append(number)
                     signal.signal(number, self._stop)
         return self
 
@@ -58,10 +57,6 @@ class Stopping:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> bool:
         self._begun = False
-        if not self._program and self._before:
-            sys.unraisablehook = self._hook
-            for number, before in self._before.items():
-                signal.signal(number, before)
         # Some libraries turn the exception into one of their own.
         stopped = isinstance(error, KeyboardInterrupt) or (error is not None and self._number is not None)
         if stopped:
@@ -71,14 +66,14 @@ class Stopping:
         return stopped
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
-        if self._program and (not self._begun or self._number is not None or _imports(frame)):
+        if not self._begun or self._number is not None or _imports(frame):
             self._end(number)
         self._number = number
         raise Stopped(number)
 
     def _end(self, number: int) -> None:
         """End the process at once."""
-        for other in self._before:
+        for other in self._handled:
             signal.signal(other, signal.SIG_IGN)
         self._number = self._number or number
         if not self._said:
