@@ -7,6 +7,7 @@ errors, into exit code 2; any other exception is a bug in bbfit.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, fields
 from functools import cache
 from math import inf
@@ -28,6 +29,14 @@ class MissingFileError(InputError, FileNotFoundError):
 
     def __str__(self) -> str:
         return str(self.args[0])
+
+
+def in_words(error: Exception) -> str:
+    """An error in words for the user: its message, and for an ``OSError`` the file and the system's reason without their numbers."""
+    if not isinstance(error, OSError) or isinstance(error, InputError) or error.strerror is None:
+        return str(error)
+    name = error.filename
+    return error.strerror if name is None else f"{os.fsdecode(name) if isinstance(name, bytes) else name} cannot be used ({error.strerror})"
 
 
 def fail(name: str, problem: str, hint: str = "") -> NoReturn:

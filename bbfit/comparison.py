@@ -147,7 +147,7 @@ def _compared(
 
     def write_tables(on_progress: OnProgress) -> None:
         write_bytes(folder / "compare.csv", compare_csv(rows))
-        write_bytes(folder / "compare.md", compare_markdown(rows, original_tree(views)).encode())
+        write_bytes(folder / "compare.md", compare_markdown(rows, original_tree(views)).encode(errors="backslashreplace"))
         write_json(folder / "compare.json", [row.to_json() for row in rows])
         compare_plot(rows, folder / "quality.png")
         compare_picture(rows, views.test, folder)

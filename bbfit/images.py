@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 
 import cv2
@@ -30,7 +31,7 @@ def read_rgba(path: str | Path) -> NDArray[np.uint8]:
     if png and not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
         fail("image", f"{path} is cut short", "render or copy it again")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(_essential(data) if png else data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:  # the header announces more pixels than OpenCV accepts
         image = None
     if image is None:
@@ -40,6 +41,21 @@ def read_rgba(path: str | Path) -> NDArray[np.uint8]:
     if image.dtype == np.uint16:
         image = np.rint(image / 257).astype(np.uint8)
     return np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA))
+
+
+def _essential(png: bytes) -> bytes:
+    """The chunks of a PNG file that its pixels depend on; nothing if one is damaged. libpng would print complaints about the others."""
+    kept, start, kind = [png[:8]], 8, b""
+    while kind != b"IEND":
+        kind, end = png[start + 4 : start + 8], start + 12 + int.from_bytes(png[start : start + 4], "big")
+        if end > len(png):
+            return b""
+        if kind in (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"):
+            if zlib.crc32(png[start + 4 : end - 4]) != int.from_bytes(png[end - 4 : end], "big"):
+                return b""
+            kept.append(png[start:end])
+        start = end
+    return b"".join(kept)
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:

@@ -123,3 +123,29 @@ def test_over_a_background() -> None:
     assert over_color(image, torch.tensor([1.0, 0, 0]))[1].tolist() == [1, 0, 0]
     with pytest.raises(InputError, match="shape"):
         over_color(image[:, :3])
+
+
+def chunk(kind: bytes, content: bytes) -> bytes:
+    """A chunk of a PNG file."""
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+@pytest.mark.parametrize("depth", [np.uint8, np.uint16])
+def test_what_a_png_holds_beside_its_pixels_is_of_no_concern(depth: type, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Bad color profiles, of which some programs write one into every picture, and chunks whose checksum is wrong."""
+    picture = np.random.default_rng(0).integers(0, np.iinfo(depth).max, (5, 7, 4)).astype(depth)
+    data = cv2.imencode(".png", picture)[1].tobytes()
+    extra = chunk(b"iCCP", b"icc\0\0" + zlib.compress(b"nonsense")) + chunk(b"tIME", b"")[:-4] + b"none"
+    for name, content in (("plain.png", data), ("extra.png", data[:33] + extra + data[33:] + b"\0\0")):
+        (tmp_path / name).write_bytes(content)
+    np.testing.assert_array_equal(read_rgba(tmp_path / "extra.png"), read_rgba(tmp_path / "plain.png"))
+    assert capfd.readouterr().err == ""
+
+
+def test_libpng_says_nothing_of_damaged_pixels(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    data = bytearray(cv2.imencode(".png", np.zeros((64, 64, 4), np.uint8))[1].tobytes())
+    data[data.index(b"IDAT") + 8] ^= 255
+    (tmp_path / "bad.png").write_bytes(data)
+    with pytest.raises(InputError, match="cannot be decoded"):
+        read_rgba(tmp_path / "bad.png")
+    assert capfd.readouterr().err == ""

@@ -113,11 +113,12 @@ def test_an_evaluated_run_goes_on(folder: Path) -> None:
     assert not list((folder / "run").glob("*.changed"))
 
 
-def test_an_edited_result_of_a_run_is_kept_beside_the_new_one(folder: Path) -> None:
+def test_an_edited_result_of_a_run_is_kept_beside_the_new_one(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "run" / "model.obj").write_text("edited")
     assert main(["fit", "views", "--out", "run", *FIT]) == 0
     assert (folder / "run" / "model.obj.changed").read_text() == "edited"
     assert (folder / "run" / "model.obj").read_text().startswith("#")
+    assert "run/model.obj has changed since bbfit wrote it; it is now model.obj.changed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["fit views --out run", "run tree.glb --out run", "evaluate run/cloud.safetensors views"])

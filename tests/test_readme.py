@@ -31,7 +31,8 @@ from interrupting import heed_ctrl_c
 from one_at_a_time import one_at_a_time
 
 import bbfit
-from bbfit.cli import _COMMANDS, main
+from bbfit.cli import main
+from bbfit.cli.program import COMMANDS
 
 TREES = ("tree.glb", "acer.glb", "library/one.glb")
 VIEWS = ("tree", "acer", "quaking_aspen", "weeping_willow")
@@ -317,7 +318,7 @@ def said_by(*words: str) -> str:
 @pytest.fixture(scope="module")
 def offered() -> set[str]:
     """Every option of every command."""
-    return {option for command in _COMMANDS for option in re.findall(r"--[a-z][\w.-]*", said_by(command, "--help"))}
+    return {option for command in COMMANDS for option in re.findall(r"--[a-z][\w.-]*", said_by(command, "--help"))}
 
 
 @each(PAGES)
@@ -326,7 +327,7 @@ def test_options_and_commands_that_are_mentioned_exist(page: Path, offered: set[
     other = {"--help", "--fast", "--out", "--quick", "--strict"}
     mentioned = {option.rstrip(".") for option in re.findall(r"(?<![\w-])--[a-z][\w.-]*", text)}
     assert mentioned - other <= offered
-    assert {name for name in re.findall(r"`bbfit ([a-z]+)", text)} <= set(_COMMANDS)
+    assert {name for name in re.findall(r"`bbfit ([a-z]+)", text)} <= set(COMMANDS)
 
 
 def test_the_last_of_an_option_given_twice_counts(stand_ins: Path, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.checks import InputError, fail
+from bbfit.scratch import ScratchFolder
 
 WORKER = Path(__file__).with_name("worker.py")
 """The script that each worker process runs."""
@@ -112,7 +113,7 @@ class BlenderPool:
     def __init__(self, settings: dict[str, Any]) -> None:
         self._settings = settings
         self._events: queue.Queue[tuple[Blender, dict[str, Any]]] = queue.Queue()
-        self._scratch = tempfile.TemporaryDirectory(prefix="bbfit-", ignore_cleanup_errors=True)
+        self._scratch = ScratchFolder()
         self._workers: list[Blender] = []
 
     def __enter__(self) -> BlenderPool:
@@ -121,10 +122,10 @@ class BlenderPool:
     def __exit__(self, *_: object) -> None:
         for worker in self._workers:
             worker.stop()
-        self._scratch.cleanup()
+        self._scratch.remove()
 
     def _start(self, *, measure: bool) -> Blender:
-        self._workers.append(Blender(self._settings | {"measure": measure}, self._scratch.name, self._events))
+        self._workers.append(Blender(self._settings | {"measure": measure}, str(self._scratch.path), self._events))
         return self._workers[-1]
 
     def _next(self) -> tuple[Blender, dict[str, Any]]:
@@ -145,7 +146,7 @@ class BlenderPool:
 
         Raises :class:`BlenderError` if Blender crashes, and ``InputError`` if the tree cannot be read or written.
         """
-        path = Path(self._scratch.name) / "tree.glb"
+        path = self._scratch.path / "tree.glb"
         self._settings = self._settings | {"convert": {"path": str(path), "triangles": triangles}}
         self._start_first("converting", measure=False)
         return path

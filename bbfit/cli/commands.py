@@ -89,7 +89,7 @@ def grow_command(
         from bbfit.reporting.tables import species_table
 
         out_console.print(species_table([load_species(name, grow.species_file) for name in known_species(grow.species_file)]))
-        out_console.print(f"figures in {grow.species_file or figures_file()}", soft_wrap=True, highlight=False)
+        out_console.print(f"figures in {grow.species_file or figures_file()}", soft_wrap=True)
         return
     from bbfit.outputs import single_files
     from bbfit.trees.tree_writer import write_tree
@@ -130,7 +130,7 @@ def views_command(
 
     with progress() as on_progress:
         render_views(TreeFile.open(tree, limits), out, views, on_progress=lambda done, total: on_progress("views", done, total))
-    out_console.print(f"{views.count} views in {out}")
+    out_console.print(f"{views.count} views in {out}", soft_wrap=True)
 
 
 def fit_command(
@@ -252,7 +252,7 @@ def export_command(
     with single_files("bbfit export", out.parent, names, [cloud]):
         paths = model.export(billboards, out, export)
     for path in paths:
-        out_console.print(f"{path}  {path.stat().st_size:,} bytes")
+        out_console.print(f"{path}  {path.stat().st_size:,} bytes", soft_wrap=True)
     show_missing_encoder(export)
 
 

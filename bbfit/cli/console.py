@@ -2,21 +2,50 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
-from typing import TYPE_CHECKING
+import io
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
 
 if TYPE_CHECKING:
     from bbfit.pipeline import RunResult
     from bbfit.stages.stage import OnProgress
 
-out_console = Console()
-"""Standard output."""
-err_console = Console(stderr=True)
-"""Standard error."""
+
+class OutputError(InputError):
+    """Standard output cannot be written to."""
+
+
+@contextlib.contextmanager
+def printing() -> Iterator[None]:
+    """Within this block only standard output is written. If that fails, it raises :class:`OutputError`; a closed pipe is another matter."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputError(f"standard output cannot be written to ({error.strerror})") from None
+
+
+class _Output(Console):
+    def print(self, *objects: Any, **options: Any) -> None:
+        with printing():
+            super().print(*objects, **options)
+
+
+out_console = _Output(markup=False, emoji=False, highlight=False)
+"""Standard output. It shows text as it is, so that paths may contain anything."""
+err_console = Console(stderr=True, markup=False, emoji=False, highlight=False)
+"""Standard error, likewise."""
+# What bbfit, its progress bars and its help write beyond ASCII, for terminals that know ASCII alone.
+_PLAIN = str.maketrans("↑↓→·•²…╭╮╰╯├┤┬┴┼─━│┃╸╺", "^v>-*2.+++++++++--||--") | {ord("±"): "+-", ord("°"): " degrees"}
 
 
 def show(result: RunResult, *, thesis: bool) -> None:
@@ -47,3 +76,24 @@ def progress() -> contextlib.AbstractContextManager[OnProgress]:
     from bbfit.reporting.progress import progress_bars
 
     return progress_bars(err_console)
+
+
+def take_any_text() -> None:
+    """Let standard output and standard error take any text. What they cannot encode is replaced by something similar or by its code."""
+    codecs.register_error("bbfit", _similar)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="bbfit")
+
+
+def _similar(error: UnicodeError) -> tuple[str | bytes, int]:
+    assert isinstance(error, UnicodeEncodeError)
+    text = error.object[error.start : error.end].translate(_PLAIN)
+    return "".join(map(_escaped, text)), error.end
+
+
+def _escaped(letter: str) -> str:
+    code = ord(letter)
+    if 0xDC80 <= code <= 0xDCFF:  # where Python keeps the bytes of a path that are not UTF-8
+        return f"\\x{code - 0xDC00:02x}"
+    return letter.encode("ascii", "backslashreplace").decode()

@@ -71,7 +71,7 @@ def view_command(
         with _until_ctrl_c() as wait:
             _announce(viewer.url, port, " (Ctrl-C ends it)", open=open)
             if viewer.notes:
-                out_console.print("\n".join(viewer.notes), style="yellow", soft_wrap=True, highlight=False)
+                out_console.print("\n".join(viewer.notes), style="yellow", soft_wrap=True)
             wait()
 
 

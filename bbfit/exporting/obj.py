@@ -35,7 +35,7 @@ def obj_bytes(cards: Cards, config: ExportConfig, *, material_file: str) -> byte
     for face, card in enumerate(cards.cards, 1):
         lines.append("f " + " ".join(f"{vertex}/{vertex}/{face}" for vertex in range(first, first + len(card.corners))))
         first += len(card.corners)
-    return ("\n".join(lines) + "\n").encode()
+    return ("\n".join(lines) + "\n").encode(errors="surrogateescape")
 
 
 def mtl_bytes(*, texture_file: str) -> bytes:
@@ -51,7 +51,7 @@ def mtl_bytes(*, texture_file: str) -> bytes:
         f"map_Kd {texture_file}",
         f"map_d {texture_file}",
     ]
-    return ("\n".join(lines) + "\n").encode()
+    return ("\n".join(lines) + "\n").encode(errors="surrogateescape")
 
 
 def _z_up(points: NDArray[np.float64]) -> NDArray[np.float64]:

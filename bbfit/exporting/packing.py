@@ -24,7 +24,10 @@ def packed(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     # It finds its modules wherever this process does.
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     command = [sys.executable, "-c", f"from {__name__} import _main; _main()"]
-    done = subprocess.run(command, input=json.dumps(cells.tolist()).encode(), stdout=subprocess.PIPE, env=environment, check=True)
+    # A session of its own: this process handles keyboard interrupts, and ends the other one.
+    done = subprocess.run(
+        command, input=json.dumps(cells.tolist()).encode(), stdout=subprocess.PIPE, env=environment, check=True, start_new_session=True
+    )
     boxes = np.array(json.loads(done.stdout), dtype=np.int64)
     assert boxes.shape == (len(cells), 4) and np.array_equal(boxes[:, :2] + cells, boxes[:, 2:]), "xatlas scaled or split the atlas"
     return boxes[:, :2] - boxes[:, :2].min(0)

@@ -31,6 +31,7 @@ from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.images import bleed_color
 from bbfit.provenance import cache_key
+from bbfit.scratch import named_in_utf8
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset
 
@@ -283,7 +284,7 @@ def _load(path: Path, key: str) -> _FitState | None:
     if not path.is_file():
         return None
     try:
-        with safe_open(path, framework="pt") as file:
+        with named_in_utf8(path) as named, safe_open(named, framework="pt") as file:
             metadata = file.metadata() or {}
             if metadata.get("fit") != key:
                 return None

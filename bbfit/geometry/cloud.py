@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bbfit.checks import InputError, check_choice, check_count, check_file, check_shape, fail
 from bbfit.geometry.alpha import AlphaMode
+from bbfit.scratch import named_in_utf8
 
 FORMAT = "bbfit billboard cloud 1"
 TENSORS = ("centers", "rights", "ups", "half_extents", "texture_sizes", "two_sided", "texels")
@@ -150,7 +151,7 @@ class BillboardCloud:
         if path.suffix.lower() in (".glb", ".gltf", ".obj"):
             fail("cloud", f"{path} is a model", "give the cloud.safetensors of its run")
         try:
-            with safe_open(path, framework="pt") as file:
+            with named_in_utf8(path) as named, safe_open(named, framework="pt") as file:
                 form = (file.metadata() or {}).get("format", "")
                 known = form == FORMAT or form.startswith(f"{FORMAT} ")
                 tensors = {name: file.get_tensor(name) for name in TENSORS} if known else {}

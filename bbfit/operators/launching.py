@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -15,10 +16,29 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from bbfit.checks import InputError
+
 FLAGS = "-march=native -ffp-contract=fast"
 """Clang's flags for CPU kernels; they enable the host's vector instructions and fused multiply-add."""
 LEAST_PIXELS = 1 << 14
 """Least pixels in a piece for a CPU thread."""
+
+
+class CacheError(InputError, ImportError):
+    """Warp cannot write its compiled kernels. Without them, modules that launch kernels cannot be imported."""
+
+
+@contextmanager
+def cache_of_kernels() -> Iterator[None]:
+    """Within this block Warp uses its cache of compiled kernels. If it cannot be written to, this raises :class:`CacheError`."""
+    try:
+        yield
+    except OSError as error:
+        place = error.filename or wp.config.kernel_cache_dir or "the cache"
+        raise CacheError(
+            f"Warp: {place} cannot be written to ({error.strerror or error}), and compiled kernels are kept there; "
+            "set the variable WARP_CACHE_PATH to a folder that can"
+        ) from None
 
 
 def _initialize() -> None:
@@ -27,14 +47,16 @@ def _initialize() -> None:
     try:
         kept = os.dup(2)
     except OSError:  # there is no standard error
-        wp.init()
+        with cache_of_kernels():
+            wp.init()
         return
     if sys.stderr is not None:
         sys.stderr.flush()
     try:
         with Path(os.devnull).open("wb") as nowhere:
             os.dup2(nowhere.fileno(), 2)
-        wp.init()
+        with cache_of_kernels():
+            wp.init()
     finally:
         os.dup2(kept, 2)
         os.close(kept)
@@ -48,7 +70,8 @@ def launch(kernel: Any, count: int, least: int, arguments: Sequence[Any], output
 
     Warp runs a CPU launch in the calling thread; the pieces share all cores. The kernel's first argument is where its piece begins.
     """
-    kernel.module.load(on)  # or every thread would compile it
+    with cache_of_kernels():
+        kernel.module.load(on)  # or every thread would compile it
 
     def piece(begin: int, end: int) -> None:
         wp.launch(kernel, (end - begin, across), [begin, *arguments], outputs, device=on)

@@ -65,7 +65,7 @@ def compare_csv(rows: Sequence[CompareRow]) -> bytes:
     writer.writerow(["system", "title", "planes", "vertices", "bytes", "seconds", *names, "note"])
     for row in rows:
         writer.writerow([row.system, row.title, row.planes, row.vertices, row.bytes, row.seconds, *_measures(row.measures), row.note])
-    return text.getvalue().encode()
+    return text.getvalue().encode(errors="backslashreplace")
 
 
 def _measures(measures: Measures | None) -> list[float | None]:

@@ -23,13 +23,13 @@ def progress_bars(console: Console, *, log_interval: float = 60.0) -> Iterator[C
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     with Progress(
-        TextColumn("{task.description:9}"),
+        TextColumn("{task.description:9}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]:>10}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
         console=console,
     ) as bars:
         tasks: dict[str, TaskID] = {}
@@ -50,6 +50,6 @@ def _lines(console: Console, interval: float) -> Callable[..., None]:
         now = time.monotonic()
         if done == total or now - printed.setdefault(stage, now) >= interval:
             printed[stage] = now
-            console.print(f"{stage} {done}/{total} {note}".rstrip(), highlight=False, soft_wrap=True)
+            console.print(f"{stage} {done}/{total} {note}".rstrip(), highlight=False, markup=False, emoji=False, soft_wrap=True)
 
     return on_progress

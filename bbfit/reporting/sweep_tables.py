@@ -121,7 +121,7 @@ def table_csv(rows: Sequence[SweepRow]) -> bytes:
         figures = asdict(row.published) if row.published else {}
         end = [*map(figures.get, published), facts.get("billboards"), facts.get("texels"), row.seconds, row.folder]
         writer.writerow([*start, *values, *end])
-    return text.getvalue().encode()
+    return text.getvalue().encode(errors="backslashreplace")
 
 
 def table_markdown(rows: Sequence[SweepRow]) -> str:

@@ -21,9 +21,11 @@ _UP, _DOWN, _ONE = "↑", "↓", "→ 1"
 
 def species_table(species: Sequence[Species]) -> Table:
     """A ``rich`` table of species: name, height and levels of stems."""
+    from rich.text import Text
+
     table = _table(["species"], ["height, m", "levels of stems"])
     for one in species:
-        table.add_row(one.name, f"{one.scale:g} ± {one.scale_v:g}", str(one.levels))
+        table.add_row(Text(one.name), f"{one.scale:g} ± {one.scale_v:g}", str(one.levels))
     return table
 
 
@@ -33,6 +35,8 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
     An arrow shows which direction is better. With ``thesis`` a last column has the thesis scale, for comparison with the thesis's figures.
     """
     mean, count = report.mean, len(report.views)
+    from rich.text import Text
+
     table = _table(["measure"], [])
     table.title, table.title_style = f"{title}: mean of {count}" if count > 1 else f"{title}: one view", "bold"
     table.add_column("better", justify="center", style="dim")
@@ -63,12 +67,12 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
 
     if report.sizes:
         table.add_section()
-        table.add_row("[bold]as exported[/]", "", "[bold]PSNR, dB[/]", "[bold]coverage[/]", "")
+        table.add_row("as exported", "", "PSNR, dB", "coverage", "", style="bold")
         for size in report.sizes:
             table.add_row(f"{size.width} x {size.height} pixels", f"{_UP} {_ONE}", f"{size.psnr:.2f}", _share(size.coverage), "")
 
     table.add_section()
-    table.add_row("[bold]cost[/]", "", "[bold]model[/]", "[bold]original[/]", "[bold not dim]ratio[/]")
+    table.add_row("cost", "", "model", "original", Text("ratio", style="not dim"), style="bold")
     for name, cost in (("vertices", report.vertices), ("file, bytes", report.bytes)):
         table.add_row(name, _DOWN, _count(cost.model), _count(cost.original), _percent(cost))
     if report.overdraw is not None:
@@ -92,12 +96,14 @@ def lod_table(levels: Sequence[LodLevel]) -> Table:
 
 def sweep_table(rows: Sequence[SweepRow]) -> Table:
     """A ``rich`` table with one line per run: measures and costs, or the reason of its failure."""
+    from rich.text import Text  # of names and reasons, in which brackets are no markup
+
     labels = label_names(rows)
     table = _table(["tree", *labels], ["PSNR, dB", "SSIM", "FLIP", "vertices", "bytes", "seconds"])
     for row in rows:
-        start = [row.tree, *(row.labels.get(name, "") for name in labels)]
+        start = [Text(row.tree), *(Text(row.labels.get(name, "")) for name in labels)]
         if row.facts is None:
-            table.add_row(*start, f"failed: {row.reason}", style="yellow")
+            table.add_row(*start, Text(f"failed: {row.reason}"), style="yellow")
             continue
         report = row.facts["report"]
         measures = [f"{measure.of(row):{measure.digits}}" for measure in MEASURES[:3]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +20,7 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera, orthographic_intrinsics
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import bleed_color, read_rgba
+from bbfit.scratch import ScratchFolder
 from bbfit.tree_files.tree_file import TreeFile
 
 # Endings of Y-up files whose triangles are read directly; others go through Blender.
@@ -114,7 +114,7 @@ def bake(
         As for ``render_pictures``, also if a picture would have more than 16384 texels a side.
     """
     if folder is None:
-        with tempfile.TemporaryDirectory(prefix="bbfit-") as scratch:
+        with ScratchFolder() as scratch:
             return bake(tree, slabs, config, fill_cuts=fill_cuts, folder=scratch, on_progress=on_progress)
     if not len(slabs):
         fail("slabs", "there is none to bake")
@@ -148,8 +148,8 @@ def tree_triangles(tree: str | Path | TreeFile) -> NDArray[np.float64]:
     """
     tree = TreeFile.open(tree)
     if tree.suffix not in _MESH_SUFFIXES:
-        with tempfile.TemporaryDirectory(prefix="bbfit-") as scratch:
-            return tree_triangles(tree_as_glb(tree, Path(scratch) / "tree.glb"))
+        with ScratchFolder() as scratch:
+            return tree_triangles(tree_as_glb(tree, scratch / "tree.glb"))
     return np.asarray(tree.mesh().triangles, np.float64)
 
 

@@ -80,7 +80,7 @@ def report_stage(
         readable = replace(model.config, textures="webp", fallback=False, mip_files=False)  # browsers read WebP
         known = RunFacts(**facts, losses=losses, pareto=picture)
         page = report_page(report, model, views.test, known, glb_bytes(model.cards, readable))
-        write_bytes(folder / "report.html", page.encode())
+        write_bytes(folder / "report.html", page.encode(errors="backslashreplace"))
         on_progress("report", 1, 1)
 
     shown = [folder / name for name in ("cloud.safetensors", "metrics.json", "loss.csv")] + ([pareto] if pareto else [])

@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import socket
-import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bbfit.checks import fail
+from bbfit.checks import fail, in_words
 from bbfit.files import write_bytes
 from bbfit.outputs import output_folder
+from bbfit.scratch import ScratchFolder
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.tasks import Outcome, Task, attempt
 
@@ -50,10 +54,11 @@ class RayWorkers:
         _check_address(address)
         if not ray.is_initialized():
             try:
-                if address == "local":
-                    ray.init(**_QUIET)
-                else:
-                    ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+                with _same_handlers():
+                    if address == "local":
+                        ray.init(**_QUIET)
+                    else:
+                        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
             except (ConnectionError, ValueError, RuntimeError) as error:
                 fail(
                     "ray",
@@ -103,6 +108,19 @@ class RayWorkers:
         return self._references[paths]
 
 
+@contextmanager
+def _same_handlers() -> Iterator[None]:
+    """Keep the handlers of signals. Ray's own one for SIGTERM prints a stack trace and ends the process."""
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in before.items():
+                if callable(handler):
+                    signal.signal(number, handler)
+
+
 def _check_address(address: str) -> None:
     """Require that a server listens at an address. Ray itself would try for minutes."""
     host, _, port = address.rpartition(":")
@@ -110,8 +128,9 @@ def _check_address(address: str) -> None:
         return  # auto, local, or another name that Ray knows
     try:
         socket.create_connection((host.rpartition("/")[2], int(port)), timeout=10).close()
-    except OSError as error:
-        fail("ray", f"no cluster answers at {address} ({error.strerror or error})", "start one with ray start, or use local")
+    except (OSError, UnicodeError, OverflowError) as error:
+        reason = in_words(error) if isinstance(error, OSError) else "it is not an address"
+        fail("ray", f"no cluster answers at {address} ({reason})", "start one with ray start, or use local")
 
 
 def read_files(*paths: Path) -> Files:
@@ -141,13 +160,13 @@ def _run_remotely(task: Task, cores: int, main_files: dict[str, str], *contents:
     import torch
 
     torch.set_num_threads(cores)
-    with tempfile.TemporaryDirectory(prefix="bbfit-") as scratch:
+    with ScratchFolder() as scratch:
         inputs = {}
         for (name, main_file), files in zip(main_files.items(), contents, strict=True):
-            folder = Path(scratch) / name
+            folder = scratch / name
             write_files(files, folder)
             inputs[name] = folder / main_file
-        out = output_folder("out", Path(scratch) / "out")
+        out = output_folder("out", scratch / "out")
         where = f"node {ray.get_runtime_context().get_node_id()}"
         outcome = attempt(partial(task.work, inputs, out, *task.arguments), where)
         return outcome, read_files(out) if outcome.reason is None else {}

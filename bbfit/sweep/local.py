@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import collections
+import logging
 import multiprocessing
 import os
 import platform
 import signal
 import threading
+import time
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from types import FrameType
 from typing import Any
 
+from bbfit.scratch import remove_own
 from bbfit.sweep.tasks import Outcome, Task, attempt
 
 # A fork of a process that has used torch can hang. Workers are forks of a server that only imports, or new processes on Windows.
 _CONTEXT: Any = multiprocessing.get_context("forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn")
 _PRELOADED = ["bbfit.pipeline", "bbfit.fitting.fused_pass"]
+# Seconds that a process has to end its task, with the Blender that it started, when its parent ends.
+_PATIENCE = 1.0
 
 
 @dataclass
@@ -45,6 +51,8 @@ class LocalWorkers:
         return self
 
     def __exit__(self, *_: object) -> None:
+        for worker in self._workers:
+            worker.lifeline.close()  # all of them end at the same time
         for worker in self._workers:
             _stop(worker)
         self._workers.clear()
@@ -109,7 +117,7 @@ def _start() -> _Worker:
 def _stop(worker: _Worker) -> str:
     """Stop a process if it still runs. Return how it ended."""
     worker.lifeline.close()
-    worker.process.join(1)
+    worker.process.join(2 * _PATIENCE)
     if worker.process.is_alive():
         worker.process.kill()
         worker.process.join()
@@ -124,21 +132,37 @@ def _run_tasks(pipe: Connection, lifeline: Connection, environment: dict[str, st
 
     os.environ.clear()
     os.environ.update(environment)  # the server has that of its own start
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles keyboard interrupts
-    threading.Thread(target=_exit_with_parent, args=(lifeline,), daemon=True).start()
-    while True:
-        try:
+    logging.getLogger().addHandler(logging.NullHandler())  # libraries have no place to log to
+    orphaned = threading.Event()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if orphaned.is_set():  # otherwise the signal is for the parent, which handles it
+            raise KeyboardInterrupt
+
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), stop)
+    threading.Thread(target=_exit_with_parent, args=(lifeline, orphaned), daemon=True).start()
+    try:
+        while True:
             task, cores = pipe.recv()
-        except EOFError:
-            return
-        torch.set_num_threads(cores)
-        inputs = {name: paths[0] for name, paths in task.inputs.items()}
-        pipe.send(attempt(partial(task.work, inputs, task.folder, *task.arguments), platform.node()))
+            torch.set_num_threads(cores)
+            inputs = {name: paths[0] for name, paths in task.inputs.items()}
+            pipe.send(attempt(partial(task.work, inputs, task.folder, *task.arguments), platform.node()))
+    except (EOFError, BrokenPipeError):
+        return
+    except KeyboardInterrupt:
+        os._exit(1)
 
 
-def _exit_with_parent(lifeline: Connection) -> None:
-    """Exit at once when the parent ends, even in the middle of a task."""
+def _exit_with_parent(lifeline: Connection, orphaned: threading.Event) -> None:
+    """Exit when the parent ends, even in the middle of a task: in an orderly way, or at once if that takes long."""
     try:
         lifeline.recv()
     except (EOFError, OSError):
+        orphaned.set()
+        if hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+            time.sleep(_PATIENCE)
+        remove_own()
         os._exit(1)

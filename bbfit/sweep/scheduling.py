@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections import defaultdict
 from collections.abc import Sequence
@@ -145,20 +146,27 @@ def sources(
     there are no trees, one does not exist, or two have the same name.
     """
     result = [Source(load_species(name, species_file).name, species=name) for name in species]
-    on_disk = [(path, Source(path.stem, tree=check_file("tree", path))) for path in map(Path, trees)]
+    on_disk = [(path, Source(_plain(path.stem), tree=check_file("tree", path))) for path in map(Path, trees)]
     for folder in views:
         path = check_folder("views", folder).resolve()
         path = path.parent if path.name == "views" else path  # a run calls its folder of views so
-        on_disk.append((path, Source(path.name, views=Path(folder))))
+        on_disk.append((path, Source(_plain(path.name), views=Path(folder))))
     names = [source.name for source in result] + [source.name for _, source in on_disk]
     for path, source in on_disk:  # tree libraries often have a folder for each tree, with the same file name in all folders
-        result.append(source if names.count(source.name) == 1 else replace(source, name=f"{path.resolve().parent.name}_{source.name}"))
+        result.append(
+            source if names.count(source.name) == 1 else replace(source, name=f"{_plain(path.resolve().parent.name)}_{source.name}")
+        )
     if not result:
         fail("sweep", "there are no trees", "give species, trees or views")
     for source in result:
         if sum(other.name == source.name for other in result) > 1:
             fail("sweep", f"two trees are called {source.name}", "rename one, or omit one")
     return result
+
+
+def _plain(name: str) -> str:
+    """A name in which bytes that are not UTF-8 are written as numbers."""
+    return os.fsencode(name).decode(errors="backslashreplace")
 
 
 class _Sweep:
@@ -191,7 +199,7 @@ class _Sweep:
         """Write the tables and return the rows."""
         rows = self._rows()
         write_bytes(self._folder / "table.csv", table_csv(rows))
-        write_bytes(self._folder / "table.md", table_markdown(rows).encode())
+        write_bytes(self._folder / "table.md", table_markdown(rows).encode(errors="backslashreplace"))
         sweep_plot(rows, self._folder / "table.png")
         return SweepResult(self._folder, tuple(rows), self._kept)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from bbfit.checks import InputError
+from bbfit.checks import InputError, in_words
 from bbfit.fitting.config import FitConfig
 from bbfit.pipeline import RunConfig
 
@@ -114,7 +114,7 @@ def attempt(work: Callable[[], Facts], where: str) -> Outcome:
     try:
         facts = work()
     except (InputError, OSError) as error:
-        reason = " ".join(str(error).split())
+        reason = " ".join(in_words(error).split())
     except Exception as error:  # an error in the program, or too little memory
         reason, trace = " ".join(f"{type(error).__name__}: {error}".split()), traceback.format_exc()
     return Outcome(facts, reason, where, round(time.perf_counter() - started, 3), trace)

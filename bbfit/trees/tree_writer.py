@@ -152,7 +152,7 @@ def _mtl(scene: trimesh.Scene) -> str:
 
 def _obj(scene: trimesh.Scene, library: str) -> Iterator[bytes]:
     """The OBJ in pieces: one object for each node, at its place in the scene."""
-    yield f"# {generator()}, meters, Y up\nmtllib {library}\n".encode()
+    yield f"# {generator()}, meters, Y up\nmtllib {library}\n".encode(errors="surrogateescape")
     first = 1
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]

@@ -28,7 +28,8 @@ def listen(host: str, port: int, start: Callable[[tuple[str, int], socket.Addres
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     except (socket.gaierror, UnicodeError) as error:
-        fail("host", f"{host!r} is not known ({error})", "127.0.0.1 is this machine alone, 0.0.0.0 all of its addresses")
+        reason = error.strerror if isinstance(error, OSError) else "it is not a name"
+        fail("host", f"{host!r} is not known ({reason})", "127.0.0.1 is this machine alone, 0.0.0.0 all of its addresses")
     for candidate in range(port, min(port + _TRIES, 65536)):
         try:
             return start((str(address[0]), candidate), family)

@@ -16,10 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from interrupting import heed_signals
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.views_folder import BlenderError, render_views
 from bbfit.checks import InputError
+from bbfit.cli import main
+from bbfit.cli.stopping import LINE
 from bbfit.files import read_json
 from bbfit.images import read_rgba
 
@@ -108,6 +111,51 @@ def test_killed_in_the_middle_and_started_again(thing_glb: Path, tmp_path: Path)
     assert [name for name in kept if later[name] == finished[name]] == kept[1:]
     assert read_json("views", out / "views.json")["complete"] is True
     assert_same_pictures(out, render_views(thing_glb, tmp_path / "unbroken", config))
+
+
+# The command, which hands over no more after two views.
+_COMMAND = """
+import sys
+import bbfit.blender.views_folder as views_folder
+from bbfit.cli import main
+render_views = views_folder.render_views
+def held(tree, out, config, on_progress):
+    def hold(done, total):
+        print(done, flush=True)
+        if done == 2:
+            sys.stdin.readline()
+    return render_views(tree, out, config, on_progress=hold)
+views_folder.render_views = held
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_stopped_in_the_middle_and_started_again(number: int, code: int, thing_glb: Path, unbroken: Path, tmp_path: Path) -> None:
+    """Blender ends with the command, no temporary folder is left, and the same command goes on."""
+    out, temporary = tmp_path / "views", tmp_path / "temporary"
+    temporary.mkdir()
+    words = ["views", str(thing_glb), "--out", str(out), "--count", "4", "--size", "32", "--samples", "4", "--no-denoise"]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    environment = os.environ | {"TMPDIR": str(temporary)}
+    command = [sys.executable, "-c", _COMMAND, *words, "--render-workers", "2"]
+    parent = subprocess.Popen(command, **pipes, text=True, env=environment, preexec_fn=heed_signals)
+    assert parent.stdout
+    for _ in range(3):  # 0, 1, 2 views
+        parent.stdout.readline()
+    workers = [os.pidfd_open(pid) for pid in blenders(parent.pid)]
+    assert len(workers) == 2 and list(temporary.iterdir())
+    parent.send_signal(number)
+    _, said = parent.communicate()
+    assert (parent.returncode, said) == (code, f"{LINE}\n")
+    for worker in workers:
+        assert select.select([worker], [], [], 0)[0]  # it has ended
+        os.close(worker)
+    assert not list(temporary.iterdir())
+    finished = {name: time for name, time in times(out).items() if name.endswith("g")}
+    assert main(words) == 0
+    assert times(out) == times(out) | finished
+    assert_same_pictures(out, unbroken)
 
 
 @pytest.mark.usefixtures("broken_blender")

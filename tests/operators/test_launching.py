@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import pairwise
+from pathlib import Path
 from threading import Barrier, Event, Lock, Thread, get_ident
 
 import pytest
 import torch
 
-from bbfit.operators.launching import in_parallel, pieces_of, worker_count
+from bbfit.operators.launching import CacheError, cache_of_kernels, in_parallel, pieces_of, worker_count
 
 PATIENCE = 20.0
 """Seconds after which something is taken to hang."""
@@ -188,3 +192,15 @@ def test_pieces_are_about_equal_parts_of_the_whole(threads: Callable[[int], None
     lengths = [end - begin for begin, end in pieces]
     assert len(pieces) == (min(max(1, count // max(least, 1)), 8 if most is None else most) if count else 0)
     assert not lengths or (max(lengths) - min(lengths) <= 1 and (len(lengths) == 1 or min(lengths) >= least))
+
+
+def test_a_cache_that_cannot_be_written_is_named_with_its_variable(tmp_path: Path) -> None:
+    """When Warp starts, and when a kernel is compiled."""
+    with pytest.raises(CacheError, match=r"^Warp: /there cannot be written to \(Read-only file system\).*WARP_CACHE_PATH"):
+        with cache_of_kernels():
+            raise OSError(30, "Read-only file system", "/there")
+    (tmp_path / "file").touch()
+    script = "import bbfit.operators.launching"
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "file" / "cache")}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment)
+    assert "CacheError: Warp: " in done.stderr.splitlines()[-1] and "WARP_CACHE_PATH" in done.stderr

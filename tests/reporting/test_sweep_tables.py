@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from bbfit.evaluation.published import Experiment, published_figures
 from bbfit.images import read_rgba
 from bbfit.reporting.sweep_plots import sweep_plot
 from bbfit.reporting.sweep_tables import THESIS_SCALE, SweepRow, effects, pivot, table_csv, table_markdown
+from bbfit.reporting.tables import sweep_table
 
 
 def report(psnr: float, vertices: int, original: int | None = 1000) -> dict[str, Any]:
@@ -122,3 +125,11 @@ def test_the_plot_shows_something(rows: list[SweepRow], tmp_path: Path) -> None:
     assert np.unique(read_rgba(tmp_path / "plot.png")[..., :3].reshape(-1, 3), axis=0).shape[0] > 20
     sweep_plot([row("oak", None)], tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()
+
+
+def test_the_screen_shows_names_and_reasons_as_they_are() -> None:
+    """Brackets of a path are no markup, on any console."""
+    failed = replace(row("c/[/b]", None, variant="[red]"), reason="tree: c/[/b].glb is empty")
+    out = io.StringIO()
+    Console(file=out, width=150, emoji=False).print(sweep_table([failed]))
+    assert "c/[/b] " in out.getvalue() and "[red]" in out.getvalue() and "failed: tree: c/[/b].glb is empty" in out.getvalue()

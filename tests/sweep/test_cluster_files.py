@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
 
 from bbfit.checks import InputError
-from bbfit.sweep.cluster import RayWorkers, read_files, write_files
+from bbfit.sweep.cluster import RayWorkers, _same_handlers, read_files, write_files
 from bbfit.sweep.config import SweepConfig
 
 
@@ -41,3 +42,15 @@ def test_files_outside_the_folder_of_a_tree_are_refused(tmp_path: Path) -> None:
     for outside in (tmp_path / "bark.png", tmp_path / "tree" / ".." / "bark.png"):
         with pytest.raises(InputError, match=r"ray: .*bark\.png lies outside .*tree; put all files of a tree into one folder"):
             read_files(tmp_path / "tree" / "tree.obj", outside)
+
+
+def test_ray_may_not_take_over_signals() -> None:
+    def mine(number: int, frame: object) -> None: ...
+
+    before = signal.signal(signal.SIGTERM, mine)
+    try:
+        with _same_handlers():
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)  # as Ray does
+        assert signal.getsignal(signal.SIGTERM) is mine
+    finally:
+        signal.signal(signal.SIGTERM, before)

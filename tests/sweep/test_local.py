@@ -49,7 +49,7 @@ def test_a_failure_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
         outcomes = carried_out(workers, tasks)
     assert outcomes["good"].facts == {"name": "good", "files": 0}
     assert outcomes["fault"].reason == "ZeroDivisionError: a fault of ours" and "sweep_works.py" in (outcomes["fault"].trace or "")
-    assert outcomes["bad"].reason == "[Errno 2] No such file: 'leaf.png'" and outcomes["bad"].trace is None
+    assert outcomes["bad"].reason == "leaf.png cannot be used (No such file)" and outcomes["bad"].trace is None
 
 
 def test_a_process_that_dies_costs_its_own_task_only(tmp_path: Path) -> None:
