@@ -187,8 +187,8 @@ def full(scratch: Scratch) -> Iterator[Row]:
     for what, folder, path in (("TMPDIR", scratch.temporary, out), ("the disk of the output folder", small, small / "out")):
         before = mounted(f"mount -t tmpfs -o size=64k none '{folder}' && dd if=/dev/zero of='{folder}/filler' bs=1k count=48 2>/dev/null")
         code, errors = scratch.finish([*arguments, str(path)], before)
-        wrong = refusal(code, errors)
-        yield Row("full", f"{what} is full", "one line" if not wrong else errors[-200:], wrong)
+        wrong = [] if code == 0 else refusal(code, errors)
+        yield Row("full", f"{what} is full", "finished" if code == 0 else "one line" if not wrong else errors[-200:], wrong)
     code, errors = scratch.finish([*arguments, str(out)])
     yield Row("full", "the same command with room", "finished" if code == 0 else errors[-200:], [] if code == 0 else ["failed"])
 

@@ -8,16 +8,18 @@ import multiprocessing
 import os
 import platform
 import signal
+import tempfile
 import threading
 import time
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from multiprocessing.util import Finalize
 from types import FrameType
 from typing import Any
 
-from bbfit.scratch import remove_own
+from bbfit.scratch import ScratchFolder, remove_own
 from bbfit.sweep.tasks import Outcome, Task, attempt
 
 # A fork of a process that has used torch can hang. Workers are forks of a server that only imports, or new processes on Windows.
@@ -108,10 +110,22 @@ def _start() -> _Worker:
     ours, theirs = _CONTEXT.Pipe()
     held, watched = _CONTEXT.Pipe()
     process = _CONTEXT.Process(target=_run_tasks, args=(theirs, watched, dict(os.environ)), daemon=True)
-    process.start()
+    before, tempfile.tempdir = tempfile.tempdir, _folder_of_the_server()
+    try:
+        process.start()
+    finally:
+        tempfile.tempdir = before
     theirs.close()
     watched.close()
     return _Worker(process, ours, held)
+
+
+@cache
+def _folder_of_the_server() -> str:
+    """The folder for the socket of the server that workers are forks of, until this process ends."""
+    folder = ScratchFolder()
+    Finalize(None, folder.remove, exitpriority=-101)  # after multiprocessing has removed its own folder in this one
+    return str(folder.path)
 
 
 def _stop(worker: _Worker) -> str:
