@@ -27,6 +27,8 @@ _CONTEXT: Any = multiprocessing.get_context("forkserver" if "forkserver" in mult
 _PRELOADED = ["bbfit.pipeline", "bbfit.fitting.fused_pass"]
 # Seconds that a process has to end its task, with the Blender that it started, when its parent ends.
 _PATIENCE = 1.0
+# Most bytes of the path of the folder for temporary files, to which the path of a socket adds 55.
+_LONGEST_PLACE = 48
 
 
 @dataclass
@@ -121,8 +123,13 @@ def _start() -> _Worker:
 
 
 @cache
-def _folder_of_the_server() -> str:
-    """The folder for the socket of the server that workers are forks of, until this process ends."""
+def _folder_of_the_server() -> str | None:
+    """The folder for the socket of the server that workers are forks of, until this process ends.
+
+    The path of a socket may have about 100 bytes. Where one in a folder of bbfit's own would be longer, there is no such folder.
+    """
+    if len(os.fsencode(tempfile.gettempdir())) > _LONGEST_PLACE:
+        return None
     folder = ScratchFolder()
     Finalize(None, folder.remove, exitpriority=-101)  # after multiprocessing has removed its own folder in this one
     return str(folder.path)

@@ -144,7 +144,7 @@ def test_failures_on_a_cluster_are_recorded(cluster: Cluster, tmp_path: Path) ->
         for task in tasks:
             workers.submit(task)
         outcomes = {task.name: outcome for task, outcome in (workers.next() for _ in tasks)}
-    assert outcomes["bad"].reason == "[Errno 2] No such file: 'leaf.png'"
+    assert outcomes["bad"].reason == "leaf.png cannot be used (No such file)"
     assert outcomes["fault"].reason == "ZeroDivisionError: a fault of ours"
     assert outcomes["doomed"].facts is None and "WorkerCrashedError" in str(outcomes["doomed"].reason)
     assert outcomes["hardy"].facts == {"name": "hardy"}
