@@ -14,9 +14,14 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
 
+_LONGEST_MESSAGE = 4000
+
 
 class InputError(ValueError):
-    """The caller's input cannot be used; the message says why and what to do."""
+    """The caller's input cannot be used; the message says why and what to do, in one line."""
+
+    def __str__(self) -> str:
+        return one_line(" ".join(map(str, self.args)))
 
 
 class InputTypeError(InputError, TypeError):
@@ -26,8 +31,18 @@ class InputTypeError(InputError, TypeError):
 class MissingFileError(InputError, FileNotFoundError):
     """A file or folder that the caller named does not exist."""
 
-    def __str__(self) -> str:
-        return str(self.args[0])
+    def __str__(self) -> str:  # not that of FileNotFoundError
+        return InputError.__str__(self)
+
+
+def one_line(text: str) -> str:
+    """A text for the terminal: control characters and characters without an encoding as escapes, and the middle of a long text omitted.
+
+    Names and values in messages come from files that nobody has checked.
+    """
+    if len(text) > _LONGEST_MESSAGE:
+        text = f"{text[: _LONGEST_MESSAGE - 200]} ... {text[-190:]}"
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 
 
 def fail(name: str, problem: str, hint: str = "") -> NoReturn:
