@@ -10,14 +10,18 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from bbfit.checks import check_file, fail
+from bbfit.inputs import InputLimits, reading
 from bbfit.provenance import digest_files
+from bbfit.tree_files.extent import check_box, check_finite
 from bbfit.tree_files.gltf import read_gltf
+from bbfit.tree_files.mesh_checks import check_obj, check_stl
 from bbfit.tree_files.obj import obj_files
-from bbfit.tree_files.ply import ply_positions
+from bbfit.tree_files.ply import check_ply
 
 if TYPE_CHECKING:
     import trimesh
 
+_LIMITS = InputLimits()
 UpAxis = Literal["y", "z"]
 UP_AXES: dict[str, UpAxis] = {
     **dict.fromkeys((".glb", ".gltf", ".obj", ".fbx", ".usd", ".usda", ".usdc", ".usdz"), "y"),
@@ -40,7 +44,7 @@ class TreeFile:
     """Total size of the files."""
 
     @staticmethod
-    def open(tree: str | Path | TreeFile) -> TreeFile:
+    def open(tree: str | Path | TreeFile, limits: InputLimits = _LIMITS) -> TreeFile:
         """Find the files of a tree, check them, and compute the digest. This loads no geometry.
 
         Parameters
@@ -48,14 +52,17 @@ class TreeFile:
         tree
             The path of a .glb, .gltf, .obj, .fbx, .usd, .usda, .usdc, .usdz, .ply, .stl or .blend file. A ``TreeFile`` is returned
             unchanged.
+        limits
+            How large the tree may be, and in which folders besides its own its files may lie.
 
         Raises
         ------
         MissingFileError
             If the file is missing, or a file that a glTF refers to.
         InputError
-            If the file is empty, of an unknown format, or a damaged glTF. If a glTF refers to a file outside its folder. If a glTF or PLY
-            has vertices that are NaN or infinite. Blender's importers of these two formats would silently replace them by 0.
+            If the file is empty, of an unknown format, or exceeds the limits, or if a glTF is damaged or refers to a file outside its folder.
+            If a glTF, PLY or STL has vertices that are NaN, infinite, or in other ways not those of a tree in meters. Blender's importers
+            would silently replace some of them by 0.
         """
         if isinstance(tree, TreeFile):
             return tree
@@ -63,16 +70,19 @@ class TreeFile:
         suffix = path.suffix.lower()
         if suffix not in UP_AXES:
             fail("tree", f"{path} has an unknown format", f"expected one of {' '.join(UP_AXES)}")
-        others, positions = list[Path](), list[np.ndarray]()
+        limits.at_most("max_input_bytes", "tree", path, path.stat().st_size, "bytes")
+        others = list[Path]()
         if suffix in (".glb", ".gltf"):
-            others, positions = read_gltf(path)
+            others = read_gltf(path, limits)
         elif suffix == ".obj":
             others = obj_files(path)
-        elif suffix == ".ply" and (points := ply_positions(path.read_bytes())) is not None:
-            positions = [points]
-        if not all(np.isfinite(points).all() for points in positions):
-            fail("tree", f"{path} has vertices that are NaN or infinite", "export the tree again")
+            check_obj(path, others, limits)
+        elif suffix == ".ply":
+            check_ply(path, limits)
+        elif suffix == ".stl":
+            check_stl(path, limits)
         files = (path, *others)
+        limits.at_most("max_input_bytes", "tree", path, sum(file.stat().st_size for file in files), "bytes")
         return TreeFile(files, digest_files(files, path.parent), sum(file.stat().st_size for file in files))
 
     @property
@@ -112,15 +122,18 @@ class TreeFile:
 
         if not self.is_mesh:
             fail("tree", f"only Blender can read the triangles of {self.path}", f"give one of {' '.join(MESH_SUFFIXES)}, or no tree")
-        try:
+        with reading("tree", self.path, "expected a mesh"), np.errstate(all="ignore"):
             scene = trimesh.load_scene(self.path, process=False)
-        except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:
-            fail("tree", f"{self.path} cannot be read ({error})", "expected a mesh")
-        for name in [name for name, mesh in scene.geometry.items() if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces)]:
-            scene.delete_geometry(name)  # points, lines, and empty meshes
-        if not scene.geometry or not scene.area > 0:
-            fail("tree", f"{self.path} has no triangles", "expected a mesh")
-        return scene
+            for name in [name for name, mesh in scene.geometry.items() if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces)]:
+                scene.delete_geometry(name)  # points, lines, and empty meshes
+            for mesh in scene.geometry.values():
+                if not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+                    raise ValueError("a face refers to a vertex that it does not have")
+                check_finite(self.path, mesh.vertices)
+            if not scene.geometry or not scene.area > 0:
+                fail("tree", f"{self.path} has no triangles", "expected a mesh")
+            check_box(self.path, *scene.bounds)
+            return scene
 
     def mesh(self) -> trimesh.Trimesh:
         """All triangles of the tree as one mesh in the axes of the file. Raises the errors of :meth:`scene`."""
