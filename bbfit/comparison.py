@@ -14,7 +14,7 @@ from torch import Tensor
 from bbfit.blender.conversion import tree_as_glb
 from bbfit.blender.pictures import render_pictures
 from bbfit.budget.config import BudgetConfig
-from bbfit.checks import InputError, fail
+from bbfit.checks import InputError, check_record, fail
 from bbfit.evaluation.report import Measures, mean_measures
 from bbfit.evaluation.scoring import held_out, score_views
 from bbfit.exporting.lod import glb_counts
@@ -24,6 +24,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, read_rgba, to_bytes, unpremultiply, write_png
+from bbfit.inputs import reading
 from bbfit.pipeline import RunConfig, run
 from bbfit.provenance import VERSIONS
 from bbfit.reporting.comparison_tables import CompareRow, compare_csv, compare_markdown, compare_picture, compare_plot
@@ -188,7 +189,11 @@ class _Comparison:
             if "is not installed" not in str(error) and "LLVM" not in str(error):
                 raise
             return CompareRow(system, title, None, None, None, None, None, str(error))
-        return replace(CompareRow.from_json(read_json("result", folder / "result.json")), title=title)
+        content = read_json("result", folder / "result.json")
+        with reading("result", folder / "result.json", "remove it, then start bbfit compare again"):
+            row = replace(CompareRow.from_json(content), title=title)
+            check_record("row", row, CompareRow)
+            return row
 
     def _score(self, system: str, draw: Callable[[int], Tensor], folder: Path) -> Measures:
         """Compute the mean measures over the held-out views, and save the pictures."""

@@ -7,13 +7,14 @@ import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from bbfit.checks import fail
+from bbfit.checks import check_record, fail
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import output_folder, read_json, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_per_meter
+from bbfit.inputs import reading
 from bbfit.pipeline import RunConfig, RunResult, run
 from bbfit.provenance import digest_file
 from bbfit.reporting.plots import lod_picture
@@ -94,8 +95,11 @@ def build_lod(
     if export.textures is None:
         export = replace(export, textures="auto")  # distant levels need mip levels
     record.run(_join_stage(folder, out, original, runs, views, config, export), on_progress)
-    levels = read_json("levels of detail", folder / "lod.json")["levels"]
-    return LodResult(out, folder, tuple(LodLevel(**level) for level in levels))
+    stored = read_json("levels of detail", folder / "lod.json")
+    with reading("levels of detail", folder / "lod.json", "remove it, then start bbfit lod again"):
+        levels = tuple(LodLevel(**level) for level in stored["levels"])
+        check_record("levels", levels, tuple[LodLevel, ...])
+    return LodResult(out, folder, levels)
 
 
 def _join_stage(

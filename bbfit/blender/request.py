@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import check_file, fail
 from bbfit.files import read_json, write_json
+from bbfit.inputs import LARGEST, reading
 from bbfit.provenance import VERSIONS, identity, installed_version
 from bbfit.tree_files.tree_file import TreeFile
 
@@ -76,19 +78,8 @@ class ViewsRequest:
         content = read_json("views", path)
         if not isinstance(content, dict) or not isinstance(content.get("tree"), dict):
             return None
-        kinds = {"name": str, "sha256": str, "bytes": int, "up_axis": str, "vertices": int, "faces": int, "bounds": list}
-        facts: dict[str, Any] = {name: value for name, kind in kinds.items() if isinstance(value := content["tree"].get(name), kind)}
-        types = {"version": int, "bbfit": str, "blender": str, "camera": dict, "cameras": dict, "clips": list, "complete": bool}
-        known: dict[str, Any] = {"version": 1}  # files from before there was a version
-        known |= {name: value for name, kind in types.items() if isinstance(value := content.get(name), kind)}
-        config = content.get("config")
-        seconds = content.get("seconds")
-        return ViewsRequest(
-            identity(config) if isinstance(config, dict) else {},
-            RenderedTree(**facts),
-            **known,
-            seconds=float(seconds) if isinstance(seconds, int | float) else 0.0,
-        )
+        with reading("views", path, "remove the file or restore it"):
+            return _request(content)
 
     def save(self, path: Path) -> None:
         """Write the request. Unknown values are omitted."""
@@ -118,6 +109,32 @@ class ViewsRequest:
             if getattr(earlier, name) != getattr(self, name):
                 fail("out", f"{folder} contains pictures with other {name}", hint)
         return earlier
+
+
+def _request(content: dict[str, Any]) -> ViewsRequest:
+    """The request in the JSON of a file."""
+    tree = content["tree"]
+    facts: dict[str, Any] = {name: tree[name] for name in ("name", "sha256", "up_axis") if isinstance(tree.get(name), str)}
+    facts |= {name: tree[name] for name in ("bytes", "vertices", "faces") if _is_number(tree.get(name), 1 << 62, int)}
+    bounds = tree.get("bounds")
+    if isinstance(bounds, list) and [len(corner) for corner in bounds if isinstance(corner, list)] == [3, 3]:
+        low, high = bounds
+        if all(_is_number(value, LARGEST) for value in (*low, *high)) and all(map(operator.le, low, high)):
+            facts["bounds"] = bounds
+    types = {"version": int, "bbfit": str, "blender": str, "camera": dict, "cameras": dict, "clips": list, "complete": bool}
+    known: dict[str, Any] = {"version": 1}  # files from before there was a version
+    known |= {name: value for name, kind in types.items() if isinstance(value := content.get(name), kind)}
+    config, seconds = content.get("config"), content.get("seconds")
+    return ViewsRequest(
+        identity(config) if isinstance(config, dict) else {},
+        RenderedTree(**facts),
+        **known,
+        seconds=float(seconds) if _is_number(seconds, 1e12) and seconds >= 0 else 0.0,
+    )
+
+
+def _is_number(value: Any, most: float, kind: Any = int | float) -> TypeGuard[float]:
+    return isinstance(value, kind) and not isinstance(value, bool) and -most <= value <= most
 
 
 def _shown(value: Any) -> str:

@@ -149,7 +149,9 @@ def check_extent(path: str, points: np.ndarray) -> None:
     """Refuse trees that are too far from the origin, too large or too small for pictures of them to mean anything."""
     farthest, size = np.abs(points).max(), np.ptp(points, axis=0).max()
     if farthest > LARGEST:
-        raise InputRefused("tree", f"{path} reaches {farthest:.3g} meters from the origin, more than {LARGEST:g}", "export the tree in meters")
+        raise InputRefused(
+            "tree", f"{path} reaches {farthest:.3g} meters from the origin, more than {LARGEST:g}", "export the tree in meters"
+        )
     if size < SMALLEST:
         raise InputRefused("tree", f"{path} is smaller than {SMALLEST:g} meters", "export the tree again, at its real size")
 

@@ -101,7 +101,7 @@ def run_sweep(
     if stages.budget.given:
         fail("budget", "a sweep runs the configurations of its grid", "omit the budget")
     grid = Grid.load(config.grid).narrowed(config)
-    cells = grid.cells(stages.fit)
+    cells = grid.cells(stages.fit, max_cells=config.max_cells)
     all_sources = sources(species if species or trees or views else grid.trees, trees, views, stages.grow.species_file)
     sweep = _Sweep(output_folder("out", out), all_sources, cells, config, stages)
     workers: Workers = LocalWorkers(config.workers, config.retries) if config.ray is None else RayWorkers(config)

@@ -19,7 +19,7 @@ def check_pictures(path: Path, pictures: Iterable[Path | bytes], limits: InputLi
     """
     total = 0
     for picture in dict.fromkeys(pictures):
-        inside = isinstance(picture, bytes)
-        header = picture_header("tree", f"a picture in {path}" if inside else picture, limits, picture if inside else None)
+        name, data = (f"a picture in {path}", picture) if isinstance(picture, bytes) else (picture, None)
+        header = picture_header("tree", name, limits, data)
         total += header.width * header.height if header else 0
     limits.at_most("max_input_pixels", "tree", f"all pictures of {path} together", -(-total // _TEXTURES), f"pixels per {_TEXTURES}")

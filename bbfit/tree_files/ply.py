@@ -68,8 +68,8 @@ def _positions(vertices: _Element, encoding: str, body: bytes) -> NDArray[np.flo
     if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
         return None
     if encoding == "ascii":
-        rows = [line.split() for line in body.splitlines()[: vertices.count]]
-        return np.array([[float(row[names.index(axis)]) for axis in "xyz"] for row in rows]).reshape(-1, 3)
+        words = [line.split() for line in body.splitlines()[: vertices.count]]
+        return np.array([[float(row[names.index(axis)]) for axis in "xyz"] for row in words]).reshape(-1, 3)
     order = ">" if encoding == "binary_big_endian" else "<"
     layout = np.dtype([(name, order + _TYPES[kind]) for kind, name in vertices.properties])
     rows = np.frombuffer(body, layout, vertices.count)

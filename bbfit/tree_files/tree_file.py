@@ -60,7 +60,7 @@ class TreeFile:
         MissingFileError
             If the file is missing, or a file that a glTF refers to.
         InputError
-            If the file is empty, of an unknown format, or exceeds the limits, or if a glTF is damaged or refers to a file outside its folder.
+            If the file is empty, of an unknown format, or exceeds the limits. If a glTF is damaged or refers to a file outside its folder.
             If a glTF, PLY or STL has vertices that are NaN, infinite, or in other ways not those of a tree in meters. Blender's importers
             would silently replace some of them by 0.
         """
