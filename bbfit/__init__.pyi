@@ -17,6 +17,7 @@ from .fitting.loop import fit as fit
 from .geometry.camera import Camera as Camera
 from .geometry.cloud import BillboardCloud as BillboardCloud
 from .geometry.orbit import Orbit as Orbit
+from .inputs import InputLimits as InputLimits
 from .lod import build_lod as build_lod
 from .pipeline import RunConfig as RunConfig
 from .pipeline import run as run

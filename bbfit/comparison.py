@@ -19,12 +19,13 @@ from bbfit.evaluation.report import Measures, mean_measures
 from bbfit.evaluation.scoring import held_out, score_views
 from bbfit.exporting.lod import glb_counts
 from bbfit.exporting.model import ShippedModel, shipped_model
-from bbfit.files import output_folder, read_json, write_bytes, write_json
+from bbfit.files import read_json, remove_parts, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, read_rgba, to_bytes, unpremultiply, write_png
 from bbfit.inputs import reading
+from bbfit.outputs import claimed_folder, output_folder
 from bbfit.pipeline import RunConfig, run
 from bbfit.provenance import VERSIONS
 from bbfit.reporting.comparison_tables import CompareRow, compare_csv, compare_markdown, compare_picture, compare_plot
@@ -48,6 +49,7 @@ _VERSIONS = {name: VERSIONS[name] for name in ("fit", "export", "evaluate")}
 _READABLE = (".glb", ".gltf", ".obj")
 # Blender decimates a tree to a number of triangles. It takes a few attempts to find the number that fits a size in bytes.
 _DECIMATION_ATTEMPTS = 5
+_TABLES = ("compare.csv", "compare.md", "compare.json", "quality.png", "systems.png")
 
 
 @dataclass(frozen=True)
@@ -110,11 +112,18 @@ def compare(
         If the tree cannot be used or a file cannot be written. If a package is missing, the row of the system has no scores but a note.
     """
     config, stages, on_progress = config or CompareConfig(), stages or RunConfig(), on_progress or silent
-    tree = TreeFile.open(tree)
+    tree = TreeFile.open(tree, stages.limits)
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "the comparison sets their numbers", "omit billboards and budgets")
-    folder = output_folder("out", out)
-    record = Record(folder)
+    with claimed_folder("out", out) as folder:
+        record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
+        record.check({"tables": _TABLES} | ({} if tree.suffix in _READABLE else {"convert": ("tree.glb",)}))
+        return CompareResult(folder, _compared(tree, record, config, stages, on_progress))
+
+
+def _compared(tree: TreeFile, record: Record, config: CompareConfig, stages: RunConfig, on_progress: OnProgress) -> tuple[CompareRow, ...]:
+    """Compare the systems in a claimed folder."""
+    folder = record.folder
     record.run(views_stage(folder, tree, stages.views), on_progress)
     views = ViewDataset.load(folder / "views")
     systems = [system for system in SYSTEMS if system in config.systems or not config.systems]
@@ -127,12 +136,16 @@ def compare(
     for number, system in enumerate(systems, 1):
         rows.append(comparison.row(system))
         on_progress("systems", number, len(systems), system)
-    write_bytes(folder / "compare.csv", compare_csv(rows))
-    write_bytes(folder / "compare.md", compare_markdown(rows, original_tree(views)).encode())
-    write_json(folder / "compare.json", [row.to_json() for row in rows])
-    compare_plot(rows, folder / "quality.png")
-    compare_picture(rows, views.test, folder)
-    return CompareResult(folder, tuple(rows))
+
+    def write_tables(on_progress: OnProgress) -> None:
+        write_bytes(folder / "compare.csv", compare_csv(rows))
+        write_bytes(folder / "compare.md", compare_markdown(rows, original_tree(views)).encode())
+        write_json(folder / "compare.json", [row.to_json() for row in rows])
+        compare_plot(rows, folder / "quality.png")
+        compare_picture(rows, views.test, folder)
+
+    record.run(Stage("tables", ([row.to_json() for row in rows], views.fingerprint), _TABLES, write_tables, algorithm="compare"))
+    return tuple(rows)
 
 
 class _Comparison:
@@ -170,6 +183,7 @@ class _Comparison:
         """The score and the costs of a system."""
         title, simplify = self._systems[system]
         folder = output_folder("out", self._folder / system)
+        remove_parts(folder)
 
         def work(on_progress: OnProgress) -> None:
             result = simplify(folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import tempfile
@@ -15,8 +16,8 @@ from bbfit.inputs import parse_json, reading
 if TYPE_CHECKING:  # importing torch would delay commands that do not need it
     from torch import Tensor
 
-PART = ".part"
-"""The suffix of temporary files, whose names start with a dot."""
+PREFIX, PART = ".bbfit-", ".part"
+"""How the names of temporary files start and end."""
 _LARGEST_JSON = 1 << 28
 
 
@@ -38,7 +39,7 @@ def write_pieces(path: str | Path, pieces: Iterable[bytes]) -> None:
 
 
 def _replace(path: Path, pieces: Iterable[bytes]) -> None:
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=PART)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=PREFIX, suffix=PART)
     try:
         with os.fdopen(handle, "wb") as file:
             file.writelines(pieces)
@@ -74,22 +75,8 @@ def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], metadata: Map
     write_bytes(path, save(dict(tensors), dict(metadata)))
 
 
-def output_folder(name: str, path: str | Path) -> Path:
-    """Create an output folder if it does not exist, remove temporary files of killed processes from it, and return it.
-
-    If ``path`` or a part of it is a file, or the folder cannot be written to, this raises ``InputError`` with the option's ``name``.
-    """
-    path = Path(path)
-    if path.exists() and not path.is_dir():
-        fail(name, f"{path} is a file, not a folder", "choose another output folder")
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-        for temporary in path.glob(f".*{PART}"):
-            temporary.unlink(missing_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        fail(name, f"a part of {path} is a file, not a folder", "choose another output folder")
-    except OSError as error:
-        fail(name, f"{path} cannot be written to ({error.strerror})", "choose another output folder or free the disk")
-    return path
+def remove_parts(folder: Path) -> None:
+    """Remove the temporary files of killed processes from a folder to which no other process writes."""
+    for temporary in folder.glob(f"{PREFIX}*{PART}"):
+        with contextlib.suppress(OSError):
+            temporary.unlink()

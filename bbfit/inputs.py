@@ -18,6 +18,8 @@ SMALLEST, LARGEST = 1e-4, 1e6
 """Range of the size of a tree in meters. ``LARGEST`` also limits the distance of everything from the origin along each axis."""
 _LONGEST_REASON = 200
 _MOST_VALUES = 10_000_000  # of a JSON text; each takes up to a hundred bytes in memory
+_HINTS = {"tree": "export the tree as one .glb file, or ", "views": "copy the pictures into the folder of the views, or "}
+_ALLOW = "allow the other folder with --allow-folders"
 
 
 @dataclass(frozen=True)
@@ -67,8 +69,7 @@ class InputLimits:
             admitted = self.admits(path, folder)
             kind = path.stat().st_mode if path.exists() else None
         if not admitted:
-            hint = "put all files into one folder, or allow theirs with --allow-folders"
-            fail(name, f"{source} refers to {reference}, outside its own folder", hint)
+            fail(name, f"{source} refers to {reference}, outside its own folder", _HINTS.get(name, "") + _ALLOW)
         if kind is not None and not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
             fail(name, f"{source} refers to {reference}, which is a device or a pipe", "replace it by a file")
         return path

@@ -12,9 +12,10 @@ from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.model import ShippedModel, shipped_model
-from bbfit.files import output_folder, read_json, write_bytes, write_json
+from bbfit.files import read_json, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.inputs import reading
+from bbfit.outputs import claimed_folder, used_folder
 from bbfit.pipeline import RunConfig, RunResult, run
 from bbfit.provenance import digest_file
 from bbfit.reporting.plots import lod_picture
@@ -23,6 +24,9 @@ from bbfit.stages.stage import OnProgress, Record, Stage, silent
 from bbfit.stages.trees import convert_stage, views_stage
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset
+
+ORIGINAL = "original.glb"
+"""The file of the converted tree."""
 
 
 @dataclass(frozen=True)
@@ -80,12 +84,17 @@ def build_lod(
     out = Path(out)
     if out.suffix.lower() != ".glb":
         fail("out", f"{out} ends in {out.suffix or 'nothing'}", "give a name that ends in .glb")
-    output_folder("out's folder", out.parent)
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "planes sets the number of billboards of each level", "omit billboards and budgets")
-    tree = TreeFile.open(tree)
-    folder = output_folder("work", work or out.with_suffix(""))
-    record = Record(folder)
+    tree = TreeFile.open(tree, stages.limits)
+    with used_folder("out's folder", out.parent), claimed_folder("work", work or out.with_suffix("")) as folder:
+        return _built(tree, out, config, stages, folder, on_progress)
+
+
+def _built(tree: TreeFile, out: Path, config: LodConfig, stages: RunConfig, folder: Path, on_progress: OnProgress) -> LodResult:
+    """Build the levels in a claimed folder."""
+    record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
+    record.check({"join": _outputs(out, folder)} | ({"convert": (ORIGINAL,)} if _converts(tree, config) else {}))
     record.run(views_stage(folder, tree, stages.views), on_progress)
     views = ViewDataset.load(folder / "views")
     original = _original(record, tree, config, on_progress) if config.original else None
@@ -126,7 +135,11 @@ def _join_stage(
 
     clouds = [digest_file(fitted.folder / name) for fitted in runs for name in ("cloud.safetensors", "metrics.json")]
     inputs = (original and digest_file(original), clouds, views.fingerprint, config, export.resolve(), out.stem)
-    return Stage("join", inputs, ("lod.json", "lod.png", os.path.relpath(out, folder)), work, algorithm="lod")
+    return Stage("join", inputs, _outputs(out, folder), work, algorithm="lod")
+
+
+def _outputs(out: Path, folder: Path) -> tuple[str, ...]:
+    return ("lod.json", "lod.png", os.path.relpath(out, folder))
 
 
 @dataclass(frozen=True)
@@ -153,10 +166,15 @@ def _fitted(folder: Path, stages: RunConfig, planes: int, on_progress: OnProgres
 
 def _original(record: Record, tree: TreeFile, config: LodConfig, on_progress: OnProgress) -> Path:
     """The tree as a GLB that others can be joined to."""
-    if config.triangles is None and is_self_contained(tree.path):
+    if not _converts(tree, config):
         return tree.path
-    record.run(convert_stage(record.folder, tree, "original.glb", triangles=config.triangles), on_progress)
-    return record.folder / "original.glb"
+    record.run(convert_stage(record.folder, tree, ORIGINAL, triangles=config.triangles), on_progress)
+    return record.folder / ORIGINAL
+
+
+def _converts(tree: TreeFile, config: LodConfig) -> bool:
+    """Whether the finest level is a converted tree."""
+    return config.original and not (config.triangles is None and is_self_contained(tree.path))
 
 
 def _switches(views: ViewDataset, runs: list[RunResult], config: LodConfig) -> list[_Switch]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,16 @@ def check_model_path(name: str, path: str | Path) -> Path:
         fail(name, f"{path} ends in {path.suffix or 'nothing'}", f"choose an ending of {' or '.join(SUFFIXES)}")
     check_folder(f"{name}'s folder", path.parent)
     return path
+
+
+def names_beside(path: Path, *, texture: bool = False, mip_files: bool = False) -> list[str]:
+    """The names of the files that a model at ``path`` consists of, the model first.
+
+    A GLB is one file. An OBJ has a material library, and with ``texture`` a texture. ``mip_files`` adds a pattern for mip levels.
+    """
+    others = [".mtl", *([".png"] if texture else [])] if path.suffix.lower() == ".obj" else []
+    levels = [f"{glob.escape(path.stem)}_mip*.png"] if mip_files else []
+    return [path.name, *(path.with_suffix(suffix).name for suffix in others), *levels]
 
 
 def glb_of_scene(scene: trimesh.Scene, complete: Callable[[dict[str, Any]], None]) -> bytes:

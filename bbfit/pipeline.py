@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,23 @@ from bbfit.checks import fail
 from bbfit.evaluation.report import Report
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
-from bbfit.files import output_folder
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.stages.billboards import budget_stage, fit_stage, read_choice, remove_checkpoint
-from bbfit.stages.results import evaluate_stage, export_config, export_stage, report_stage
+from bbfit.inputs import InputLimits
+from bbfit.outputs import claimed_folder
+from bbfit.stages.billboards import BUDGET_OUTPUTS, FIT_OUTPUTS, budget_stage, fit_stage, read_choice
+from bbfit.stages.results import (
+    EVALUATE_OUTPUTS,
+    REPORT_OUTPUTS,
+    evaluate_stage,
+    export_config,
+    export_outputs,
+    export_stage,
+    report_stage,
+)
 from bbfit.stages.stage import OnProgress, Record, Stage, record_head, silent
-from bbfit.stages.trees import grow_stage, views_stage
+from bbfit.stages.trees import GROW_OUTPUTS, grow_stage, views_stage
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.species import Species, load_species
@@ -46,6 +56,8 @@ class RunConfig:
     """Limits of the result. They determine the options of the fit that ``fit`` does not set."""
     export: ExportConfig = field(default_factory=ExportConfig)
     """Options for writing the model."""
+    limits: InputLimits = field(default_factory=InputLimits)
+    """What the tree and the views may refer to, and how large they may be."""
 
     def seeded(self, seed: int) -> RunConfig:
         """The same options with one seed for growing, rendering and fitting."""
@@ -114,7 +126,12 @@ def run(
         If an input cannot be used or the folder cannot be written to. Earlier results stay as they were.
     """
     config, on_progress = config or RunConfig(), on_progress or silent
-    prepared = prepare(source, out, config, on_progress=on_progress)
+    with prepare(source, out, config, on_progress=on_progress) as prepared:
+        return _fitted(prepared, config, on_progress, on_step)
+
+
+def _fitted(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on_step: Callable[[Step], None] | None) -> RunResult:
+    """The stages of a run after its views."""
     record, tree, views = prepared.record, prepared.tree, prepared.views
     folder = record.folder
     views.train.check()
@@ -127,8 +144,7 @@ def run(
         record.head["config"]["fit"] = _plain(asdict(fit_config))  # the fit uses the chosen configuration
     max_bytes = config.budget.most_bytes
     limit = None if max_bytes is None else (max_bytes, export)
-    if record.run(fit_stage(folder, views, tree, fit_config, limit, on_step), on_progress):
-        remove_checkpoint(folder)
+    record.run(fit_stage(folder, views, tree, fit_config, limit, on_step), on_progress)
     cloud = BillboardCloud.load(folder / "cloud.safetensors")
     model = shipped_model(cloud, export)
     record.run(export_stage(folder, model), on_progress)
@@ -139,10 +155,14 @@ def run(
     return RunResult(folder, cloud, report, tuple(record.skipped), missed)
 
 
+@contextlib.contextmanager
 def prepare(
     source: str | Path | TreeFile | None, out: str | Path, config: RunConfig | None = None, *, on_progress: OnProgress | None = None
-) -> Prepared:
-    """Run the first stages of :func:`run`, with the same arguments and errors: grow a tree if none is given, and render its views."""
+) -> Iterator[Prepared]:
+    """Run the first stages of :func:`run`, with the same arguments and errors: grow a tree if none is given, and render its views.
+
+    No other process can write to the folder until the context ends.
+    """
     config, on_progress = config or RunConfig(), on_progress or silent
     path = source.path if isinstance(source, TreeFile) else source
     views_folder = Path(path) if path is not None and Path(path).is_dir() else None
@@ -150,17 +170,39 @@ def prepare(
         fail("tree", f"{config.tree} is given together with {path or 'a tree to grow'}", "give a mesh only with a folder of views")
     if source is None:
         species = load_species(config.species or (None if config.grow.species_file else "quaking_aspen"), config.grow.species_file)
-        record = Record(output_folder("out", out), _head(species.name, config, grown=species, rendered=True))
-        tree = _grown(record, grow_stage(record.folder, species, config.grow), on_progress)
+        head = _head(species.name, config, grown=species, rendered=True)
+        with _record(out, head, config, [config.grow.species_file, config.views.hdri]) as record:
+            tree = _grown(record, grow_stage(record.folder, species, config.grow), on_progress)
+            yield _rendered(record, tree, config, on_progress)
     elif config.species is not None or replace(config.grow, seed=0) != RunConfig().grow:
         fail("run", f"{path} is given, so no tree is grown", "omit the species and the options for growing")
     elif views_folder is not None:
         views = ViewDataset.load(views_folder, seed=config.fit.seed)  # check the inputs before creating the output folder
-        mesh = None if config.tree is None else TreeFile.open(config.tree)
-        return Prepared(Record(output_folder("out", out), _head(str(views_folder.resolve()), config, rendered=False)), mesh, views)
+        mesh = None if config.tree is None else TreeFile.open(config.tree, config.limits)
+        head = _head(str(views_folder.resolve()), config, rendered=False)
+        with _record(out, head, config, [*views.train.paths, *views.test.paths, *(mesh.files if mesh else ())]) as record:
+            yield Prepared(record, mesh, views)
     else:
-        tree = TreeFile.open(source)
-        record = Record(output_folder("out", out), _head(str(tree.path.resolve()), config, rendered=True))
+        tree = TreeFile.open(source, config.limits)
+        head = _head(str(tree.path.resolve()), config, rendered=True)
+        with _record(out, head, config, [*tree.files, config.views.hdri]) as record:
+            yield _rendered(record, tree, config, on_progress)
+
+
+@contextlib.contextmanager
+def _record(out: str | Path, head: dict[str, Any], config: RunConfig, inputs: Iterable[Path | None]) -> Iterator[Record]:
+    """The record of a run's folder, which no other process can write to until the context ends, and which has room for the results."""
+    outputs = {"grow": GROW_OUTPUTS} if head["config"]["grow"] else {}
+    outputs |= {"fit": FIT_OUTPUTS, "export": export_outputs(config.export), "evaluate": EVALUATE_OUTPUTS, "report": REPORT_OUTPUTS}
+    outputs |= {"budget": BUDGET_OUTPUTS} if config.budget.given else {}
+    with claimed_folder("out", out) as folder:
+        record = Record(folder, head, [path for path in inputs if path is not None])
+        record.check(outputs)
+        yield record
+
+
+def _rendered(record: Record, tree: TreeFile, config: RunConfig, on_progress: OnProgress) -> Prepared:
+    """Render the views of a run's tree."""
     record.run(views_stage(record.folder, tree, config.views), on_progress)
     return Prepared(record, tree if tree.is_mesh else None, ViewDataset.load(record.folder / "views"))
 

@@ -26,7 +26,7 @@ GROUPS = (
     ("checks",),
     ("provenance", "inputs"),
     ("files", "glb", "model_files"),
-    ("geometry",),
+    ("geometry", "outputs"),
     ("layout",),
     ("images",),
     ("tree_files",),

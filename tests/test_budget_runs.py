@@ -17,6 +17,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.files import write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.outputs import WRITTEN_FILE
 from bbfit.pipeline import RunConfig, RunResult, run
 from bbfit.stages.billboards import fit_stage
 from bbfit.views import ViewDataset
@@ -120,7 +121,7 @@ def killed_after_a_trial(folder: Path) -> None:
 
 def test_a_killed_run_goes_on_with_the_trials_done(done: RunResult, tmp_path: Path) -> None:
     killed_after_a_trial(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["pareto.json"]
+    assert {path.name for path in tmp_path.iterdir()} == {"pareto.json", WRITTEN_FILE}
     tag(tmp_path)
     (first,), told = trials_of(tmp_path), []
     result = run(VIEWS, tmp_path, CONFIG, on_progress=lambda *event: told.append(event))

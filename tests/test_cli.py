@@ -22,6 +22,7 @@ from bbfit.cli import main
 from bbfit.cli.console import out_console
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import write_png
+from bbfit.outputs import single_files
 from bbfit.reporting.tables import report_table
 from bbfit.stages.results import original_tree
 from bbfit.tree_files.tree_file import TreeFile
@@ -387,7 +388,8 @@ def test_a_fault_of_ours_is_exit_code_1(views_folder: Path, tmp_path: Path) -> N
 def test_a_disk_that_fills_up_leaves_the_earlier_model(fitted: Path, tmp_path: Path) -> None:
     """A limit on file size makes a real write fail half-way, as a full disk does."""
     model = tmp_path / "model.glb"
-    model.write_bytes(b"earlier")
+    with single_files("bbfit export", tmp_path, [model.name]):
+        model.write_bytes(b"earlier")
     script = "import sys; from bbfit.cli import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", script, "export", str(fitted / "cloud.safetensors"), "--out", str(model)]
     limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))  # noqa: E731
@@ -399,7 +401,7 @@ def test_a_disk_that_fills_up_leaves_the_earlier_model(fitted: Path, tmp_path: P
         and "model.glb cannot be written" in result.stderr
         and len(result.stderr.strip().splitlines()) == 1
     )
-    assert model.read_bytes() == b"earlier" and [path.name for path in tmp_path.iterdir()] == ["model.glb"]
+    assert model.read_bytes() == b"earlier" and {path.name for path in tmp_path.iterdir()} == {"model.glb", ".bbfit.json"}
 
 
 def test_a_run_killed_outright_goes_on(views_folder: Path, tmp_path: Path) -> None:

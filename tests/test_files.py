@@ -12,7 +12,7 @@ from full_disk import FULL, full_disk
 from safetensors import safe_open
 
 from bbfit.checks import InputError
-from bbfit.files import output_folder, read_json, write_bytes, write_json, write_pieces, write_tensors
+from bbfit.files import read_json, remove_parts, write_bytes, write_json, write_pieces, write_tensors
 
 
 def names(folder: Path) -> list[str]:
@@ -71,10 +71,11 @@ def test_pieces_make_one_file_or_none(tmp_path: Path) -> None:
 
 
 def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
-    (tmp_path / ".cloud.safetensors.abc.part").write_bytes(b"half")
+    (tmp_path / ".bbfit-abc.part").write_bytes(b"half")
     (tmp_path / "mine.part").write_bytes(b"kept")
-    output_folder("out", tmp_path)
-    assert names(tmp_path) == ["mine.part"]
+    (tmp_path / ".video.mp4.part").write_bytes(b"kept")
+    remove_parts(tmp_path)
+    assert names(tmp_path) == [".video.mp4.part", "mine.part"]
 
 
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
@@ -111,25 +112,3 @@ def test_tensors_round_trip(tmp_path: Path) -> None:
         for name, tensor in tensors.items():
             assert torch.equal(file.get_tensor(name), tensor) and file.get_tensor(name).dtype == tensor.dtype
     assert names(tmp_path) == ["a.safetensors"]
-
-
-def test_an_output_folder_is_made(tmp_path: Path) -> None:
-    folder = tmp_path / "a" / "b"
-    assert output_folder("out", str(folder)) == folder and folder.is_dir()
-    (folder / "old.txt").write_text("kept")
-    output_folder("out", folder)
-    assert names(folder) == ["old.txt"]
-
-
-def test_an_output_folder_that_is_a_file_or_within_one_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("x")
-    for path in (tmp_path / "file", tmp_path / "file" / "a", tmp_path / "file" / "a" / "b"):
-        with pytest.raises(InputError, match=r"^out: .*choose another output folder"):
-            output_folder("out", path)
-    assert (tmp_path / "file").read_text() == "x"
-
-
-def test_an_output_folder_that_cannot_be_written_to_is_refused() -> None:
-    """The system's own folder of processes holds no files of ours."""
-    with pytest.raises(InputError, match=r"^out: .* cannot be written to \(.*\); choose"):
-        output_folder("out", "/proc")

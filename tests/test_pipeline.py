@@ -18,6 +18,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import read_rgba
+from bbfit.outputs import WRITTEN_FILE
 from bbfit.pipeline import RunConfig, RunResult, run
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
@@ -40,7 +41,7 @@ def snapshot(folder: Path) -> dict[str, bytes]:
 
 
 def test_everything_is_written(done: RunResult) -> None:
-    assert sorted(path.name for path in done.folder.iterdir()) == sorted([*FILES, *MODELS])
+    assert sorted(path.name for path in done.folder.iterdir()) == sorted([*FILES, *MODELS, WRITTEN_FILE])
     assert done.skipped == ()
     metrics = json.loads((done.folder / "metrics.json").read_text())
     assert set(metrics) >= {"over_white", "rgba", "thesis_scale", "vertices", "bytes", "seconds", "views"}
@@ -92,7 +93,7 @@ def test_a_killed_run_goes_on_to_the_same_result(views_folder: Path, tmp_path: P
 
     with pytest.raises(Killed):
         run(views_folder, tmp_path, CONFIG, on_progress=kill)
-    assert [path.name for path in tmp_path.iterdir()] == ["fit.checkpoint"]
+    assert {path.name for path in tmp_path.iterdir()} == {"fit.checkpoint", WRITTEN_FILE}
     steps = []
     result = run(views_folder, tmp_path, CONFIG, on_progress=lambda stage, index, *rest: steps.append((stage, index)))
     assert steps[0] == ("fit", 11)

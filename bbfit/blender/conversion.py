@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from bbfit.blender.pictures import tree_settings
 from bbfit.blender.processes import BlenderPool, require_bpy
 from bbfit.checks import check_count, check_folder, fail
 from bbfit.files import write_pieces
@@ -61,7 +62,7 @@ def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int 
     if out.exists() and any(out.samefile(file) for file in tree.files):
         fail("out", f"{out} is the tree itself", "choose another name")
     require_bpy()
-    with BlenderPool({"tree": str(tree.path.resolve())}) as pool:
+    with BlenderPool(tree_settings(tree)) as pool:
         with pool.convert(triangles).open("rb") as file:
             write_pieces(out, iter(partial(file.read, _PIECE), b""))
     return out

@@ -18,9 +18,9 @@ from bbfit.blender.config import ViewsConfig
 from bbfit.blender.processes import BlenderPool, require_bpy
 from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputError, check_range, fail
-from bbfit.files import output_folder
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, camera_to_nerf
 from bbfit.images import read_rgba
+from bbfit.outputs import claimed_folder
 from bbfit.tree_files.tree_file import TreeFile
 
 PICTURES_FILE = "pictures.json"
@@ -96,9 +96,8 @@ def render_pictures(
     if not missing:
         return paths
     require_bpy()
-    with BlenderPool(worker_settings(tree, config, size, len(missing))) as pool:
+    with claimed_folder("out", out), BlenderPool(worker_settings(tree, config, size, len(missing))) as pool:
         points = to_y_up(pool.load()["payload"])
-        output_folder("out", out)
         request.save(out / PICTURES_FILE)
         visible = clips or [clip_distances(points, position) for position in cameras.position]
         report, finished = on_progress, count - len(missing)
@@ -134,12 +133,17 @@ def vertical_axis(low: NDArray[np.floating], high: NDArray[np.floating], axis: s
     return target
 
 
+def tree_settings(tree: TreeFile) -> dict[str, Any]:
+    """The worker's settings for a tree: its main file, and all files that Blender may read for it."""
+    return {"tree": str(tree.path.resolve()), "files": [str(file.resolve()) for file in tree.files]}
+
+
 def worker_settings(tree: TreeFile, config: ViewsConfig, size: int, count: int) -> dict[str, Any]:
     """The worker's settings for ``count`` pictures of ``size`` x ``size`` pixels."""
     azimuth, elevation = math.radians(config.sun_azimuth), math.radians(config.sun_elevation)
     across = math.cos(elevation)
     return {
-        "tree": str(tree.path.resolve()),
+        **tree_settings(tree),
         "size": size,
         "samples": config.samples,
         "denoise": config.denoise,

@@ -16,10 +16,11 @@ from bbfit.blender.pictures import FILTER_REACH, clip_distances, frames, is_inta
 from bbfit.blender.processes import BlenderError, BlenderPool, require_bpy
 from bbfit.blender.request import ViewsRequest
 from bbfit.checks import fail
-from bbfit.files import output_folder
+from bbfit.files import remove_parts
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.orbit import Orbit
 from bbfit.layout import REQUEST_FILE, SINGLE_FILE, TEST_FILE, TRAIN_FILE, split_views, write_transforms
+from bbfit.outputs import Written, claimed_folder, output_folder
 from bbfit.tree_files.tree_file import TreeFile
 
 __all__ = ["BlenderError", "render_views"]
@@ -64,14 +65,21 @@ def render_views(
     """
     config, out, tree = config or ViewsConfig(), Path(out), TreeFile.open(tree)
     request = ViewsRequest.of(tree, config)
-    earlier = _earlier(out, request)
+    _earlier(out, request)
+    with claimed_folder("out", out):
+        _render(tree, out, config, request, on_progress or (lambda done, total: None))
+    return out
+
+
+def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsRequest, report: Callable[[int, int], None]) -> None:
+    """Render the missing views into a claimed folder."""
+    earlier = _earlier(out, request)  # again, because another process may just have written it
     images = out / "images"
     paths = [images / f"{index:04}.png" for index in range(config.count)]
     missing = [index for index, path in enumerate(paths) if not is_intact(path, config.size)]
-    report = on_progress or (lambda done, total: None)
     if earlier and earlier.complete and not missing and (out / TRAIN_FILE).is_file() and (out / TEST_FILE).is_file():
         report(config.count, config.count)
-        return out
+        return
 
     started, spent = time.monotonic(), earlier.seconds if earlier else 0.0
     require_bpy()
@@ -86,8 +94,12 @@ def render_views(
             camera={"target": target.tolist(), "distance": distance},
             blender=measured["blender"],
         )
-        output_folder("out", out)
         output_folder("out", images)
+        remove_parts(images)
+        written, files = Written(out), [REQUEST_FILE, TRAIN_FILE, TEST_FILE, *(f"images/{paths[index].name}" for index in missing)]
+        if earlier:
+            written.adopt("views", written.digests([name for name in files if (out / name).is_file()]))
+        written.begin("views", files, [*tree.files, *([config.hdri] if config.hdri else [])])
 
         def save(*, complete: bool = False) -> None:
             seconds = round(spent + time.monotonic() - started, 3)
@@ -104,7 +116,7 @@ def render_views(
     train, test = split_views(config.count, config.seed)
     write_transforms(out, camera, [f"images/{path.name}" for path in paths], train, test)
     save(complete=True)
-    return out
+    written.finish("views", written.digests([REQUEST_FILE, TRAIN_FILE, TEST_FILE, "images/*.png"]))
 
 
 def _earlier(out: Path, request: ViewsRequest) -> ViewsRequest | None:

@@ -87,7 +87,7 @@ def _listen(requests: queue.Queue[dict[str, Any]]) -> None:
 def convert(settings: dict[str, Any], answer: Any) -> None:
     """Load the tree and write it as a GLB file."""
     tree, path, triangles = settings["tree"], settings["convert"]["path"], settings["convert"]["triangles"]
-    _, facts = SCENE.open_tree(tree)
+    _, facts = SCENE.open_tree(tree, settings["files"])
     try:
         count = import_beside("worker_glb").write(path, triangles)
     except RuntimeError as error:  # any failure of the exporter
@@ -102,7 +102,7 @@ def prepare(settings: dict[str, Any], answer: Any) -> None:
     """Load the tree, set up light, camera and renderer, and report the measurements of the tree."""
     import bpy
 
-    points, facts = SCENE.open_tree(settings["tree"])
+    points, facts = SCENE.open_tree(settings["tree"], settings["files"])
     add_light(settings)
     set_up_cycles(settings)
     camera = bpy.data.objects.new("bbfit camera", bpy.data.cameras.new("bbfit camera"))
@@ -204,7 +204,7 @@ def render(frame: dict[str, Any]) -> None:
     lens.clip_start, lens.clip_end = frame["clip"]
     scene.camera.matrix_world = Matrix(frame["camera_to_world"])
     scene.cycles.seed = frame["seed"]
-    part = path.with_name(f".{path.name}.part")
+    part = path.with_name(f".bbfit-{path.stem}.part")
     scene.render.filepath = str(part).replace("{", "{{").replace("}", "}}")  # Blender would replace {names}
     try:
         bpy.ops.render.render(write_still=True)
@@ -212,11 +212,23 @@ def render(frame: dict[str, Any]) -> None:
         reason = " ".join(str(error).split()).removeprefix("Error: ")
         raise SCENE.InputRefused("views", f"{path} could not be rendered ({reason})", RESUME_HINT) from error
     try:
-        if not part.read_bytes().endswith(b"IEND\xaeB`\x82"):
+        picture = part.read_bytes()
+        if not picture.endswith(b"IEND\xaeB`\x82"):
             raise SCENE.InputRefused("views", f"{path} could not be written completely", RESUME_HINT)
+        part.write_bytes(without_texts(picture))
         part.replace(path)
     except OSError as error:
         raise SCENE.InputRefused("views", f"{path} could not be written ({error.strerror})", RESUME_HINT) from error
+
+
+def without_texts(png: bytes) -> bytes:
+    """A PNG without texts: Cycles writes its seconds into them, so that no two renders would have the same bytes."""
+    kept, start = png[:8], 8
+    while start < len(png):
+        end = start + 12 + int.from_bytes(png[start : start + 4], "big")
+        kept += b"" if png[start + 4 : start + 8] == b"tEXt" else png[start:end]
+        start = end
+    return kept
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +25,17 @@ class InputRefused(Exception):
         super().__init__(subject, problem, hint)
 
 
-def open_tree(path: str) -> tuple[np.ndarray, dict[str, Any]]:
-    """Load the tree with its materials, as it renders. Return its vertices, [P, 3], and the facts that are reported to the parent."""
+def open_tree(path: str, files: list[str]) -> tuple[np.ndarray, dict[str, Any]]:
+    """Load the tree with its materials, as it renders. Return its vertices, [P, 3], and the facts that are reported to the parent.
+
+    ``files`` are all files that the tree may refer to, with symbolic links resolved.
+    """
     try:
         import bpy
     except ImportError as error:
         raise InputRefused("Blender", f"its module bpy cannot be loaded ({error})", "install the missing library") from error
     load(path)
+    check_files(path, files)
     show_what_renders()
     points, faces = measure(path)
     add_plain_material()
@@ -62,6 +67,17 @@ def load(path: str) -> None:
     for mesh in bpy.data.meshes:
         check_finite(path, coordinates(mesh))
         mesh.validate()  # only now, because it replaces NaN by 0
+
+
+def check_files(path: str, files: list[str]) -> None:
+    """Refuse a tree that refers to a file that is not one of ``files``: it may lie anywhere, and a change of it would go unnoticed."""
+    import bpy
+
+    for name in bpy.utils.blend_paths(absolute=True, packed=False, local=False):
+        file = Path(os.path.realpath(name))
+        if file.exists() and not file.is_dir() and str(file) not in files:
+            hint = "put all files into one folder, or export the tree as one .glb file"
+            raise InputRefused("tree", f"{path} refers to {name}, which bbfit did not find in its folder", hint)
 
 
 def append_scene(path: str) -> None:

@@ -16,6 +16,7 @@ from bbfit.cli.console import out_console, progress, show, show_missing_encoder
 from bbfit.cli.viewing import WatchConfig, watched
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.fitting.config import FitConfig
+from bbfit.inputs import InputLimits
 from bbfit.trees.config import GrowConfig
 
 
@@ -30,6 +31,7 @@ def run_command(
     fit: FitConfig = FitConfig(),  # noqa: B008
     budget: BudgetConfig = BudgetConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
     page: WatchConfig = WatchConfig(),  # noqa: B008
 ) -> None:
     """Do everything: take a tree or grow one, render views of it, fit billboards to them, write the models and a report with the scores.
@@ -48,11 +50,12 @@ def run_command(
         fit: How the billboards are fitted. The preset decides options that are not given.
         budget: What the result may cost. With any limit, short fits choose the number of billboards.
         export: How the models are written.
+        limits: What the tree and the views may refer to, and how large they may be.
         page: Watching the fit in a browser.
     """
     from bbfit.pipeline import RunConfig, run
 
-    config = RunConfig(species=species, grow=grow, views=views, fit=fit, budget=budget, export=export)
+    config = RunConfig(species=species, grow=grow, views=views, fit=fit, budget=budget, export=export, limits=limits)
     with watched(page, out, tree, None, fit) as display:
         with display.progress() as on_progress:
             result = run(tree, out, config, on_progress=on_progress, on_step=display.on_step)
@@ -78,7 +81,7 @@ def grow_command(
         list: List the species and the file of their parameters, and grow nothing.
         grow: How it is grown.
     """
-    from bbfit.model_files import check_model_path
+    from bbfit.model_files import check_model_path, names_beside
     from bbfit.trees import growth
     from bbfit.trees.species import figures_file, known_species, load_species
 
@@ -88,14 +91,16 @@ def grow_command(
         out_console.print(species_table([load_species(name, grow.species_file) for name in known_species(grow.species_file)]))
         out_console.print(f"figures in {grow.species_file or figures_file()}", soft_wrap=True, highlight=False)
         return
+    from bbfit.outputs import single_files
     from bbfit.trees.tree_writer import write_tree
 
     figures = load_species(species, grow.species_file)
     if out is None:
         fail("out", "a file to write the tree to is missing", f"for example --out {figures.name}.glb")
     check_model_path("tree", out)
-    scene = growth.grow(figures, seed=grow.seed, detail=grow.detail, leaves=grow.leaves, max_vertices=grow.max_vertices)
-    paths = write_tree(scene, out)
+    with single_files("bbfit grow", out.parent, names_beside(out), [grow.species_file] if grow.species_file else []):
+        scene = growth.grow(figures, seed=grow.seed, detail=grow.detail, leaves=grow.leaves, max_vertices=grow.max_vertices)
+        paths = write_tree(scene, out)
     out_console.print(f"{figures.name}: {sum(len(mesh.vertices) for mesh in scene.geometry.values()):,} vertices")
     for path in paths:
         out_console.print(f"{path}  {path.stat().st_size:,} bytes", soft_wrap=True)
@@ -106,6 +111,7 @@ def views_command(
     /,
     out: Path,
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
 ) -> None:
     """Render views of a tree from all around with Blender, into a folder in the NeRF-synthetic layout.
 
@@ -117,11 +123,13 @@ def views_command(
         tree: The tree's file (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
         out: Folder for the views; one with a part of them is completed.
         views: How the tree is rendered.
+        limits: What the tree and the views may refer to, and how large they may be.
     """
     from bbfit.blender.views_folder import render_views
+    from bbfit.tree_files.tree_file import TreeFile
 
     with progress() as on_progress:
-        render_views(tree, out, views, on_progress=lambda done, total: on_progress("views", done, total))
+        render_views(TreeFile.open(tree, limits), out, views, on_progress=lambda done, total: on_progress("views", done, total))
     out_console.print(f"{views.count} views in {out}")
 
 
@@ -133,6 +141,7 @@ def fit_command(
     fit: FitConfig = FitConfig(),  # noqa: B008
     budget: BudgetConfig = BudgetConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
     page: WatchConfig = WatchConfig(),  # noqa: B008
 ) -> None:
     """Fit billboards to a folder of views, write the models and a report with the scores. Needs no Blender.
@@ -148,6 +157,7 @@ def fit_command(
         fit: How the billboards are fitted. The preset decides options that are not given.
         budget: What the result may cost. With any limit, short fits choose the number of billboards.
         export: How the models are written.
+        limits: What the tree and the views may refer to, and how large they may be.
         page: Watching the fit in a browser.
     """
     from bbfit.checks import check_folder
@@ -156,7 +166,7 @@ def fit_command(
     if views.is_file():
         fail("views", f"{views} is a file", "give a folder of views; bbfit run takes a tree")
     check_folder("views", views)
-    stages = RunConfig(tree=tree, fit=fit, budget=budget, export=export)
+    stages = RunConfig(tree=tree, fit=fit, budget=budget, export=export, limits=limits)
     with watched(page, out, views, tree, fit) as display:
         with display.progress() as on_progress:
             result = run(views, out, stages, on_progress=on_progress, on_step=display.on_step)
@@ -172,6 +182,7 @@ def evaluate_command(
     out: Path | None = None,
     tree: Path | None = None,
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
 ) -> None:
     """Score fitted billboards on the held-out views of a folder, which they were not fitted to.
 
@@ -183,11 +194,12 @@ def evaluate_command(
         out: File for the measures as JSON. Default: metrics.json beside the cloud, which replaces the one of its run.
         tree: The mesh that the views show, for its vertices and bytes, if the views were not rendered by bbfit.
         export: How the model is exported, if not by default. The scores are those of the exported model.
+        limits: What the tree and the views may refer to, and how large they may be.
     """
     from bbfit.evaluation.report import Report
     from bbfit.evaluation.scoring import evaluate
-    from bbfit.files import output_folder
     from bbfit.geometry.cloud import BillboardCloud
+    from bbfit.outputs import claimed_folder, single_files, used_folder
     from bbfit.reporting.tables import report_table
     from bbfit.stages.results import original_tree
     from bbfit.tree_files.tree_file import TreeFile
@@ -196,12 +208,15 @@ def evaluate_command(
     billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
     out, earlier = out or cloud.with_name("metrics.json"), cloud.with_name("metrics.json")
     seconds = Report.load(earlier).seconds if earlier.is_file() else {}
-    output_folder("out", out.parent)
-    with progress() as on_progress:
-        original = original_tree(dataset, None if tree is None else TreeFile.open(tree))
-        report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=partial(on_progress, "evaluate"))
-    report = replace(report, seconds={**seconds, **report.seconds})
-    report.save(out)
+    mesh = None if tree is None else TreeFile.open(tree, limits)
+    inputs = [cloud, *dataset.train.paths, *dataset.test.paths, *(mesh.files if mesh else ())]
+    use = claimed_folder if out == earlier else used_folder  # no other process may be at work in the run's folder
+    with use("out", out.parent) as folder, single_files("evaluate", folder, [out.name], inputs):
+        with progress() as on_progress:
+            original = original_tree(dataset, mesh)
+            report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=partial(on_progress, "evaluate"))
+        report = replace(report, seconds={**seconds, **report.seconds})
+        report.save(out)
     out_console.print(report_table(report, thesis=False))
     out_console.print(f"measures in {out}", soft_wrap=True)
 
@@ -223,8 +238,14 @@ def export_command(
     """
     from bbfit.exporting import model
     from bbfit.geometry.cloud import BillboardCloud
+    from bbfit.model_files import check_model_path, names_beside
+    from bbfit.outputs import single_files
 
-    for path in model.export(BillboardCloud.load(cloud), out, export):
+    billboards, out = BillboardCloud.load(cloud), check_model_path("model file", out)
+    names = names_beside(out, texture=True, mip_files=export.resolve().mip_files)
+    with single_files("bbfit export", out.parent, names, [cloud]):
+        paths = model.export(billboards, out, export)
+    for path in paths:
         out_console.print(f"{path}  {path.stat().st_size:,} bytes")
     show_missing_encoder(export)
 
@@ -239,6 +260,7 @@ def lod_command(
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
 ) -> None:
     """Make levels of detail: the tree and fewer and fewer billboards in one GLB, with the distance from which each looks the same.
 
@@ -255,13 +277,15 @@ def lod_command(
         views: How the tree is rendered.
         fit: How the billboards are fitted. The preset decides options that are not given.
         export: How they are written.
+        limits: What the tree and the views may refer to, and how large they may be.
     """
     from bbfit.lod import build_lod
     from bbfit.pipeline import RunConfig
     from bbfit.reporting.tables import lod_table
 
+    stages = RunConfig(views=views, fit=fit, export=export, limits=limits)
     with progress() as on_progress:
-        result = build_lod(tree, out, lod, RunConfig(views=views, fit=fit, export=export), work=work, on_progress=on_progress)
+        result = build_lod(tree, out, lod, stages, work=work, on_progress=on_progress)
     out_console.print(lod_table(result.levels))
     show_missing_encoder(export)
     out_console.print(

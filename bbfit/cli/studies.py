@@ -11,6 +11,7 @@ from bbfit.blender.config import ViewsConfig
 from bbfit.cli.console import out_console, progress
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
+from bbfit.inputs import InputLimits
 from bbfit.rivals.config import CompareConfig
 from bbfit.sweep.config import SweepConfig
 from bbfit.trees.config import GrowConfig
@@ -27,6 +28,7 @@ def sweep_command(
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
 ) -> None:
     """Fit many configurations to many trees, on this machine or on a Ray cluster, and compare them in tables.
 
@@ -46,12 +48,13 @@ def sweep_command(
         views: How trees are rendered.
         fit: Options of all fits; the grid overrides them.
         export: How the models are written.
+        limits: What the tree and the views may refer to, and how large they may be.
     """
     from bbfit.pipeline import RunConfig
     from bbfit.reporting.tables import sweep_table
     from bbfit.sweep.scheduling import run_sweep
 
-    stages = RunConfig(grow=grow, views=views, fit=fit, export=export)
+    stages = RunConfig(grow=grow, views=views, fit=fit, export=export, limits=limits)
     with progress() as on_progress:
         result = run_sweep(out, sweep, stages, species=species, trees=trees, views=folders, on_progress=on_progress)
     out_console.print(sweep_table(result.rows))
@@ -72,6 +75,7 @@ def compare_command(
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
 ) -> None:
     """Compare bbfit with other methods on one tree: scores on the same held-out views, bytes, vertices and seconds.
 
@@ -87,13 +91,15 @@ def compare_command(
         views: How the tree is rendered.
         fit: How bbfit's billboards are fitted.
         export: How they are written.
+        limits: What the tree and the views may refer to, and how large they may be.
     """
     from bbfit import comparison
     from bbfit.pipeline import RunConfig
     from bbfit.reporting.tables import compare_table
 
+    stages = RunConfig(views=views, fit=fit, export=export, limits=limits)
     with progress() as on_progress:
-        result = comparison.compare(tree, out, compare, RunConfig(views=views, fit=fit, export=export), on_progress=on_progress)
+        result = comparison.compare(tree, out, compare, stages, on_progress=on_progress)
     out_console.print(compare_table(result.rows))
     out_console.print(
         f"tables in {result.folder}: compare.md, compare.csv, compare.json; pictures: systems.png, quality.png", soft_wrap=True

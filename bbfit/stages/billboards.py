@@ -21,6 +21,9 @@ from bbfit.stages.stage import OnProgress, Stage
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset
 
+BUDGET_OUTPUTS = ("pareto.json", "pareto.png")
+FIT_OUTPUTS = ("cloud.safetensors", "loss.csv", "loss.png")
+
 
 def budget_stage(
     folder: Path, views: ViewDataset, tree: TreeFile | None, fit_config: FitConfig, budget: BudgetConfig, export: ExportConfig
@@ -46,7 +49,7 @@ def budget_stage(
         cost: Cost = "bytes" if budget.bytes else "texels" if budget.texels else "vertices"
         pareto_plot(choice, path.with_suffix(".png"), cost=cost)
 
-    stage = Stage("budget", inputs, (path.name, "pareto.png"), work)
+    stage = Stage("budget", inputs, BUDGET_OUTPUTS, work)
     return stage
 
 
@@ -92,12 +95,7 @@ def fit_stage(
         loss_plot(result.losses, folder / "loss.png")
         return result.seconds
 
-    return Stage("fit", (*fit_inputs(views, config, tree), limit), ("cloud.safetensors", "loss.csv", "loss.png"), work)
-
-
-def remove_checkpoint(folder: Path) -> None:
-    """Remove the checkpoint of a fit after its result was recorded."""
-    (folder / "fit.checkpoint").unlink(missing_ok=True)
+    return Stage("fit", (*fit_inputs(views, config, tree), limit), FIT_OUTPUTS, work, temporary=(checkpoint.name,))
 
 
 def _known_trials(path: Path, key: str) -> list[Trial]:

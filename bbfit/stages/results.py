@@ -22,6 +22,14 @@ from bbfit.stages.stage import OnProgress, Stage
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset
 
+EVALUATE_OUTPUTS = ("metrics.json", "comparison.png")
+REPORT_OUTPUTS = ("report.html",)
+
+
+def export_outputs(config: ExportConfig) -> tuple[str, ...]:
+    """The files that :func:`export_stage` writes."""
+    return ("model.glb", "model.obj", "model.mtl", "model.png", *(("model_mip*.png",) if config.mip_files else ()))
+
 
 def export_stage(folder: Path, model: ShippedModel) -> Stage:
     """Write ``model.glb`` and ``model.obj`` with its material and texture."""
@@ -31,8 +39,7 @@ def export_stage(folder: Path, model: ShippedModel) -> Stage:
             model.save(folder / f"model{suffix}")
             on_progress("export", step, 2)
 
-    names = ("model.glb", "model.obj", "model.mtl", "model.png", *(("model_mip*.png",) if model.config.mip_files else ()))
-    return Stage("export", (model.config, digest_file(folder / "cloud.safetensors")), names, work)
+    return Stage("export", (model.config, digest_file(folder / "cloud.safetensors")), export_outputs(model.config), work)
 
 
 def evaluate_stage(folder: Path, model: ShippedModel, views: ViewDataset, tree: TreeFile | None, seconds: Mapping[str, float]) -> Stage:
@@ -49,7 +56,7 @@ def evaluate_stage(folder: Path, model: ShippedModel, views: ViewDataset, tree: 
 
     results = [digest_file(folder / name) for name in ("cloud.safetensors", "model.glb")]
     inputs = (results, model.cloud.alpha, views.fingerprint, None if tree is None else tree.digest)
-    return Stage("evaluate", inputs, ("metrics.json", "comparison.png"), work)
+    return Stage("evaluate", inputs, EVALUATE_OUTPUTS, work)
 
 
 def report_stage(
@@ -79,7 +86,7 @@ def report_stage(
     shown = [folder / name for name in ("cloud.safetensors", "metrics.json", "loss.csv")] + ([pareto] if pareto else [])
     described = {name: value for name, value in facts.items() if name != "versions"}
     inputs = ([digest_file(file) for file in shown], described, views.fingerprint)
-    return Stage("report", inputs, ("report.html",), work)
+    return Stage("report", inputs, REPORT_OUTPUTS, work)
 
 
 def original_tree(views: ViewDataset, tree: TreeFile | None = None) -> OriginalTree:

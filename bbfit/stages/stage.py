@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol
 
 from bbfit.checks import InputError, check_record
 from bbfit.files import read_json, write_json
+from bbfit.outputs import Written
 from bbfit.provenance import cache_key, digest_file, installed_version
 
 RECORD_FILE = "run.json"
@@ -46,6 +45,10 @@ class Stage:
     """Writes the outputs. May return the seconds of all attempts. Otherwise the record measures this one."""
     algorithm: str | None = None
     """The name in :data:`~bbfit.provenance.VERSIONS` of the algorithm. ``None`` is the name of the stage."""
+    temporary: tuple[str, ...] = ()
+    """Files that ``work`` keeps in the folder to continue from. They are removed once the stage is recorded."""
+    claims: bool = True
+    """Whether the record protects files of the user under the names of the outputs. ``False`` if ``work`` does so itself."""
 
     @property
     def key(self) -> str:
@@ -56,9 +59,12 @@ class Stage:
 class Record:
     """The finished stages of a folder, with their inputs, outputs and seconds. They are stored in ``run.json``."""
 
-    def __init__(self, folder: Path, head: Mapping[str, Any] | None = None) -> None:
-        """Read the record of ``folder``, if it exists. ``head`` contains the other fields of the record (:func:`record_head`)."""
-        self.folder, self.head, self.skipped = folder, dict(head or {}), list[str]()
+    def __init__(self, folder: Path, head: Mapping[str, Any] | None = None, inputs: Iterable[Path] = ()) -> None:
+        """Read the record of ``folder``, if it exists.
+
+        ``head`` contains the other fields of the record (:func:`record_head`). ``inputs`` are files that no stage may replace.
+        """
+        self.folder, self.head, self.skipped, self._inputs = folder, dict(head or {}), list[str](), tuple(inputs)
         path = folder / RECORD_FILE
         try:
             earlier = read_json("run", path) if path.is_file() else {}
@@ -66,6 +72,11 @@ class Record:
             earlier = {}  # without a record, the stages are repeated
         stages = earlier.get("stages") if isinstance(earlier, dict) else None
         self.stages = {name: _entry(stage) for name, stage in stages.items() if _is_entry(stage)} if isinstance(stages, dict) else {}
+        self._written = Written(folder)
+        for name, entry in self.stages.items():
+            self._written.adopt(name, entry["outputs"])
+        if self.stages:
+            self._written.adopt(RECORD_FILE, self._written.digests((RECORD_FILE,)))
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -82,22 +93,41 @@ class Record:
             return False
         return all((file := self.folder / path).is_file() and digest_file(file) == digest for path, digest in entry["outputs"].items())
 
+    def check(self, outputs: Mapping[str, tuple[str, ...]]) -> None:
+        """Require that stages can write their outputs, given by the stage's name: that no file of the user and no input has such a name.
+
+        Raises ``InputError`` with the file. :meth:`run` checks it too, but only after the work of earlier stages.
+        """
+        for name, files in {RECORD_FILE: (RECORD_FILE,), **outputs}.items():
+            self._written.check(name, files, self._inputs)
+
     def run(self, stage: Stage, on_progress: OnProgress = silent) -> bool:
         """Run a stage and record it, or skip it if its results are current. Returns whether the stage was run.
 
-        Raises ``InputError`` or ``OSError`` if the work does. The record then stays as it was.
+        An output that has changed since it was recorded is kept under another name. Raises ``InputError`` if an output would replace a
+        file of the user or an input, and ``InputError`` or ``OSError`` if the work does. The record then stays as it was.
         """
         key = stage.key  # before the work, during which an input file may change
         if self._is_current(stage.name, key):
             self.skipped.append(stage.name)
             return False
+        names = (*stage.outputs, *stage.temporary) if stage.claims else ()
+        self._written.begin(stage.name, names, self._inputs)
         started = time.perf_counter()
-        seconds = stage.work(on_progress)
+        try:
+            seconds = stage.work(on_progress)
+        except BaseException:
+            self._written.abandon(stage.name, names)
+            raise
         elapsed = time.perf_counter() - started if seconds is None else seconds
-        matches = (sorted(self.folder.glob(name)) if "*" in name else [self.folder / name] for name in stage.outputs)
-        digests = {Path(os.path.relpath(path, self.folder)).as_posix(): digest_file(path) for path in chain.from_iterable(matches)}
+        digests = self._written.digests(stage.outputs)
         self.stages[stage.name] = {"inputs": key, "outputs": digests, "seconds": round(elapsed, 3)}
+        self._written.begin(RECORD_FILE, (RECORD_FILE,), self._inputs)
         write_json(self.folder / RECORD_FILE, self.head | {"stages": self.stages})
+        self._written.finish(RECORD_FILE, self._written.digests((RECORD_FILE,)))
+        for name in stage.temporary:
+            (self.folder / name).unlink(missing_ok=True)
+        self._written.finish(stage.name, digests)
         return True
 
 

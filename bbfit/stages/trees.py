@@ -16,6 +16,8 @@ from bbfit.trees.growth import grow
 from bbfit.trees.species import Species
 from bbfit.trees.tree_writer import write_tree
 
+GROW_OUTPUTS = ("tree.glb",)
+
 
 def grow_stage(folder: Path, species: Species, config: GrowConfig) -> Stage:
     """Grow a tree and write ``tree.glb``."""
@@ -26,7 +28,7 @@ def grow_stage(folder: Path, species: Species, config: GrowConfig) -> Stage:
         write_tree(scene, folder / "tree.glb")
         on_progress("grow", 1, 1)
 
-    return Stage("grow", (species, config), ("tree.glb",), work)
+    return Stage("grow", (species, config), GROW_OUTPUTS, work)
 
 
 def views_stage(folder: Path, tree: TreeFile, config: ViewsConfig) -> Stage:
@@ -38,7 +40,7 @@ def views_stage(folder: Path, tree: TreeFile, config: ViewsConfig) -> Stage:
         return request.seconds if request else 0.0
 
     files = (f"views/{REQUEST_FILE}", "views/transforms_*.json", "views/images/*.png")
-    return Stage("views", (tree.digest, ViewsRequest.of(tree, config).config), files, work)
+    return Stage("views", (tree.digest, ViewsRequest.of(tree, config).config), files, work, claims=False)
 
 
 def convert_stage(folder: Path, tree: TreeFile, name: str, *, triangles: int | None = None) -> Stage:

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.checks import fail
-from bbfit.files import output_folder, write_bytes
+from bbfit.files import write_bytes
+from bbfit.outputs import output_folder
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.tasks import Outcome, Task, attempt
 

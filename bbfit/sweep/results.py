@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.checks import InputError, check_record
-from bbfit.files import output_folder, read_json, write_json
+from bbfit.files import read_json, remove_parts, write_json
 from bbfit.inputs import reading
+from bbfit.outputs import output_folder
 from bbfit.sweep.tasks import Outcome
 
 
@@ -18,6 +19,7 @@ class Results:
     def __init__(self, folder: Path) -> None:
         """Create the folder if it does not exist."""
         self._folder = output_folder("out", folder)
+        remove_parts(folder)
 
     def get(self, key: str) -> Outcome | None:
         """The stored outcome with a key. ``None`` if its file is missing or damaged."""

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.checks import InputError, check_file, check_folder, fail
-from bbfit.files import output_folder, write_bytes
+from bbfit.files import write_bytes
 from bbfit.fitting.loop import fit_inputs
 from bbfit.layout import TEST_FILE
+from bbfit.outputs import Written, claimed_folder
 from bbfit.pipeline import RunConfig
 from bbfit.provenance import VERSIONS, cache_key, identity
 from bbfit.reporting.sweep_plots import sweep_plot
@@ -29,6 +30,8 @@ from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.species import load_species
 from bbfit.views import ViewDataset
 
+TABLES = ("table.csv", "table.md", "table.png")
+"""The files that compare the runs of a sweep."""
 # Digits of a key in the names of results and folders. Among a million keys, two agree in one of 10^12 sweeps.
 _DIGITS = 20
 # Seconds between two writes of the table during a sweep.
@@ -103,11 +106,16 @@ def run_sweep(
     grid = Grid.load(config.grid).narrowed(config)
     cells = grid.cells(stages.fit, max_cells=config.max_cells)
     all_sources = sources(species if species or trees or views else grid.trees, trees, views, stages.grow.species_file)
-    sweep = _Sweep(output_folder("out", out), all_sources, cells, config, stages)
-    workers: Workers = LocalWorkers(config.workers, config.retries) if config.ray is None else RayWorkers(config)
-    with workers:
-        sweep.run(workers, on_progress or silent)
-    return sweep.result()
+    with claimed_folder("out", out) as folder:
+        written = Written(folder)
+        written.begin("tables", TABLES, [*map(Path, trees)])
+        sweep = _Sweep(folder, all_sources, cells, config, stages)
+        workers: Workers = LocalWorkers(config.workers, config.retries) if config.ray is None else RayWorkers(config)
+        with workers:
+            sweep.run(workers, on_progress or silent)
+        result = sweep.result()
+        written.finish("tables", written.digests(TABLES))
+        return result
 
 
 def sources(
@@ -183,7 +191,7 @@ class _Sweep:
             return
         grow, views = self._stages.grow, self._stages.views
         try:
-            tree = None if source.tree is None else TreeFile.open(source.tree)
+            tree = None if source.tree is None else TreeFile.open(source.tree, self._stages.limits)
         except InputError as error:
             self._submit_runs(source, Outcome(None, str(error), ""), workers)
             return
@@ -215,7 +223,7 @@ class _Sweep:
             self._outcomes |= {(source, cell): (None, failed) for cell in range(len(self._cells))}
             return
         path = self._folder_of(source) / "tree.glb" if source.species else source.tree
-        mesh = TreeFile.open(path) if path and (outcome.facts or {}).get("mesh") else None
+        mesh = TreeFile.open(path, self._stages.limits) if path and (outcome.facts or {}).get("mesh") else None
         for number in range(len(self._cells)):
             self._submit_run(source, number, views, mesh, workers)
 
@@ -236,7 +244,9 @@ class _Sweep:
         folder = source.views or self._folder_of(source) / "views"
         inputs = {"views": (folder,)} | ({"tree": mesh.files} if fit.placement == "clusters" and mesh else {})
         self._pending[key] = key, identity(request)
-        workers.submit(Task(key, fit_tree, inputs, self._folder / "runs" / key, (RunConfig(fit=fit, export=export),)))
+        workers.submit(
+            Task(key, fit_tree, inputs, self._folder / "runs" / key, (RunConfig(fit=fit, export=export, limits=self._stages.limits),))
+        )
 
     def _is_final(self, outcome: Outcome) -> bool:
         return outcome.reason is None or not self._config.retry_failed

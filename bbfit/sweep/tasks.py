@@ -86,9 +86,9 @@ def prepare_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig, sp
 
     grow = RunConfig().grow if species is None else replace(stages.grow, species_file=inputs.get("species_file"))
     stages = replace(stages, species=species, grow=grow, views=replace(stages.views, hdri=inputs.get("hdri")))
-    prepared = prepare(inputs.get("tree"), folder, stages)
-    tree, views = prepared.tree, prepared.views
-    return {"mesh": None if tree is None else tree.path.name, "views": len(views.train) + len(views.test)}
+    with prepare(inputs.get("tree"), folder, stages) as prepared:
+        tree, views = prepared.tree, prepared.views
+        return {"mesh": None if tree is None else tree.path.name, "views": len(views.train) + len(views.test)}
 
 
 def fit_tree(inputs: Mapping[str, Path], folder: Path, stages: RunConfig) -> Facts:

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from bbfit.inputs import InputLimits, reading
 from bbfit.tree_files.extent import check_points
-from bbfit.tree_files.pictures import check_pictures
 
 _STL_HEADER, _STL_TRIANGLE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-def check_obj(path: Path, others: Iterable[Path], limits: InputLimits) -> None:
-    """Check the number of vertices of an OBJ, and the sizes of its textures, which are among the ``others`` that it refers to."""
+def check_obj(path: Path, limits: InputLimits) -> None:
+    """Check the number of vertices of an OBJ."""
     with reading("tree", path, "export the tree again"):
         data = path.read_bytes()
         limits.at_most("max_input_vertices", "tree", path, sum(data.count(b"v" + blank) for blank in (b" ", b"\t")), "vertices")
-        check_pictures(path, [other for other in others if other.suffix.lower() != ".mtl"], limits)
 
 
 def check_stl(path: Path, limits: InputLimits) -> None:

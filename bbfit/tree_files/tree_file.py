@@ -12,11 +12,15 @@ import numpy as np
 from bbfit.checks import check_file, fail
 from bbfit.inputs import InputLimits, reading
 from bbfit.provenance import digest_files
+from bbfit.tree_files.blend import blend_files
 from bbfit.tree_files.extent import check_box, check_finite
+from bbfit.tree_files.fbx import fbx_files
 from bbfit.tree_files.gltf import read_gltf
 from bbfit.tree_files.mesh_checks import check_obj, check_stl
 from bbfit.tree_files.obj import obj_files
+from bbfit.tree_files.pictures import check_pictures
 from bbfit.tree_files.ply import check_ply
+from bbfit.tree_files.usd import usd_files
 
 if TYPE_CHECKING:
     import trimesh
@@ -28,6 +32,11 @@ UP_AXES: dict[str, UpAxis] = {
     **dict.fromkeys((".ply", ".stl", ".blend"), "z"),
 }
 """The formats of trees, and the axis that points up in each. An FBX or a USD file can declare another axis, which its importer uses."""
+_REFERENCES = {".obj": obj_files, ".fbx": fbx_files, ".blend": blend_files}
+_REFERENCES |= dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), usd_files)
+_CHECKS = {".obj": check_obj, ".ply": check_ply, ".stl": check_stl}
+# Files that trees refer to and that are not pictures.
+_NO_PICTURES = (*UP_AXES, ".mtl", ".bin")
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 """The formats whose triangles can be read without Blender."""
 
@@ -37,7 +46,7 @@ class TreeFile:
     """A tree on disk, opened and checked once by :meth:`open`. Trees with the same digest have the same contents."""
 
     files: tuple[Path, ...]
-    """All files of the tree: the main file first, then the files that it refers to (glTF, OBJ)."""
+    """All files of the tree: the main file first, then the files that it refers to."""
     digest: str
     """SHA-256 over the contents of all files (:func:`bbfit.provenance.digest_files`)."""
     bytes: int
@@ -53,16 +62,16 @@ class TreeFile:
             The path of a .glb, .gltf, .obj, .fbx, .usd, .usda, .usdc, .usdz, .ply, .stl or .blend file. A ``TreeFile`` is returned
             unchanged.
         limits
-            How large the tree may be, and in which folders besides its own its files may lie.
+            What the tree may refer to, and how large it may be.
 
         Raises
         ------
         MissingFileError
             If the file is missing, or a file that a glTF refers to.
         InputError
-            If the file is empty, of an unknown format, or exceeds the limits. If a glTF is damaged or refers to a file outside its folder.
-            If a glTF, PLY or STL has vertices that are NaN, infinite, or in other ways not those of a tree in meters. Blender's importers
-            would silently replace some of them by 0.
+            If the file is empty, of an unknown format, or damaged. If it exceeds ``limits``, or refers to a file outside its folder that
+            they do not allow. If a glTF, PLY or STL has vertices that are NaN, infinite, or in other ways not those of a tree in meters.
+            Blender's importers would silently replace some of them by 0.
         """
         if isinstance(tree, TreeFile):
             return tree
@@ -74,16 +83,16 @@ class TreeFile:
         others = list[Path]()
         if suffix in (".glb", ".gltf"):
             others = read_gltf(path, limits)
-        elif suffix == ".obj":
-            others = obj_files(path)
-            check_obj(path, others, limits)
-        elif suffix == ".ply":
-            check_ply(path, limits)
-        elif suffix == ".stl":
-            check_stl(path, limits)
+        elif suffix in _REFERENCES:
+            with reading("tree", path, "export the tree again"):
+                others = _REFERENCES[suffix](path, limits)
+                check_pictures(path, [other for other in others if other.suffix.lower() not in _NO_PICTURES], limits)
+        if suffix in _CHECKS:
+            _CHECKS[suffix](path, limits)
         files = (path, *others)
-        limits.at_most("max_input_bytes", "tree", path, sum(file.stat().st_size for file in files), "bytes")
-        return TreeFile(files, digest_files(files, path.parent), sum(file.stat().st_size for file in files))
+        size = sum(file.stat().st_size for file in files)
+        limits.at_most("max_input_bytes", "tree", path, size, "bytes")
+        return TreeFile(files, digest_files(files, path.parent), size)
 
     @property
     def path(self) -> Path:

@@ -100,7 +100,7 @@ def test_killed_in_the_middle_and_started_again(thing_glb: Path, tmp_path: Path)
     assert 2 <= len(kept) < 4
     cut = out / "images" / kept[0]
     cut.write_bytes(cut.read_bytes()[:-20])
-    (out / "images/.0003.png.part").write_bytes(b"half a picture")
+    (out / "images/.bbfit-0003.part").write_bytes(b"half a picture")
     progress: list[int] = []
     render_views(thing_glb, out, config, on_progress=lambda done, total: progress.append(done))
     assert progress == list(range(len(kept) - 1, 5))

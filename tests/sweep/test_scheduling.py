@@ -67,7 +67,7 @@ def test_every_configuration_of_every_tree_is_run(done: SweepResult) -> None:
         assert row.facts["billboards"] == int(row.labels["billboards"]) * (2 if row.labels["variant"] == "double" else 1)
         assert (done.folder / row.folder / "model.glb").is_file()
     assert len({row.folder for row in done.rows}) == 8
-    assert {path.name for path in done.folder.iterdir()} == {"results", "runs", "table.csv", "table.md", "table.png"}
+    assert {path.name for path in done.folder.iterdir()} == {"results", "runs", "table.csv", "table.md", "table.png", ".bbfit.json"}
 
 
 def test_a_run_of_a_sweep_is_that_run(done: SweepResult, two_trees: list[Path], tmp_path: Path) -> None:
