@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bbfit.checks import MissingFileError, fail
+from bbfit.checks import MissingFileError, check_range, fail
 from bbfit.files import read_json, write_json
 from bbfit.geometry.camera import Camera, camera_from_nerf, camera_to_nerf, pinhole_intrinsics
 from bbfit.inputs import LARGEST, InputLimits, reading
@@ -169,7 +169,9 @@ def _intrinsics(frame: Frame, width: int, height: int) -> torch.Tensor:
                 dtype=torch.float64,
             )
         else:
-            intrinsics = pinhole_intrinsics(math.degrees(float(header["camera_angle_x"])), width, height)
+            angle = float(header["camera_angle_x"])
+            check_range("camera_angle_x", angle, 0, math.pi, open_low=True, open_high=True)
+            intrinsics = pinhole_intrinsics(math.degrees(angle), width, height)
         sizes = torch.tensor([width, height], dtype=torch.float64)
         focal, center = intrinsics.diagonal()[:2] / sizes, intrinsics[:2, 2] / sizes
         low, high = _FOCAL_LENGTHS

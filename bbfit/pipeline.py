@@ -177,7 +177,7 @@ def prepare(
     elif config.species is not None or replace(config.grow, seed=0) != RunConfig().grow:
         fail("run", f"{path} is given, so no tree is grown", "omit the species and the options for growing")
     elif views_folder is not None:
-        views = ViewDataset.load(views_folder, seed=config.fit.seed)  # check the inputs before creating the output folder
+        views = ViewDataset.load(views_folder, seed=config.fit.seed, limits=config.limits)  # before the output folder is created
         mesh = None if config.tree is None else TreeFile.open(config.tree, config.limits)
         head = _head(str(views_folder.resolve()), config, rendered=False)
         with _record(out, head, config, [*views.train.paths, *views.test.paths, *(mesh.files if mesh else ())]) as record:

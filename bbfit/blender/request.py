@@ -11,9 +11,14 @@ from typing import Any, TypeGuard
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import check_file, fail
 from bbfit.files import read_json, write_json
-from bbfit.inputs import LARGEST, reading
+from bbfit.images import picture_header
+from bbfit.inputs import LARGEST, InputLimits, reading
 from bbfit.provenance import VERSIONS, identity, installed_version
 from bbfit.tree_files.tree_file import TreeFile
+
+# Most pixels of a panorama, which are more than those of a texture: 23170 x 11585.
+_PANORAMA = 1 << 28
+_UNLIMITED = InputLimits(max_input_pixels=1 << 62)
 
 
 @dataclass(frozen=True)
@@ -63,9 +68,14 @@ class ViewsRequest:
 
     @staticmethod
     def of(tree: TreeFile, config: ViewsConfig) -> ViewsRequest:
-        """The request for views of a tree before rendering. Raises ``MissingFileError`` if the configuration's panorama does not exist."""
+        """The request for views of a tree before rendering. Raises ``InputError`` if a panorama does not exist or is too large."""
         if config.hdri is not None:
-            config = replace(config, hdri=check_file("hdri", config.hdri))
+            panorama = check_file("hdri", config.hdri)
+            header = picture_header("hdri", panorama, _UNLIMITED)
+            if header is not None and header.width * header.height > _PANORAMA:
+                pixels = f"{header.width} x {header.height} pixels"
+                fail("hdri", f"{panorama} has {pixels}, more than {_PANORAMA:,}", "reduce it; 8192 x 4096 are enough for any light")
+            config = replace(config, hdri=panorama)
         known = RenderedTree(tree.path.name, tree.digest, tree.bytes, tree.up_axis)
         return ViewsRequest(identity(config), known, bbfit=installed_version("bbfit") or "unknown")
 

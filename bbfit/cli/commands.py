@@ -205,7 +205,7 @@ def evaluate_command(
     from bbfit.tree_files.tree_file import TreeFile
     from bbfit.views import ViewDataset
 
-    billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
+    billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views, limits=limits)
     out, earlier = out or cloud.with_name("metrics.json"), cloud.with_name("metrics.json")
     seconds = Report.load(earlier).seconds if earlier.is_file() else {}
     mesh = None if tree is None else TreeFile.open(tree, limits)

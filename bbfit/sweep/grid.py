@@ -103,16 +103,16 @@ class Grid:
             fail("grid", f"it has {self.size:,} cells, more than the limit of {max_cells:,}", "--max-cells raises it")
         shared = {name: value for name in _FIELDS if (value := getattr(base or FitConfig(), name)) != getattr(FitConfig(), name)}
         cells = []
-        for variant, settings in (self.variants or {"": {}}).items():
-            for values in product(*self.axes.values()):
-                chosen = dict(zip(self.axes, values, strict=True))
-                labels = ({VARIANT: variant} if variant else {}) | {name: str(value) for name, value in chosen.items()}
-                try:
-                    with reading("grid", "a value", "give values as in bbfit/sweep/grids/thesis.yaml"):
+        with reading("grid", "a value", _EXAMPLE):
+            for variant, settings in (self.variants or {"": {}}).items():
+                for values in product(*self.axes.values()):
+                    chosen = dict(zip(self.axes, values, strict=True))
+                    labels = ({VARIANT: variant} if variant else {}) | {name: str(value) for name, value in chosen.items()}
+                    try:
                         config = FitConfig(**{**self.fit, **shared, **settings, **chosen}).resolve()
-                except InputError as error:
-                    fail("grid", f"{' '.join(labels.values()) or 'its one cell'}: {error}")
-                cells.append(Cell(labels, config))
+                    except InputError as error:
+                        fail("grid", f"{' '.join(labels.values()) or 'its one cell'}: {error}")
+                    cells.append(Cell(labels, config))
         return cells
 
 

@@ -213,7 +213,7 @@ class _Sweep:
         reason = outcome.reason
         if reason is None:
             try:
-                views = ViewDataset.load(folder)
+                views = ViewDataset.load(folder, limits=self._stages.limits)
                 views.train.check()
                 views.test.check()
             except InputError as error:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +27,7 @@ from bbfit.tree_files.usd import usd_files
 if TYPE_CHECKING:
     import trimesh
 
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # what trimesh says of damaged files is in the errors that it raises
 _LIMITS = InputLimits()
 UpAxis = Literal["y", "z"]
 UP_AXES: dict[str, UpAxis] = {
@@ -127,11 +130,24 @@ class TreeFile:
         InputError
             If only Blender can read the format, if the file cannot be read, or if it has no triangles.
         """
+        scene = self._scene()
+        with reading("tree", self.path, "expected a mesh"):
+            for mesh in scene.geometry.values():
+                material = getattr(mesh.visual, "material", None)
+                for texture in (*vars(material).values(), *getattr(material, "_data", {}).values()) if material is not None else ():
+                    if hasattr(texture, "load"):
+                        texture.load()  # trimesh reads no more than the header
+        return scene
+
+    def _scene(self) -> trimesh.Scene:
+        """:meth:`scene` without its textures, which are not decoded."""
         import trimesh
 
         if not self.is_mesh:
             fail("tree", f"only Blender can read the triangles of {self.path}", f"give one of {' '.join(MESH_SUFFIXES)}, or no tree")
-        with reading("tree", self.path, "expected a mesh"), np.errstate(all="ignore"):
+        with reading("tree", self.path, "expected a mesh"), np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.filterwarnings("error", "string or file could not be read to its end")  # from which trimesh would make half a mesh
             scene = trimesh.load_scene(self.path, process=False)
             for name in [name for name, mesh in scene.geometry.items() if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces)]:
                 scene.delete_geometry(name)  # points, lines, and empty meshes
@@ -145,5 +161,11 @@ class TreeFile:
             return scene
 
     def mesh(self) -> trimesh.Trimesh:
-        """All triangles of the tree as one mesh in the axes of the file. Raises the errors of :meth:`scene`."""
-        return self.scene().to_mesh()
+        """All triangles of the tree as one mesh in the axes of the file, without materials. Raises the errors of :meth:`scene`."""
+        import trimesh
+
+        scene = self._scene()
+        with reading("tree", self.path, "expected a mesh"):
+            for mesh in scene.geometry.values():
+                mesh.visual = trimesh.visual.ColorVisuals()
+            return scene.to_mesh()
