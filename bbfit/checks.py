@@ -8,16 +8,23 @@ errors, into exit code 2; any other exception is a bug in bbfit.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from math import inf
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
 
+_LONGEST_MESSAGE = 4000
+_LARGEST_NUMBER = 10**30
+
 
 class InputError(ValueError):
-    """The caller's input cannot be used; the message says why and what to do."""
+    """The caller's input cannot be used; the message says why and what to do, in one line."""
+
+    def __str__(self) -> str:
+        return one_line(" ".join(map(str, self.args)))
 
 
 class InputTypeError(InputError, TypeError):
@@ -27,8 +34,18 @@ class InputTypeError(InputError, TypeError):
 class MissingFileError(InputError, FileNotFoundError):
     """A file or folder that the caller named does not exist."""
 
-    def __str__(self) -> str:
-        return str(self.args[0])
+    def __str__(self) -> str:  # not that of FileNotFoundError
+        return InputError.__str__(self)
+
+
+def one_line(text: str) -> str:
+    """A text for the terminal: control characters and characters without an encoding as escapes, and the middle of a long text omitted.
+
+    Names and values in messages come from files that nobody has checked.
+    """
+    if len(text) > _LONGEST_MESSAGE:
+        text = f"{text[: _LONGEST_MESSAGE - 200]} ... {text[-190:]}"
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 
 
 def in_words(error: Exception) -> str:
@@ -102,6 +119,51 @@ def _check(name: str, value: Any, hint: Any) -> None:
             if arguments[0] is int:
                 check_count(name, value, int(limits.low))
             check_range(name, value, limits.low, limits.high, open_low=limits.open_low, open_high=limits.open_high)
+
+
+def check_record(name: str, value: Any, hint: Any) -> None:
+    """Require a value from a file to be what a type says: ``hint`` is a type, such as a dataclass, whose fields are checked too.
+
+    Numbers must be finite. Dataclasses that check themselves when they are made, and ``Any``, are not checked. Unlike a configuration, a
+    file is not what a caller gave, so this raises ``TypeError``, to be caught where the file is read.
+    """
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        check_record(name, value, arguments[0])
+    elif origin in (Union, UnionType):
+        kinds = [kind for kind in arguments if kind is not NoneType]
+        if value is not None or len(kinds) == len(arguments):
+            check_record(name, value, kinds[0])
+    elif origin is Literal:
+        _require(name, isinstance(value, str | int) and value in arguments, f"one of {arguments}")
+    elif origin is tuple:
+        _require(name, isinstance(value, tuple), "a tuple")
+        for item in value:
+            check_record(name, item, arguments[0])
+    elif isinstance(origin, type) and issubclass(origin, Mapping):
+        _require(name, isinstance(value, Mapping), "a mapping")
+        for key, item in value.items():
+            check_record(name, key, arguments[0])
+            check_record(name, item, arguments[1])
+    elif is_dataclass(hint) and isinstance(hint, type):
+        _require(name, isinstance(value, hint), hint.__name__)
+        if not hasattr(hint, "__post_init__"):
+            for each, kind in _hints(hint).items():
+                check_record(f"{name}.{each}", getattr(value, each), kind)
+    elif hint in (int, float):
+        fits = (
+            isinstance(value, int if hint is int else int | float)
+            and not isinstance(value, bool)
+            and -_LARGEST_NUMBER < value < _LARGEST_NUMBER
+        )
+        _require(name, fits, "a finite number")
+    elif isinstance(hint, type):
+        _require(name, isinstance(value, hint), hint.__name__)
+
+
+def _require(name: str, condition: bool, kind: str) -> None:
+    if not condition:
+        raise TypeError(f"{name} is no {kind}")
 
 
 def check_range(name: str, value: float, low: float, high: float, *, open_low: bool = False, open_high: bool = False) -> None:

@@ -15,7 +15,7 @@ from bbfit.blender.conversion import tree_as_glb
 from bbfit.blender.pictures import render_pictures
 from bbfit.blender.requirements import check_blender
 from bbfit.budget.config import BudgetConfig
-from bbfit.checks import InputError, fail
+from bbfit.checks import InputError, check_record, fail
 from bbfit.evaluation.report import Measures, mean_measures
 from bbfit.evaluation.scoring import held_out, score_views
 from bbfit.exporting.lod import glb_counts
@@ -25,6 +25,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, read_rgba, to_bytes, unpremultiply, write_png
+from bbfit.inputs import reading
 from bbfit.outputs import claimed_folder, output_folder, used_folder
 from bbfit.pipeline import RunConfig, needs_blender, run
 from bbfit.provenance import VERSIONS
@@ -133,7 +134,7 @@ def _compared(
     """Compare the systems in a claimed folder. The options were checked."""
     folder = record.folder
     record.run(views_stage(folder, tree, stages.views), on_progress)
-    views = ViewDataset.load(folder / "views")
+    views = ViewDataset.load(folder / "views", limits=stages.limits)
     views.check()
     if tree.suffix not in _READABLE:
         record.run(convert_stage(folder, tree, "tree.glb"), on_progress)
@@ -229,7 +230,11 @@ class _Comparison:
             if "is not installed" not in str(error) and "LLVM" not in str(error):
                 raise
             return CompareRow(system, title, None, None, None, None, None, str(error))
-        return replace(CompareRow.from_json(read_json("result", folder / "result.json")), title=title)
+        content = read_json("result", folder / "result.json")
+        with reading("result", folder / "result.json", "remove it, then start bbfit compare again"):
+            row = replace(CompareRow.from_json(content), title=title)
+            check_record("row", row, CompareRow)
+            return row
 
     def _score(self, system: str, draw: Callable[[int], Tensor], folder: Path) -> Measures:
         """Compute the mean measures over the held-out views, and save the pictures."""

@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bbfit.checks import fail
+from bbfit.inputs import parse_json, reading
 
 if TYPE_CHECKING:  # importing torch would delay commands that do not need it
     from torch import Tensor
 
 PREFIX, PART = ".bbfit-", ".part"
 """How the names of temporary files start and end."""
+_LARGEST_JSON = 1 << 28
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
@@ -56,11 +58,14 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def read_json(name: str, path: Path) -> Any:
-    """Read a JSON file. If it is not valid, the message of the ``InputError`` calls the input ``name``."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # very long numbers and very deep lists raise them too
-        fail(name, f"{path} is not valid JSON ({error})", "remove the file or restore it")
+    """Read a JSON file. If it is not valid or too large, the message of the ``InputError`` calls the input ``name``."""
+    hint = "remove the file or restore it"
+    if path.exists() and not path.is_file():
+        fail(name, f"{path} is not a file", hint)
+    with reading(name, path, hint):
+        if (size := path.stat().st_size) > _LARGEST_JSON:
+            fail(name, f"{path} has {size:,} bytes, more than {_LARGEST_JSON:,}", hint)
+        return parse_json(name, path, path.read_bytes(), hint)
 
 
 def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.checks import fail
+from bbfit.inputs import parse_json
 
 _GLB_2 = struct.pack("<4sI", b"glTF", 2)
 
@@ -42,10 +43,7 @@ def gltf_parts(data: bytes, name: str = "model", path: str | Path = "the file") 
             chunks.setdefault(kind, data[start + 8 : start + 8 + size])
             start += 8 + size
         text, binary = chunks.get(b"JSON", b""), chunks.get(b"BIN\0", b"")
-    try:
-        content = json.loads(text)
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        fail(name, f"{path} is not a glTF ({error})", "get or export the file again")
+    content = parse_json(name, path, text, "get or export the file again", "a glTF")
     if not isinstance(content, dict):
         fail(name, f"{path} is not a glTF", "get or export the file again")
     return content, binary

@@ -2,60 +2,171 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import logging
+import re
+import struct
+import threading
+import warnings
 import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
 from scipy import ndimage
 from torch import Tensor
 
 from bbfit.checks import MissingFileError, check_shape, fail
 from bbfit.files import write_bytes
+from bbfit.inputs import InputLimits, reading
+
+_LIMITS = InputLimits()
+_AGAIN = "render or copy it again"
+# Headers of the formats that Pillow cannot read are shorter.
+_HEADER_BYTES = 1 << 16
+# The formats of textures and views. Pillow reads others by running other programs, or line by line.
+_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "DIB", "TGA", "SGI", "JPEG2000", "DDS", "PSD", "GIF", "PPM")
+logging.getLogger("PIL").addHandler(logging.NullHandler())  # what Pillow says of damaged files is in the errors that it raises
+# Channels of the kinds of PNG that have an alpha channel.
+_CHANNELS = {4: 2, 6: 4}
+# Guards a global limit of Pillow's.
+_PILLOW = threading.Lock()
 
 
-def read_rgba(path: str | Path) -> NDArray[np.uint8]:
+@dataclass(frozen=True)
+class PictureHeader:
+    """What the header of a picture says."""
+
+    width: int
+    """Width in pixels."""
+    height: int
+    """Height in pixels."""
+    alpha: bool
+    """Whether it has an alpha channel or a transparent color."""
+
+
+def picture_header(name: str, path: str | Path, limits: InputLimits, data: bytes | None = None) -> PictureHeader | None:
+    """Read the header of a picture, which is in ``data`` if given, and decode nothing. ``None`` for an unknown format.
+
+    Raises ``InputError`` with the input's ``name`` if the header is damaged, or announces more pixels than ``limits`` allow.
+    """
+    with reading(name, path, _AGAIN):
+        start = data[:_HEADER_BYTES] if data is not None else _start_of(Path(path))
+        size = _radiance_size(start) or _openexr_size(start)
+        header = PictureHeader(*size, alpha=False) if size else None
+        if header is None:
+            try:
+                with _opened(path if data is None else data) as picture:
+                    header = PictureHeader(*picture.size, "A" in picture.getbands() or "transparency" in picture.info)
+            except UnidentifiedImageError:
+                return None
+        limits.at_most("max_input_pixels", name, path, header.width * header.height, "pixels")
+        return header
+
+
+def _start_of(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(_HEADER_BYTES)
+
+
+@contextlib.contextmanager
+def _opened(source: str | Path | bytes) -> Iterator[Image.Image]:
+    """A picture of which only the header is read. Pillow's own limit of pixels and its warnings are off while it opens the file."""
+    with _PILLOW, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            picture = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=_FORMATS)
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
+    with picture:
+        yield picture
+
+
+def _radiance_size(start: bytes) -> tuple[int, int] | None:
+    """Width and height of a Radiance picture (.hdr)."""
+    found = re.search(rb"\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n", start) if start.startswith(b"#?") else None
+    return (int(found[2]), int(found[1])) if found else None
+
+
+def _openexr_size(start: bytes) -> tuple[int, int] | None:
+    """Width and height of an OpenEXR picture."""
+    at = start.find(b"dataWindow\0box2i\0") if start.startswith(b"\x76\x2f\x31\x01") else -1
+    if at < 0:
+        return None
+    left, top, right, bottom = struct.unpack_from("<4i", start, at + 21)
+    return max(right - left + 1, 0), max(bottom - top + 1, 0)
+
+
+def read_rgba(path: str | Path, limits: InputLimits = _LIMITS) -> NDArray[np.uint8]:
     """Read a straight-alpha PNG or WebP picture as uint8 [H, W, 4] RGBA; 16-bit files are reduced to 8 bits.
 
-    Raises ``MissingFileError`` or ``InputError`` if the file is missing, cut short, damaged, of another format, or has no alpha channel.
+    Raises ``MissingFileError`` or ``InputError`` if the file is missing, cut short, damaged, too large, of another format, or has no alpha
+    channel. Nothing is decoded before its size is known.
     """
     path = Path(path)
     if not path.is_file():
         raise MissingFileError(f"image: {path} does not exist; check the spelling or render the views again")
-    data = path.read_bytes()
-    png, webp = data.startswith(b"\x89PNG\r\n\x1a\n"), data[:4] == b"RIFF" and data[8:12] == b"WEBP"
-    if not png and not webp:  # OpenCV would premultiply a TIFF and return an EXR in linear light
-        fail("image", f"{path} is {'neither PNG nor WebP' if data else 'empty'}", "render or copy it again")
-    if png and not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
-        fail("image", f"{path} is cut short", "render or copy it again")
-    try:
-        image = cv2.imdecode(np.frombuffer(_essential(data) if png else data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:  # the header announces more pixels than OpenCV accepts
-        image = None
-    if image is None:
-        fail("image", f"{path} cannot be decoded", "render or copy it again")
-    if image.ndim != 3 or image.shape[2] != 4:
-        fail("image", f"{path} has no alpha channel", "give straight-alpha RGBA images")
+    limits.at_most("max_input_bytes", "image", path, path.stat().st_size, "bytes")
+    with reading("image", path, _AGAIN):
+        data = path.read_bytes()
+        png, webp = data.startswith(b"\x89PNG\r\n\x1a\n"), data[:4] == b"RIFF" and data[8:12] == b"WEBP"
+        if not png and not webp:  # OpenCV would premultiply a TIFF and return an EXR in linear light
+            fail("image", f"{path} is {'neither PNG nor WebP' if data else 'empty'}", _AGAIN)
+        if png and not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
+            fail("image", f"{path} is cut short", _AGAIN)
+        header = picture_header("image", path, limits, data)
+        if header is None:
+            fail("image", f"{path} cannot be read", _AGAIN)
+        if not header.alpha:
+            fail("image", f"{path} has no alpha channel", "give straight-alpha RGBA images")
+        image = _decoded_png(data) if png else _decoded_by_opencv(data)
     if image.dtype == np.uint16:
         image = np.rint(image / 257).astype(np.uint8)
-    return np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA))
+    return np.ascontiguousarray(image)
 
 
-def _essential(png: bytes) -> bytes:
-    """The chunks of a PNG file that its pixels depend on; nothing if one is damaged. libpng would print complaints about the others."""
-    kept, start, kind = [png[:8]], 8, b""
-    while kind != b"IEND":
-        kind, end = png[start + 4 : start + 8], start + 12 + int.from_bytes(png[start : start + 4], "big")
-        if end > len(png):
-            return b""
-        if kind in (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"):
-            if zlib.crc32(png[start + 4 : end - 4]) != int.from_bytes(png[end - 4 : end], "big"):
-                return b""
-            kept.append(png[start:end])
-        start = end
-    return b"".join(kept)
+def _decoded_png(data: bytes) -> NDArray[Any]:
+    """Pillow decodes every PNG, because OpenCV writes what is wrong with a damaged one to standard error.
+
+    Pillow discards half of 16 bits. OpenCV decodes those, after a check of all that it would complain about.
+    """
+    start, needed, pixels = 8, [data[8:33]], [b""]
+    while start + 12 <= len(data):  # Pillow does not compute the checksums of the pixels
+        kind, end = data[start + 4 : start + 8], start + 8 + int.from_bytes(data[start : start + 4], "big")
+        if kind.isupper() and zlib.crc32(data[start + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            raise ValueError("its checksum is wrong")
+        if kind == b"IDAT":
+            needed.append(data[start : end + 4])
+            pixels.append(data[start + 8 : end])
+        start = end + 4
+    with _opened(data) as picture:
+        picture.load()
+        if data[24] != 16:
+            return np.array(picture.convert("RGBA"))
+    width, height, _, color, *rest = struct.unpack(">IIBBBBB", data[16:29])
+    stride = 1 + width * 2 * _CHANNELS.get(color, 0)
+    inflate = zlib.decompressobj()
+    rows = inflate.decompress(b"".join(pixels), stride * height + 1)
+    if color not in _CHANNELS or any(rest) or max(width, height) >= 1 << 16:
+        raise ValueError("it has 16 bits, and is of a kind that cannot be read")
+    if len(rows) != stride * height or not inflate.eof or inflate.unused_data or max(rows[::stride]) > 4:
+        raise ValueError("its pixels are damaged")
+    return _decoded_by_opencv(data[:8] + b"".join(needed) + b"\0\0\0\0IEND\xaeB`\x82")
+
+
+def _decoded_by_opencv(data: bytes) -> NDArray[Any]:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 3 or image.shape[2] != 4:
+        raise ValueError("it cannot be decoded")
+    return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:

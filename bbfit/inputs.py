@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
+import json
 import os
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from bbfit.checks import Count, InputError, check_fields, check_folder, fail
 
+SMALLEST, LARGEST = 1e-4, 1e6
+"""Range of the size of a tree in meters. ``LARGEST`` also limits the distance of everything from the origin along each axis."""
 _LONGEST_REASON = 200
+_MOST_VALUES = 10_000_000  # of a JSON text; each takes up to a hundred bytes in memory
 _HINTS = {"tree": "export the tree as one .glb file, or ", "views": "copy the pictures into the folder of the views, or "}
 _ALLOW = "allow the other folder with --allow-folders"
 
@@ -84,3 +90,13 @@ def reading(name: str, path: str | Path, hint: str) -> Iterator[None]:
         text = "it needs more memory than there is" if isinstance(error, MemoryError) else getattr(error, "strerror", None) or str(error)
         reason = " ".join(text.split())[:_LONGEST_REASON] or type(error).__name__
         raise InputError(f"{name}: {path} cannot be read ({reason}); {hint}") from error
+
+
+def parse_json(name: str, path: str | Path, data: bytes, hint: str, kind: str = "valid JSON") -> Any:
+    """The value of a JSON text. If it is not ``kind``, the message of the ``InputError`` contains ``name``, ``path`` and ``hint``."""
+    if sum(data.count(mark) for mark in (b",", b"[", b"{")) > _MOST_VALUES:
+        fail(name, f"{path} has more than {_MOST_VALUES:,} values", hint)
+    try:
+        return json.loads(data.decode("utf-8-sig" if data.startswith(codecs.BOM_UTF8) else "utf-8"))
+    except (ValueError, RecursionError) as error:  # very long numbers and very deep lists raise them too
+        fail(name, f"{path} is not {kind} ({error})", hint)

@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from bbfit.checks import MissingFileError, fail
+from bbfit.checks import MissingFileError, check_range, fail
 from bbfit.files import read_json, write_json
 from bbfit.geometry.camera import Camera, camera_from_nerf, camera_to_nerf, pinhole_intrinsics
+from bbfit.inputs import LARGEST, InputLimits, reading
 
+_LIMITS = InputLimits()
 TRAIN_FILE, TEST_FILE, SINGLE_FILE = "transforms_train.json", "transforms_test.json", "transforms.json"
 REQUEST_FILE = "views.json"
 """File beside the transforms in which ``bbfit views`` records its options and facts about the tree."""
@@ -26,6 +28,14 @@ CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "ORTHOGRAPHIC")
 """Values of ``camera_model`` that are read; with OPENCV the distortion coefficients must be zero."""
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 TEST_SHARE = 0.25
+_EXPECTED = "expected the NeRF-synthetic layout"
+_PICTURES = (".png", ".webp", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
+# The entries that are read, of a file or of a frame.
+_HEADER = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_model", *_DISTORTION)
+# Least and greatest focal length in sizes of the picture: views of 0.3 millimeters to 3000 kilometers, or of 179.9 to 0.00002 degrees.
+_FOCAL_LENGTHS = (1e-6, 1e7)
+# How far the principal point may lie outside the picture, in sizes of the picture.
+_FARTHEST_CENTER = 10.0
 # Accepted deviation of a camera's axes from orthonormal; many files have four decimals.
 RIGID_TOLERANCE = 1e-3
 
@@ -77,54 +87,59 @@ class Frame:
     """The file's entries with the frame's own ones over them."""
 
 
-def read_frames(folder: Path) -> tuple[list[Frame], list[Frame] | None]:
+def read_frames(folder: Path, limits: InputLimits = _LIMITS) -> tuple[list[Frame], list[Frame] | None]:
     """Training and test frames of a views folder; ``None`` for the test frames where the folder names none.
 
     ``transforms.json`` alone (nerfstudio) is split by the ``test_filenames`` in it; without those, it and a training file alone are
-    read as one list.
+    read as one list. Raises ``InputError`` if the files are damaged, or name pictures outside of the folder and the allowed folders.
     """
     for name in (TRAIN_FILE, SINGLE_FILE):
         if (folder / name).is_file():
-            train = _read_file(folder / name)
+            train, held_out = _read_file(folder / name, limits)
             if (folder / TEST_FILE).is_file():
-                return train, _read_file(folder / TEST_FILE)
-            held_out = train[0].header.get("test_filenames") if train else None
-            if not isinstance(held_out, list) or not held_out:
+                return train, _read_file(folder / TEST_FILE, limits)[0]
+            if not held_out:
                 return train, None
             test = [frame for frame in train if frame.header["file_path"] in held_out]
-            return [frame for frame in train if frame not in test], test
+            return [frame for frame in train if frame.header["file_path"] not in held_out], test
     raise MissingFileError(f"views: {folder} has no {TRAIN_FILE} or {SINGLE_FILE}; give a folder that bbfit views wrote")
 
 
-def _read_file(path: Path) -> list[Frame]:
+def _read_file(path: Path, limits: InputLimits) -> tuple[list[Frame], set[str]]:
+    """The frames of a transforms file, and the pictures that it holds out."""
     content = read_json("views", path)
-    if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
-        fail("views", f"{path} has no list of frames", "expected the NeRF-synthetic layout")
-    header = {key: value for key, value in content.items() if key != "frames"}
-    frames = []
-    for index, entry in enumerate(content["frames"]):
-        if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-            fail("views", f"frame {index} of {path} has no file_path", "expected the NeRF-synthetic layout")
-        matrix = _matrix(entry.get("transform_matrix"))
-        if matrix is None:
-            fail("views", f"frame {index} of {path} has no rigid 4x4 transform_matrix", "expected the NeRF-synthetic layout")
-        image = path.parent / entry["file_path"]
-        if image.suffix.lower() not in (".png", ".webp", ".jpg", ".jpeg", ".tif", ".tiff", ".exr"):
-            image = image.with_name(image.name + ".png")
-        frames.append(Frame(image, matrix, header | {k: v for k, v in entry.items() if k != "transform_matrix"}))
-    return frames
+    with reading("views", path, _EXPECTED), np.errstate(all="ignore"):
+        if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
+            fail("views", f"{path} has no list of frames", _EXPECTED)
+        limits.at_most("max_input_frames", "views", path, len(content["frames"]), "views")
+        header, frames, known = {key: content[key] for key in _HEADER if key in content}, [], dict[str, Path]()
+        for index, entry in enumerate(content["frames"]):
+            if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+                fail("views", f"frame {index} of {path} has no file_path", _EXPECTED)
+            matrix = _matrix(entry.get("transform_matrix"))
+            if matrix is None:
+                fail("views", f"frame {index} of {path} has no rigid 4x4 transform_matrix in meters", _EXPECTED)
+            reference = entry["file_path"]
+            if reference not in known:
+                ending = "" if Path(reference).suffix.lower() in _PICTURES else ".png"
+                known[reference] = limits.referenced("views", path, reference + ending, path.parent)
+            own = {key: entry[key] for key in ("file_path", *_HEADER) if key in entry}
+            frames.append(Frame(known[reference], matrix, header | own))
+        held_out = content.get("test_filenames")
+        return frames, {name for name in held_out if isinstance(name, str)} if isinstance(held_out, list) else set()
 
 
 def _matrix(value: Any) -> list[list[float]] | None:
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     if array.shape != (4, 4) or not np.isfinite(array).all():
         return None
     rotation = array[:3, :3]
     rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=RIGID_TOLERANCE) and np.linalg.det(rotation) > 0
-    return array.tolist() if rigid and np.allclose(array[3], (0, 0, 0, 1)) else None
+    near = (np.abs(array[:3, 3]) <= LARGEST).all()
+    return array.tolist() if rigid and near and np.allclose(array[3], (0, 0, 0, 1)) else None
 
 
 def cameras_of(frames: list[Frame], width: int, height: int) -> Camera:
@@ -154,9 +169,14 @@ def _intrinsics(frame: Frame, width: int, height: int) -> torch.Tensor:
                 dtype=torch.float64,
             )
         else:
-            intrinsics = pinhole_intrinsics(math.degrees(float(header["camera_angle_x"])), width, height)
-        if intrinsics.isfinite().all() and intrinsics[0, 0] > 0 and intrinsics[1, 1] > 0:
+            angle = float(header["camera_angle_x"])
+            check_range("camera_angle_x", angle, 0, math.pi, open_low=True, open_high=True)
+            intrinsics = pinhole_intrinsics(math.degrees(angle), width, height)
+        sizes = torch.tensor([width, height], dtype=torch.float64)
+        focal, center = intrinsics.diagonal()[:2] / sizes, intrinsics[:2, 2] / sizes
+        low, high = _FOCAL_LENGTHS
+        if ((focal >= low) & (focal <= high) & (center.abs() <= _FARTHEST_CENTER)).all():  # NaN is not
             return intrinsics
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+    except (KeyError, TypeError, ValueError, ArithmeticError):
         pass
     fail("views", f"{frame.image.parent.parent}: the camera has neither a usable fl_x nor camera_angle_x", "add one of them")

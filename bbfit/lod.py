@@ -8,13 +8,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from bbfit.blender.requirements import check_blender
-from bbfit.checks import check_output_file, fail
+from bbfit.checks import check_output_file, check_record, fail
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import read_json, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_per_meter
+from bbfit.inputs import reading
 from bbfit.outputs import claimed_folder, used_folder
 from bbfit.pipeline import RunConfig, RunResult, needs_blender, run
 from bbfit.provenance import digest_file
@@ -104,7 +105,7 @@ def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: R
     record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
     record.check({"join": _outputs(out, folder)} | ({"convert": (ORIGINAL,)} if _converts(tree, config) else {}))
     record.run(views_stage(folder, tree, stages.views), on_progress)
-    views = ViewDataset.load(folder / "views")
+    views = ViewDataset.load(folder / "views", limits=stages.limits)
     original = _original(record, tree, config, on_progress) if config.original else None
     stages = replace(stages, tree=tree.path if tree.is_mesh else None)
     runs = [_fitted(folder, stages, planes, on_progress) for planes in config.planes]
@@ -112,8 +113,11 @@ def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: R
     if export.textures is None:
         export = replace(export, textures="auto")  # distant levels need mip levels
     record.run(_join_stage(folder, out, original, runs, views, config, export), on_progress)
-    levels = read_json("levels of detail", folder / "lod.json")["levels"]
-    return LodResult(out, folder, tuple(LodLevel(**level) for level in levels))
+    stored = read_json("levels of detail", folder / "lod.json")
+    with reading("levels of detail", folder / "lod.json", "remove it, then start bbfit lod again"):
+        levels = tuple(LodLevel(**level) for level in stored["levels"])
+        check_record("levels", levels, tuple[LodLevel, ...])
+    return LodResult(out, folder, levels)
 
 
 def _join_stage(

@@ -83,6 +83,10 @@ class RunConfig:
             views would not suffice for the fit.
         """
         self.export.check()
+        self.limits.check()
+        if rendered:
+            self.limits.at_most("max_input_pixels", "size", "a view", self.views.size**2, "pixels")
+            self.limits.at_most("max_input_frames", "count", "the tree", self.views.count, "views")
         if self.budget.given:
             check_budget(self.fit, self.budget)
         else:
@@ -210,7 +214,7 @@ def prepare(
     elif config.species is not None or replace(config.grow, seed=0) != RunConfig().grow:
         fail("run", f"{path} is given, so no tree is grown", "omit the species and the options for growing")
     elif views_folder is not None:
-        views = ViewDataset.load(views_folder, seed=config.fit.seed)
+        views = ViewDataset.load(views_folder, seed=config.fit.seed, limits=config.limits)
         mesh = None if config.tree is None else TreeFile.open(config.tree, config.limits)
         if mesh is not None:
             mesh.check_is_mesh()
@@ -243,7 +247,7 @@ def _record(out: str | Path, head: dict[str, Any], config: RunConfig, inputs: It
 def _rendered(record: Record, tree: TreeFile, config: RunConfig, on_progress: OnProgress) -> Prepared:
     """Render the views of a run's tree."""
     record.run(views_stage(record.folder, tree, config.views), on_progress)
-    views = ViewDataset.load(record.folder / "views")
+    views = ViewDataset.load(record.folder / "views", limits=config.limits)
     views.check()
     return Prepared(record, tree if tree.is_mesh else None, views)
 

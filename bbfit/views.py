@@ -13,15 +13,16 @@ from typing import Any
 import torch
 from cachetools import LRUCache, cached
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputTypeError, MissingFileError, check_folder, check_shape, fail
 from bbfit.geometry.camera import Camera
-from bbfit.images import premultiply, read_rgba, to_bytes
+from bbfit.images import picture_header, premultiply, read_rgba, to_bytes
+from bbfit.inputs import InputLimits
 from bbfit.layout import REQUEST_FILE, Frame, cameras_of, read_frames, split_views
 
+_LIMITS = InputLimits()
 CACHE_BYTES = 3 << 29
 """Most bytes of decoded pictures that a dataset keeps in memory; it drops the least recently used ones first."""
 
@@ -97,8 +98,11 @@ class ViewSet:
         """SHA-256 over the cameras and the pictures' pixels: equal for equal views, wherever they lie and however they were packed."""
         digest = sha256(repr((self.cameras.width, self.cameras.height, self.cameras.orthographic)).encode())
         digest.update(self.cameras.world_to_camera.numpy().tobytes() + self.cameras.intrinsics.numpy().tobytes())
-        for index in range(len(self)):
-            digest.update(sha256(self.image(index).numpy().tobytes()).digest())
+        pictures = dict[Path, bytes]()  # several views may show one picture
+        for index, path in enumerate(self.paths):
+            if path not in pictures:
+                pictures[path] = sha256(self.image(index).numpy().tobytes()).digest()
+            digest.update(pictures[path])
         return digest.hexdigest()
 
     def shows(self, index: int) -> bool:
@@ -111,7 +115,7 @@ class ViewSet:
         Raises the errors of :meth:`image`, and ``InputError`` if all pictures are fully transparent, unless they may be.
         """
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # each thread keeps memory of its own
-            shown = list(pool.map(self.shows, range(len(self))))
+            shown = list(pool.map(self.shows, {path: index for index, path in enumerate(self.paths)}.values()))
         if not any(shown) and not may_be_empty:
             fail(
                 "views",
@@ -137,7 +141,7 @@ class ViewDataset:
     """The request that ``bbfit views`` recorded in ``views.json``; ``None`` for views from elsewhere."""
 
     @staticmethod
-    def load(folder: str | Path, *, seed: int = 0, cache_bytes: int = CACHE_BYTES) -> ViewDataset:
+    def load(folder: str | Path, *, seed: int = 0, cache_bytes: int = CACHE_BYTES, limits: InputLimits = _LIMITS) -> ViewDataset:
         """Read a folder of views: bbfit's own, any NeRF-synthetic scene, or one with nerfstudio's intrinsics.
 
         Of bbfit's own pictures some may be fully transparent: a flat tree is invisible to a camera that sees it edge-on.
@@ -150,20 +154,23 @@ class ViewDataset:
             Seed of the random quarter that becomes the test split if the folder has none.
         cache_bytes
             Most bytes of decoded pictures that stay in memory.
+        limits
+            How many views and pixels there may be, and in which folders besides ``folder`` pictures may lie.
 
         Raises
         ------
         MissingFileError, InputError
             If there are no transforms, no usable camera, too few views, or pictures missing, unreadable, without alpha or of unequal size.
+            If a picture lies outside of the allowed folders, or something exceeds the limits.
         """
         folder = check_folder("views", folder)
-        train, test = read_frames(folder)
+        train, test = read_frames(folder, limits)
         if test is None and len(train) >= 2:
             train_indices, test_indices = split_views(len(train), seed)
             train, test = [train[i] for i in train_indices], [train[i] for i in test_indices]
         if not train or not test:
             fail("views", f"{folder} has {len(train)} training and {len(test or [])} test views", "at least one of each is needed")
-        width, height = _common_size([*train, *test])
+        width, height = _common_size([*train, *test], limits)
         _check_size("views", f"pictures in {folder}", width, height)
 
         request = ViewsRequest.load(folder / REQUEST_FILE) if (folder / REQUEST_FILE).is_file() else None
@@ -171,7 +178,7 @@ class ViewDataset:
 
         @cached(LRUCache(cache_bytes, getsizeof=Tensor.numel), lock=threading.Lock())
         def read(path: Path) -> Tensor:
-            picture = torch.from_numpy(read_rgba(path))
+            picture = torch.from_numpy(read_rgba(path, limits))
             if not own and not picture[..., 3].any():
                 fail("views", f"{path} is fully transparent", "render it anew or take it out of the transforms file")
             return picture
@@ -236,19 +243,18 @@ def _check_size(name: str, pictures: str, width: int, height: int) -> None:
         fail(name, f"{pictures} have {width}x{height} pixels", f"give at least {LEAST_PIXELS}x{LEAST_PIXELS}")
 
 
-def _common_size(frames: list[Frame]) -> tuple[int, int]:
+def _common_size(frames: list[Frame], limits: InputLimits) -> tuple[int, int]:
     """Width and height that all pictures share; only headers are read."""
     first: tuple[Path, tuple[int, int]] | None = None
-    for path in (frame.image for frame in frames):
+    for path in dict.fromkeys(frame.image for frame in frames):
         if not path.is_file():
             raise MissingFileError(f"views: {path} does not exist; render the views anew or take it out of the transforms file")
-        try:
-            with Image.open(path) as picture:
-                size, bands = picture.size, picture.getbands()
-        except (UnidentifiedImageError, OSError):
+        header = picture_header("views", path, limits)
+        if header is None:
             fail("views", f"{path} is damaged or no picture", "render or copy it anew")
-        if "A" not in bands and "transparency" not in picture.info:
+        if not header.alpha:
             fail("views", f"{path} has no alpha channel", "give straight-alpha RGBA images")
+        size = header.width, header.height
         if first is None:
             first = path, size
         elif size != first[1]:

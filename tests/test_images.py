@@ -73,9 +73,9 @@ def test_damaged_pictures_are_refused_by_name(tmp_path: Path) -> None:
         (b"no picture at all", "neither PNG nor WebP"),
         (good[:-1], "is cut short"),
         (good[: len(good) // 2], "is cut short"),
-        (good[:300] + good[600:], "cannot be decoded"),
-        (bytes(flipped), "cannot be decoded"),
-        (bytes(huge), "cannot be decoded"),
+        (good[:300] + good[600:], "cannot be read"),
+        (bytes(flipped), "cannot be read"),
+        (bytes(huge), "has 10,000,000,000 pixels, more than the limit"),
     ):
         path.write_bytes(data)
         with pytest.raises(InputError, match=rf"^image: .*r_0\.png {message}|r_0\.png is {message}"):

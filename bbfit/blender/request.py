@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import check_file, fail
 from bbfit.files import read_json, write_json
+from bbfit.images import picture_header
+from bbfit.inputs import LARGEST, InputLimits, reading
 from bbfit.provenance import VERSIONS, identity, installed_version
 from bbfit.tree_files.tree_file import TreeFile
+
+# Most pixels of a panorama, which are more than those of a texture: 23170 x 11585.
+_PANORAMA = 1 << 28
+_UNLIMITED = InputLimits(max_input_pixels=1 << 62)
 
 
 @dataclass(frozen=True)
@@ -61,9 +68,14 @@ class ViewsRequest:
 
     @staticmethod
     def of(tree: TreeFile, config: ViewsConfig) -> ViewsRequest:
-        """The request for views of a tree before rendering. Raises ``MissingFileError`` if the configuration's panorama does not exist."""
+        """The request for views of a tree before rendering. Raises ``InputError`` if a panorama does not exist or is too large."""
         if config.hdri is not None:
-            config = replace(config, hdri=check_file("hdri", config.hdri))
+            panorama = check_file("hdri", config.hdri)
+            header = picture_header("hdri", panorama, _UNLIMITED)
+            if header is not None and header.width * header.height > _PANORAMA:
+                pixels = f"{header.width} x {header.height} pixels"
+                fail("hdri", f"{panorama} has {pixels}, more than {_PANORAMA:,}", "reduce it; 8192 x 4096 are enough for any light")
+            config = replace(config, hdri=panorama)
         known = RenderedTree(tree.path.name, tree.digest, tree.bytes, tree.up_axis)
         return ViewsRequest(identity(config), known, bbfit=installed_version("bbfit") or "unknown")
 
@@ -76,19 +88,8 @@ class ViewsRequest:
         content = read_json("views", path)
         if not isinstance(content, dict) or not isinstance(content.get("tree"), dict):
             return None
-        kinds = {"name": str, "sha256": str, "bytes": int, "up_axis": str, "vertices": int, "faces": int, "bounds": list}
-        facts: dict[str, Any] = {name: value for name, kind in kinds.items() if isinstance(value := content["tree"].get(name), kind)}
-        types = {"version": int, "bbfit": str, "blender": str, "camera": dict, "cameras": dict, "clips": list, "complete": bool}
-        known: dict[str, Any] = {"version": 1}  # files from before there was a version
-        known |= {name: value for name, kind in types.items() if isinstance(value := content.get(name), kind)}
-        config = content.get("config")
-        seconds = content.get("seconds")
-        return ViewsRequest(
-            identity(config) if isinstance(config, dict) else {},
-            RenderedTree(**facts),
-            **known,
-            seconds=float(seconds) if isinstance(seconds, int | float) else 0.0,
-        )
+        with reading("views", path, "remove the file or restore it"):
+            return _request(content)
 
     def save(self, path: Path) -> None:
         """Write the request. Unknown values are omitted."""
@@ -118,6 +119,32 @@ class ViewsRequest:
             if getattr(earlier, name) != getattr(self, name):
                 fail("out", f"{folder} contains pictures with other {name}", hint)
         return earlier
+
+
+def _request(content: dict[str, Any]) -> ViewsRequest:
+    """The request in the JSON of a file."""
+    tree = content["tree"]
+    facts: dict[str, Any] = {name: tree[name] for name in ("name", "sha256", "up_axis") if isinstance(tree.get(name), str)}
+    facts |= {name: tree[name] for name in ("bytes", "vertices", "faces") if _is_number(tree.get(name), 1 << 62, int)}
+    bounds = tree.get("bounds")
+    if isinstance(bounds, list) and [len(corner) for corner in bounds if isinstance(corner, list)] == [3, 3]:
+        low, high = bounds
+        if all(_is_number(value, LARGEST) for value in (*low, *high)) and all(map(operator.le, low, high)):
+            facts["bounds"] = bounds
+    types = {"version": int, "bbfit": str, "blender": str, "camera": dict, "cameras": dict, "clips": list, "complete": bool}
+    known: dict[str, Any] = {"version": 1}  # files from before there was a version
+    known |= {name: value for name, kind in types.items() if isinstance(value := content.get(name), kind)}
+    config, seconds = content.get("config"), content.get("seconds")
+    return ViewsRequest(
+        identity(config) if isinstance(config, dict) else {},
+        RenderedTree(**facts),
+        **known,
+        seconds=float(seconds) if _is_number(seconds, 1e12) and seconds >= 0 else 0.0,
+    )
+
+
+def _is_number(value: Any, most: float, kind: Any = int | float) -> TypeGuard[float]:
+    return isinstance(value, kind) and not isinstance(value, bool) and -most <= value <= most
 
 
 def _shown(value: Any) -> str:

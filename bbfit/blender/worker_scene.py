@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+# The limits of a tree's size and place in meters, as in bbfit.inputs.
+SMALLEST, LARGEST = 1e-4, 1e6
 # Objects with a surface. Lights, cameras, volumes and hair of the file are not rendered.
 SURFACES = {"MESH", "CURVE", "SURFACE", "META", "FONT"}
 UNRENDERED = {"LIGHT", "LIGHT_PROBE", "VOLUME", "CURVES", "POINTCLOUD", "GREASEPENCIL", "GPENCIL"}
@@ -155,7 +157,19 @@ def measure(path: str) -> tuple[np.ndarray, int]:
     check_finite(path, points)
     if area == 0 or not np.ptp(points, axis=0).any():
         raise InputRefused("tree", f"{path} has zero size", "export the tree again, at its real size")
+    check_extent(path, points)
     return points.astype(np.float32), faces
+
+
+def check_extent(path: str, points: np.ndarray) -> None:
+    """Refuse trees that are too far from the origin, too large or too small for pictures of them to mean anything."""
+    farthest, size = np.abs(points).max(), np.ptp(points, axis=0).max()
+    if farthest > LARGEST:
+        raise InputRefused(
+            "tree", f"{path} reaches {farthest:.3g} meters from the origin, more than {LARGEST:g}", "export the tree in meters"
+        )
+    if size < SMALLEST:
+        raise InputRefused("tree", f"{path} is smaller than {SMALLEST:g} meters", "export the tree again, at its real size")
 
 
 def measure_mesh(evaluated: Any) -> tuple[np.ndarray, int, float]:

@@ -208,8 +208,8 @@ def evaluate_command(
 
     export.check()
     out = check_output_file("out", out or cloud.with_name("metrics.json"))
-    billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views)
-    mesh = None if tree is None else TreeFile.open(tree)
+    billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views, limits=limits)
+    mesh = None if tree is None else TreeFile.open(tree, limits)
     original = original_tree(dataset, mesh)
     dataset.test.check(may_be_empty=True)
     earlier = cloud.with_name("metrics.json")

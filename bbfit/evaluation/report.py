@@ -7,9 +7,10 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from bbfit.checks import check_file, fail
+from bbfit.checks import check_file, check_record
 from bbfit.files import read_json, write_json
 from bbfit.geometry.alpha import AlphaMode
+from bbfit.inputs import reading
 
 RING_GAP = 1.0
 """Smallest difference in degrees between the elevations of two rings of views."""
@@ -213,7 +214,7 @@ class Report:
         """
         path = check_file("metrics", path)
         content = read_json("metrics", path)
-        try:
+        with reading("metrics", path, "expected a metrics.json that bbfit evaluate wrote"):
             vertices, sizes = (Cost(content[name]["model"], content[name]["original"]) for name in ("vertices", "bytes"))
             alpha = AlphaMode(content["alpha"]["mode"], content["alpha"]["cutoff"])
             scores = tuple(
@@ -221,9 +222,11 @@ class Report:
                 for view in content["views"]
             )
             afar = tuple(SizeScore(**size) for size in content["sizes"])
-            return Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar)
-        except (KeyError, TypeError, ValueError):
-            fail("metrics", f"{path} is not a report", "expected a metrics.json that bbfit evaluate wrote")
+            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar)
+            if not scores:
+                raise ValueError("it has no views")
+            check_record("report", report, Report)
+            return report
 
 
 def mean_measures(views: Sequence[ViewScore]) -> Measures:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bbfit.checks import InputTypeError
+from bbfit.checks import InputError, InputTypeError, check_range, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
 from bbfit.fitting.config import FitConfig, ResolvedFit
@@ -30,6 +30,7 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.images import bleed_color
+from bbfit.inputs import reading
 from bbfit.provenance import cache_key
 from bbfit.scratch import named_in_utf8
 from bbfit.tree_files.tree_file import TreeFile
@@ -37,6 +38,9 @@ from bbfit.views import ViewDataset
 
 # Prefixes of the tensors of two clouds in a checkpoint.
 _START, _PLACEMENT = "start.", "found."
+_ANEW = "remove it to start the fit anew"
+# More texels in a checkpoint than any fit has.
+_MOST_TEXELS = 1 << 28
 # Fraction of the steps at full resolution during which a mask hardens.
 _HARDENING = 0.3
 
@@ -127,7 +131,7 @@ def fit(
         If the mesh is missing.
     InputError
         If a view cannot be read, all are empty, or they look along one line. If the mesh is not of the tree that the views show, or the
-        device is not available.
+        device is not available. If the result is not finite.
     """
     if not isinstance(views, ViewDataset):
         raise InputTypeError(f"views: expected a ViewDataset, got {views!r}; ViewDataset.load(folder) reads one")
@@ -139,7 +143,7 @@ def fit(
     tree_file = None if tree is None or config.placement == "even" else TreeFile.open(tree)
     key = cache_key("fit", *fit_inputs(views, config, tree_file))
     checkpoint = Path(checkpoint) if checkpoint is not None else None
-    state = _load(checkpoint, key) if checkpoint is not None else None
+    state = _load(checkpoint, key, config.steps) if checkpoint is not None else None
     if state is None:
         state = _initial_state(views, config, tree_file, on_place)
         if checkpoint is not None and state.placement is not None:
@@ -159,7 +163,8 @@ def fit(
         del cloud  # the stepper has its own copy of the texels, which can take hundreds of megabytes
         fitted = None
         if state.tensors and len(losses) > level.begin:
-            stepper.restore(state.tensors, len(losses) - level.begin)
+            with reading("checkpoint", checkpoint or "", _ANEW):
+                stepper.restore(state.tensors, len(losses) - level.begin)
         for index in range(len(losses), level.end):
             rate = learning_rate(config, index)
             placement_learning_rate = config.placement_learning_rate * rate / config.learning_rate
@@ -182,6 +187,10 @@ def fit(
     fitted = fitted.with_texels(torch.cat(bled))
     if config.placement != "even" or config.placement_learning_rate:
         fitted = trimmed(fitted)
+    try:
+        fitted.check()
+    except InputError as error:
+        fail("fit", f"the result cannot be used ({error})", "check the pictures, the cameras and the size of the tree, or lower the rates")
     return FitResult(fitted, losses, config, time.perf_counter() - started)
 
 
@@ -277,25 +286,38 @@ def _save(path: Path, key: str, state: _FitState) -> None:
     write_tensors(path, tensors, {"fit": key, "seconds": repr(state.seconds)})
 
 
-def _load(path: Path, key: str) -> _FitState | None:
-    """Read a checkpoint, or return ``None`` if the file does not contain one of this fit."""
-    from safetensors import SafetensorError, safe_open
-
-    if not path.is_file():
-        return None
+def _load(path: Path, key: str, steps: int) -> _FitState | None:
+    """Read a checkpoint, or return ``None`` if the file does not contain one of this fit, or is damaged."""
     try:
+        return _read_checkpoint(path, key, steps) if path.is_file() else None
+    except InputError:
+        return None
+
+
+def _read_checkpoint(path: Path, key: str, steps: int) -> _FitState | None:
+    from safetensors import safe_open
+
+    with reading("checkpoint", path, _ANEW):
         with named_in_utf8(path) as named, safe_open(named, framework="pt") as file:
             metadata = file.metadata() or {}
             if metadata.get("fit") != key:
                 return None
             tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except SafetensorError:
-        return None
-    parts = {
-        prefix: {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
-        for prefix in (_START, _PLACEMENT)
-    }
-    texels = parts[_START]["texture_sizes"].prod(-1) * (1 + parts[_START]["two_sided"].long())
-    start = BillboardCloud(**parts[_START], texels=torch.zeros(1, 4).expand(int(texels.sum()), 4))
-    placement = BillboardCloud(**parts[_PLACEMENT]) if parts[_PLACEMENT] else None
-    return _FitState(tensors.pop("losses").tolist(), start, placement, tensors, float(metadata["seconds"]))
+        if not all(tensor.isfinite().all() for tensor in tensors.values()):
+            fail("checkpoint", f"{path} has values that are not finite", _ANEW)
+        parts = {
+            prefix: {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
+            for prefix in (_START, _PLACEMENT)
+        }
+        texels = int((parts[_START]["texture_sizes"].double().prod(-1) * (1 + parts[_START]["two_sided"].long())).sum())
+        if texels > _MOST_TEXELS:
+            fail("checkpoint", f"{path} has {texels:,} texels", _ANEW)
+        start = BillboardCloud(**parts[_START], texels=torch.zeros(1, 4).expand(texels, 4))
+        placement = BillboardCloud(**parts[_PLACEMENT]) if parts[_PLACEMENT] else None
+        for cloud in (start, placement):
+            if cloud is not None:
+                cloud.check_rectangles()
+        losses, seconds = list(tensors.pop("losses").double().tolist()), float(metadata["seconds"])
+        check_range("seconds", seconds, 0, math.inf)
+        check_range("steps", len(losses), 0, steps)
+        return _FitState(losses, start, placement, tensors, seconds)

@@ -82,7 +82,10 @@ class Stepper:
         return self.state.tensors() | (self._movement.tensors() if self._movement else {})
 
     def restore(self, tensors: dict[str, Tensor], steps: int) -> None:
-        """Continue from what :meth:`tensors` returned after ``steps`` steps."""
+        """Continue from what :meth:`tensors` returned after ``steps`` steps. ``ValueError``: it was another stepper."""
+        own = self.tensors()
+        if any(name not in tensors or tensors[name].shape != own[name].shape or tensors[name].dtype != own[name].dtype for name in own):
+            raise ValueError("its tensors are not those of this fit")
         self.state, self.steps = self.state.restored({name: tensors[name] for name in self.state.tensors()}), steps
         if self._movement:
             self._movement.restore(tensors)

@@ -13,11 +13,14 @@ from torch import Tensor
 
 from bbfit.checks import InputError, check_choice, check_count, check_file, check_shape, fail
 from bbfit.geometry.alpha import AlphaMode
+from bbfit.inputs import LARGEST, reading
 from bbfit.scratch import named_in_utf8
 
 FORMAT = "bbfit billboard cloud 1"
 TENSORS = ("centers", "rights", "ups", "half_extents", "texture_sizes", "two_sided", "texels")
 """Names of a cloud's tensors."""
+_EXPECTED = "expected a file written by bbfit fit"
+_UNIT_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class BillboardCloud:
         check_shape("texture_sizes", tuple(self.texture_sizes.shape), (n, 2))
         check_shape("two_sided", tuple(self.two_sided.shape), (n,))
         if self.texture_sizes.dtype != torch.int64 or (self.texture_sizes < 1).any():
-            fail("texture_sizes", f"expected int64 values of at least 1, got {self.texture_sizes.dtype} {self.texture_sizes.tolist()}")
+            fail("texture_sizes", f"expected int64 values of at least 1, got {self.texture_sizes.dtype}")
         check_choice("two_sided's dtype", self.two_sided.dtype, (torch.bool,))
         check_shape("texels", tuple(self.texels.shape), (sum(self._texel_counts), 4))
 
@@ -126,10 +129,38 @@ class BillboardCloud:
         tensors = {name: torch.cat([getattr(cloud, name) for cloud in clouds]) for name in TENSORS}
         return BillboardCloud(**tensors, alpha=clouds[0].alpha)
 
+    def check(self) -> None:
+        """Require what every finished cloud is: of floats, within a sane distance of the origin, of unit axes, and of texels in [0, 1].
+
+        Raises ``InputError`` with the name of the tensor that is not.
+        """
+        self.check_rectangles()
+        check_choice("texels's dtype", self.texels.dtype, (self.centers.dtype,))
+        if not ((self.texels >= 0) & (self.texels <= 1)).all():  # NaN is neither
+            fail("texels", "expected values in [0, 1]")
+
+    def check_rectangles(self) -> None:
+        """The part of :meth:`check` that does not look at the texels."""
+        vectors = {name: getattr(self, name) for name in ("centers", "rights", "ups", "half_extents")}
+        for name, tensor in vectors.items():
+            check_choice(f"{name}'s dtype", tensor.dtype, (torch.float32, torch.float64) if name == "centers" else (self.centers.dtype,))
+            if not tensor.isfinite().all():
+                fail(name, "expected finite values")
+        if (self.centers.abs() > LARGEST).any():
+            fail("centers", f"expected at most {LARGEST:g} meters from the origin")
+        if ((self.half_extents <= 0) | (self.half_extents > LARGEST)).any():
+            fail("half_extents", f"expected more than 0 and at most {LARGEST:g} meters")
+        for name in ("rights", "ups"):
+            if ((vectors[name].double().norm(dim=-1) - 1).abs() > _UNIT_TOLERANCE).any():
+                fail(name, "expected unit vectors")
+        if ((self.rights.double() * self.ups.double()).sum(-1).abs() > _UNIT_TOLERANCE).any():
+            fail("ups", "expected vectors perpendicular to rights")
+
     def save(self, path: str | Path) -> None:
-        """Write one ``.safetensors`` file, completely or not at all."""
+        """Write one ``.safetensors`` file, completely or not at all. Raises the errors of :meth:`check`: it writes nothing damaged."""
         from bbfit.files import write_tensors
 
+        self.check()
         tensors = {name: getattr(self, name).detach().cpu().clone(memory_format=torch.contiguous_format) for name in TENSORS}
         alpha = json.dumps({"kind": self.alpha.kind, "cutoff": self.alpha.cutoff})
         write_tensors(path, tensors, {"format": f"{FORMAT} {alpha}"})  # in one entry, because the order of several is not defined
@@ -141,28 +172,27 @@ class BillboardCloud:
         Raises
         ------
         MissingFileError, InputError
-            If the file is missing, empty, not a billboard cloud or damaged.
+            If the file is missing, empty, not a billboard cloud or damaged, or holds values that no cloud has (:meth:`check`).
         """
-        from safetensors import SafetensorError, safe_open
+        from safetensors import safe_open
 
         if (inside := Path(path) / "cloud.safetensors").is_file():  # a run's folder
             fail("cloud", f"{path} is a folder", f"give the file {inside}")
         path = check_file("cloud", path)
         if path.suffix.lower() in (".glb", ".gltf", ".obj"):
             fail("cloud", f"{path} is a model", "give the cloud.safetensors of its run")
-        try:
+        with reading("cloud", path, _EXPECTED):
             with named_in_utf8(path) as named, safe_open(named, framework="pt") as file:
                 form = (file.metadata() or {}).get("format", "")
-                known = form == FORMAT or form.startswith(f"{FORMAT} ")
-                tensors = {name: file.get_tensor(name) for name in TENSORS} if known else {}
-            if tensors:
-                for name, tensor in tensors.items():
-                    if not tensor.isfinite().all():
-                        fail(name, "expected finite values")
-                return BillboardCloud(**tensors, alpha=AlphaMode(**json.loads(form[len(FORMAT) :] or "{}")))
-        except (SafetensorError, InputError, TypeError, json.JSONDecodeError) as error:
-            fail("cloud", f"{path} is damaged ({error})", "expected a file written by bbfit fit")
-        fail("cloud", f"{path} is not a billboard cloud", "expected a file written by bbfit fit")
+                if form != FORMAT and not form.startswith(f"{FORMAT} "):
+                    fail("cloud", f"{path} is not a billboard cloud", _EXPECTED)
+                tensors = {name: file.get_tensor(name) for name in TENSORS}
+            try:
+                cloud = BillboardCloud(**tensors, alpha=AlphaMode(**json.loads(form[len(FORMAT) :] or "{}")))
+                cloud.check()
+            except InputError as error:
+                fail("cloud", f"{path} is damaged ({error})", _EXPECTED)
+            return cloud
 
 
 def even_upright(

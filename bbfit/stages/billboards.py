@@ -10,11 +10,12 @@ from pathlib import Path
 
 from bbfit.budget.choice import Trial, choose, lookup, within_bytes
 from bbfit.budget.config import BudgetConfig
-from bbfit.checks import InputError
+from bbfit.checks import InputError, check_record
 from bbfit.exporting.config import ExportConfig
 from bbfit.files import read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.loop import Step, fit, fit_inputs
+from bbfit.inputs import reading
 from bbfit.reporting.plots import Cost, loss_plot, pareto_plot
 from bbfit.stages.stage import OnProgress, Stage
 from bbfit.tree_files.tree_file import TreeFile
@@ -54,8 +55,12 @@ def budget_stage(
 
 def read_choice(folder: Path) -> tuple[ResolvedFit, bool]:
     """The configuration that a finished budget stage chose, and whether it reached the target PSNR (true without a target)."""
-    content = read_json("budget", folder / "pareto.json")
-    return ResolvedFit(**content["config"]), content["met"]
+    path = folder / "pareto.json"
+    content = read_json("budget", path)
+    with reading("budget", path, "remove it to choose anew"):
+        config = ResolvedFit(**content["config"])
+        check_record("met", content["met"], bool)
+        return config, content["met"]
 
 
 def fit_stage(
@@ -99,8 +104,12 @@ def _known_trials(path: Path, key: str) -> list[Trial]:
         content = read_json("budget", path) if path.is_file() else {}
         names = [entry.name for entry in fields(Trial)]
         same = isinstance(content, dict) and content.get("inputs") == key
-        return [Trial(**{name: trial[name] for name in names}) for trial in content["trials"]] if same else []
-    except (InputError, KeyError, TypeError):
+        with reading("budget", path, "remove it to choose anew"):
+            trials = [Trial(**{name: trial[name] for name in names}) for trial in content["trials"]] if same else []
+            for trial in trials:
+                check_record("trial", trial, Trial)
+            return trials
+    except InputError:
         return []
 
 

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from bbfit.checks import InputError
+from bbfit.checks import InputError, check_record
 from bbfit.files import read_json, write_json
 from bbfit.outputs import Written
 from bbfit.provenance import cache_key, digest_file, installed_version
 
 RECORD_FILE = "run.json"
 """The name of the record in a folder."""
+_KINDS: dict[str, Any] = {"inputs": str, "outputs": dict[str, str], "seconds": float}
 _PACKAGES = ("bbfit", "torch", "kornia", "numpy", "opencv-contrib-python-headless", "bpy", "trimesh", "xatlas", "scikit-image", "warp-lang")
 
 
@@ -70,7 +71,7 @@ class Record:
         except InputError:
             earlier = {}  # without a record, the stages are repeated
         stages = earlier.get("stages") if isinstance(earlier, dict) else None
-        self.stages = {name: stage for name, stage in stages.items() if _is_entry(stage)} if isinstance(stages, dict) else {}
+        self.stages = {name: _entry(stage) for name, stage in stages.items() if _is_entry(stage)} if isinstance(stages, dict) else {}
         self._written = Written(folder)
         for name, entry in self.stages.items():
             self._written.adopt(name, entry["outputs"])
@@ -137,5 +138,14 @@ def record_head(source: str, config: Mapping[str, Any], seeds: Mapping[str, int]
 
 
 def _is_entry(entry: Any) -> bool:
-    kinds = {"inputs": str, "outputs": dict, "seconds": int | float}
-    return isinstance(entry, dict) and all(isinstance(entry.get(name), kind) for name, kind in kinds.items())
+    try:
+        check_record("stage", entry, dict)
+        for name, kind in _KINDS.items():
+            check_record(name, entry.get(name), kind)
+    except TypeError:
+        return False
+    return True
+
+
+def _entry(entry: dict[str, Any]) -> dict[str, Any]:
+    return {name: entry[name] for name in _KINDS}

@@ -23,6 +23,8 @@ class SweepConfig:
     """Losses, in place of the grid's."""
     variants: tuple[str, ...] = ()
     """Variants of the grid to run. Default: all of them."""
+    max_cells: Count = 10_000
+    """Most configurations of the grid."""
     retry_failed: bool = False
     """Run again what failed before; otherwise the recorded failure is kept."""
     workers: Count | None = None

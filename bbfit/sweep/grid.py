@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ import yaml
 
 from bbfit.checks import InputError, check_file, fail
 from bbfit.fitting.config import FitConfig, ResolvedFit
+from bbfit.inputs import reading
 from bbfit.sweep.config import SweepConfig
 
 VARIANT = "variant"
 """The label of a cell that contains the name of its variant."""
 _BUILT_IN = Path(__file__).with_name("grids")
+_EXAMPLE = "see bbfit/sweep/grids/thesis.yaml for an example"
+_LARGEST_FILE, _MOST_VALUES = 1 << 18, 100_000
 _FIELDS = {entry.name for entry in fields(FitConfig)}
 
 
@@ -64,11 +68,13 @@ class Grid:
         if name not in built_in and not name.endswith((".yaml", ".yml")):
             fail("grid", f"{name!r} is neither built in nor a .yaml file", f"the built-in grids are {', '.join(built_in)}")
         path = _BUILT_IN / f"{name}.yaml" if name in built_in else check_file("grid", name)
-        try:
-            content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, ValueError, RecursionError) as error:
-            fail("grid", f"{path} is not valid YAML ({' '.join(str(error).split())})", "see bbfit/sweep/grids/thesis.yaml for an example")
-        return _grid(content, path)
+        if path.stat().st_size > _LARGEST_FILE:
+            fail("grid", f"{path} has {path.stat().st_size:,} bytes, more than {_LARGEST_FILE:,}", _EXAMPLE)
+        with reading("grid", path, _EXAMPLE):
+            try:
+                return _grid(_parsed(path.read_text(encoding="utf-8")), path)
+            except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+                fail("grid", f"{path} is not valid YAML ({error})", _EXAMPLE)
 
     def narrowed(self, config: SweepConfig) -> Grid:
         """The grid with the variants (``InputError`` if it lacks one) and the axis values that the options of a sweep select."""
@@ -82,23 +88,53 @@ class Grid:
         variants = {name: self.variants[name] for name in config.variants} or self.variants
         return replace(self, axes=axes, variants=variants)
 
-    def cells(self, base: FitConfig | None = None) -> list[Cell]:
-        """All cells. The last axis varies fastest. Raises ``InputError`` if a value is invalid, or values contradict each other.
+    @property
+    def size(self) -> int:
+        """The number of cells."""
+        return max(len(self.variants), 1) * math.prod(map(len, self.axes.values()))
 
-        Fields of ``base`` that differ from their defaults apply to all cells, unless the grid varies them.
+    def cells(self, base: FitConfig | None = None, *, max_cells: int = SweepConfig.max_cells) -> list[Cell]:
+        """All cells. The last axis varies fastest.
+
+        Fields of ``base`` that differ from their defaults apply to all cells, unless the grid varies them. Raises ``InputError`` if there
+        are more than ``max_cells`` cells, a value is invalid, or values contradict each other.
         """
+        if self.size > max_cells:
+            fail("grid", f"it has {self.size:,} cells, more than the limit of {max_cells:,}", "--max-cells raises it")
         shared = {name: value for name in _FIELDS if (value := getattr(base or FitConfig(), name)) != getattr(FitConfig(), name)}
         cells = []
-        for variant, settings in (self.variants or {"": {}}).items():
-            for values in itertools.product(*self.axes.values()):
-                chosen = dict(zip(self.axes, values, strict=True))
-                labels = ({VARIANT: variant} if variant else {}) | {name: str(value) for name, value in chosen.items()}
-                try:
-                    config = FitConfig(**{**self.fit, **shared, **settings, **chosen}).resolve()
-                except InputError as error:
-                    fail("grid", f"{' '.join(labels.values()) or 'its one cell'}: {error}")
-                cells.append(Cell(labels, config))
+        with reading("grid", "a value", _EXAMPLE):
+            for variant, settings in (self.variants or {"": {}}).items():
+                for values in product(*self.axes.values()):
+                    chosen = dict(zip(self.axes, values, strict=True))
+                    labels = ({VARIANT: variant} if variant else {}) | {name: str(value) for name, value in chosen.items()}
+                    try:
+                        config = FitConfig(**{**self.fit, **shared, **settings, **chosen}).resolve()
+                    except InputError as error:
+                        fail("grid", f"{' '.join(labels.values()) or 'its one cell'}: {error}")
+                    cells.append(Cell(labels, config))
         return cells
+
+
+def _parsed(text: str) -> Any:
+    """The value of a YAML text. Names for other parts of the text must not expand to more than the file could hold itself."""
+    loader = yaml.SafeLoader(text)
+    node = loader.get_single_node()
+    if node is None:
+        return None
+    if _expanded(node, {}) > _MOST_VALUES:
+        raise ValueError(f"it has more than {_MOST_VALUES:,} values")
+    return loader.construct_document(node)
+
+
+def _expanded(node: yaml.Node, known: dict[int, float]) -> float:
+    """The number of values in a node, each counted as often as it is named; infinite if it contains itself."""
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        children = node.value if isinstance(node, yaml.CollectionNode) else []
+        pairs = chain.from_iterable(children) if isinstance(node, yaml.MappingNode) else children
+        known[id(node)] = 1 + sum(_expanded(child, known) for child in pairs)
+    return known[id(node)]
 
 
 def _grid(content: Any, path: Path) -> Grid:

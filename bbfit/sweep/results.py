@@ -6,8 +6,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bbfit.checks import InputError
+from bbfit.checks import InputError, check_record
 from bbfit.files import read_json, remove_parts, write_json
+from bbfit.inputs import reading
 from bbfit.outputs import output_folder
 from bbfit.sweep.tasks import Outcome
 
@@ -27,8 +28,12 @@ class Results:
             return None
         try:
             content: Any = read_json("result", path)
-            return Outcome(**content["outcome"])
-        except (InputError, KeyError, TypeError):
+            with reading("result", path, "remove it"):
+                outcome = Outcome(**content["outcome"])
+                check_record("outcome", outcome, Outcome)
+                _check_numbers((outcome.facts or {}).get("report", {}))
+                return outcome
+        except InputError:
             return None
 
     def put(self, key: str, outcome: Outcome, request: dict[str, Any]) -> None:
@@ -37,3 +42,12 @@ class Results:
 
     def _path(self, key: str) -> Path:
         return self._folder / f"{key}.json"
+
+
+def _check_numbers(report: dict[str, Any]) -> None:
+    """Require numbers, texts, lists or nothing, in dictionaries to any depth."""
+    for name, value in report.items():
+        if isinstance(value, dict):
+            _check_numbers(value)
+        elif not isinstance(value, str | list):
+            check_record(name, value, float | None)

@@ -107,7 +107,7 @@ def run_sweep(
     if stages.budget.given:
         fail("budget", "a sweep runs the configurations of its grid", "omit the budget")
     grid = Grid.load(config.grid).narrowed(config)
-    cells = grid.cells(stages.fit)
+    cells = grid.cells(stages.fit, max_cells=config.max_cells)
     all_sources = sources(species if species or trees or views else grid.trees, trees, views, stages.grow.species_file)
     _check(Path(out), all_sources, cells, config, stages)
     with claimed_folder("out", out) as folder:
@@ -239,7 +239,7 @@ class _Sweep:
         reason = outcome.reason
         if reason is None:
             try:
-                views = ViewDataset.load(folder)
+                views = ViewDataset.load(folder, limits=self._stages.limits)
                 views.check()
             except InputError as error:
                 reason = str(error)

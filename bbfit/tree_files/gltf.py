@@ -1,55 +1,56 @@
-"""The files and vertex positions of a glTF, for checks before a program loads it."""
+"""The files of a glTF, and its check before a program loads it."""
 
 from __future__ import annotations
 
 import base64
-import binascii
 import re
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bbfit.checks import MissingFileError, fail
 from bbfit.glb import gltf_parts
-from bbfit.inputs import InputLimits
+from bbfit.inputs import InputLimits, reading
+from bbfit.tree_files.gltf_checks import check_gltf, entries_of, slice_of
+from bbfit.tree_files.pictures import check_pictures
 
-_FLOAT = 5126
+_AGAIN = "export the tree again"
 
 
-def read_gltf(path: Path, limits: InputLimits) -> tuple[list[Path], list[NDArray[np.float32]]]:
-    """The files that a .gltf or .glb refers to, and the vertex positions of its primitives, [P, 3] each.
+def read_gltf(path: Path, limits: InputLimits) -> list[Path]:
+    """The files that a .gltf or .glb refers to, after a check of everything that programs trust when they load it.
 
-    Packed, sparse and damaged positions are omitted. The program that loads the file checks those. Raises ``MissingFileError`` or
-    ``InputError`` if the file is damaged, or refers to a file that is missing or outside its folder.
+    Raises ``MissingFileError`` or ``InputError`` if the file is damaged or exceeds the limits, or refers to a file that is missing or
+    outside of its folder and the allowed folders.
     """
-    content, binary = gltf_parts(path.read_bytes(), "tree", path)
-    buffers: list[bytes] = []
-    files: list[Path] = []
-    for kind in ("buffers", "images"):
-        for entry in _entries(content, kind):
-            uri, data = entry.get("uri"), b""
-            if uri is None:
-                data = binary
-            elif not isinstance(uri, str):
-                fail("tree", f"{path} has a damaged list of {kind}", "export the tree again")
-            elif not uri.startswith("data:"):
-                files.append(_referenced(path, uri, limits))
-                data = files[-1].read_bytes() if kind == "buffers" else b""
-            elif kind == "buffers":
-                data = _decode_data_uri(path, uri)
-            if kind == "buffers":
-                buffers.append(data)
-    primitives = [primitive for mesh in _entries(content, "meshes") for primitive in _entries(mesh, "primitives")]
-    read = (_positions(content, primitive, buffers) for primitive in primitives)
-    return list(dict.fromkeys(files)), [positions for positions in read if positions is not None]
-
-
-def _entries(content: dict[str, Any], kind: str) -> list[dict[str, Any]]:
-    entries = content.get(kind, [])
-    return [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
+    with reading("tree", path, _AGAIN), np.errstate(all="ignore"):
+        content, binary = gltf_parts(path.read_bytes(), "tree", path)
+        files, buffers, pictures = dict[Path, bytes](), list[bytes](), list[Path | bytes]()
+        for entry in entries_of(content, "buffers"):
+            uri = entry.get("uri")
+            if isinstance(uri, str) and not uri.startswith("data:"):
+                file = _referenced(path, uri, limits)
+                if file not in files:
+                    total = path.stat().st_size + sum(map(len, files.values())) + file.stat().st_size
+                    limits.at_most("max_input_bytes", "tree", path, total, "bytes")
+                    files[file] = file.read_bytes()
+                buffers.append(files[file])
+            else:
+                buffers.append(binary if uri is None else _decoded(uri))
+        views = entries_of(content, "bufferViews")
+        for entry in entries_of(content, "images"):
+            uri = entry.get("uri")
+            if uri is None and "bufferView" in entry:
+                pictures.append(bytes(slice_of(views, entry["bufferView"], buffers)))
+            elif isinstance(uri, str) and not uri.startswith("data:"):
+                pictures.append(_referenced(path, uri, limits))
+            elif uri is not None:
+                pictures.append(_decoded(uri))
+        check_gltf(path, content, buffers, limits)
+        check_pictures(path, pictures, limits)
+        return list(dict.fromkeys((*files, *(picture for picture in pictures if isinstance(picture, Path)))))
 
 
 def _referenced(path: Path, uri: str, limits: InputLimits) -> Path:
@@ -63,23 +64,8 @@ def _referenced(path: Path, uri: str, limits: InputLimits) -> Path:
     return target
 
 
-def _decode_data_uri(path: Path, uri: str) -> bytes:
-    try:
-        return base64.b64decode(uri.partition(",")[2])
-    except (binascii.Error, ValueError) as error:
-        fail("tree", f"{path} contains a damaged data URI ({error})", "export the tree again")
-
-
-def _positions(content: dict[str, Any], primitive: dict[str, Any], buffers: list[bytes]) -> NDArray[np.float32] | None:
-    """The POSITION attribute of a primitive, [P, 3]. ``None`` if it is packed, sparse or damaged."""
-    try:
-        accessor = content["accessors"][primitive["attributes"]["POSITION"]]
-        view = content["bufferViews"][accessor["bufferView"]]
-        data = buffers[view["buffer"]]
-        if accessor["componentType"] != _FLOAT:
-            return None
-        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        strides = (view.get("byteStride", 12), 4)
-        return np.ndarray((accessor["count"], 3), "<f4", data, start, strides)
-    except (KeyError, IndexError, TypeError, ValueError):
-        return None
+def _decoded(uri: Any) -> bytes:
+    """The bytes in a data URI."""
+    if not isinstance(uri, str):
+        raise ValueError("a URI is no text")
+    return base64.b64decode(uri.partition(",")[2])

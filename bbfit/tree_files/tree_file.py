@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,15 +15,20 @@ from bbfit.checks import check_file, fail
 from bbfit.inputs import InputLimits, reading
 from bbfit.provenance import digest_files
 from bbfit.tree_files.blend import blend_files
+from bbfit.tree_files.extent import check_box, check_finite
 from bbfit.tree_files.fbx import fbx_files
 from bbfit.tree_files.gltf import read_gltf
+from bbfit.tree_files.mesh_checks import check_obj, check_stl
 from bbfit.tree_files.obj import obj_files
-from bbfit.tree_files.ply import ply_positions
+from bbfit.tree_files.pictures import check_pictures
+from bbfit.tree_files.ply import check_ply
 from bbfit.tree_files.usd import usd_files
 
 if TYPE_CHECKING:
     import trimesh
 
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # what trimesh says of damaged files is in the errors that it raises
+_LIMITS = InputLimits()
 UpAxis = Literal["y", "z"]
 UP_AXES: dict[str, UpAxis] = {
     **dict.fromkeys((".glb", ".gltf", ".obj", ".fbx", ".usd", ".usda", ".usdc", ".usdz"), "y"),
@@ -30,6 +37,9 @@ UP_AXES: dict[str, UpAxis] = {
 """The formats of trees, and the axis that points up in each. An FBX or a USD file can declare another axis, which its importer uses."""
 _REFERENCES = {".obj": obj_files, ".fbx": fbx_files, ".blend": blend_files}
 _REFERENCES |= dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), usd_files)
+_CHECKS = {".obj": check_obj, ".ply": check_ply, ".stl": check_stl}
+# Files that trees refer to and that are not pictures.
+_NO_PICTURES = (*UP_AXES, ".mtl", ".bin")
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 """The formats whose triangles can be read without Blender."""
 
@@ -46,7 +56,7 @@ class TreeFile:
     """Total size of the files."""
 
     @staticmethod
-    def open(tree: str | Path | TreeFile, limits: InputLimits = InputLimits()) -> TreeFile:  # noqa: B008
+    def open(tree: str | Path | TreeFile, limits: InputLimits = _LIMITS) -> TreeFile:
         """Find the files of a tree, check them, and compute the digest. This loads no geometry.
 
         Parameters
@@ -63,8 +73,8 @@ class TreeFile:
             If the file is missing, or a file that a glTF refers to.
         InputError
             If the file is empty, of an unknown format, or damaged. If it exceeds ``limits``, or refers to a file outside its folder that
-            they do not allow. If a glTF or PLY has vertices that are NaN or infinite. Blender's importers of these two formats would
-            silently replace them by 0.
+            they do not allow. If a glTF, PLY or STL has vertices that are NaN, infinite, or in other ways not those of a tree in meters.
+            Blender's importers would silently replace some of them by 0.
         """
         if isinstance(tree, TreeFile):
             return tree
@@ -72,16 +82,16 @@ class TreeFile:
         suffix = path.suffix.lower()
         if suffix not in UP_AXES:
             fail("tree", f"{path} has an unknown format", f"expected one of {' '.join(UP_AXES)}")
-        others, positions = list[Path](), list[np.ndarray]()
+        limits.at_most("max_input_bytes", "tree", path, path.stat().st_size, "bytes")
+        others = list[Path]()
         if suffix in (".glb", ".gltf"):
-            others, positions = read_gltf(path, limits)
+            others = read_gltf(path, limits)
         elif suffix in _REFERENCES:
             with reading("tree", path, "export the tree again"):
                 others = _REFERENCES[suffix](path, limits)
-        elif suffix == ".ply" and (points := ply_positions(path.read_bytes())) is not None:
-            positions = [points]
-        if not all(np.isfinite(points).all() for points in positions):
-            fail("tree", f"{path} has vertices that are NaN or infinite", "export the tree again")
+                check_pictures(path, [other for other in others if other.suffix.lower() not in _NO_PICTURES], limits)
+        if suffix in _CHECKS:
+            _CHECKS[suffix](path, limits)
         files = (path, *others)
         size = sum(file.stat().st_size for file in files)
         limits.at_most("max_input_bytes", "tree", path, size, "bytes")
@@ -125,19 +135,41 @@ class TreeFile:
         InputError
             If only Blender can read the format, if the file cannot be read, or if it has no triangles.
         """
+        scene = self._scene()
+        with reading("tree", self.path, "expected a mesh"):
+            for mesh in scene.geometry.values():
+                material = getattr(mesh.visual, "material", None)
+                for texture in (*vars(material).values(), *getattr(material, "_data", {}).values()) if material is not None else ():
+                    if hasattr(texture, "load"):
+                        texture.load()  # trimesh reads no more than the header
+        return scene
+
+    def _scene(self) -> trimesh.Scene:
+        """:meth:`scene` without its textures, which are not decoded."""
         import trimesh
 
         self.check_is_mesh()
-        try:
+        with reading("tree", self.path, "expected a mesh"), np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.filterwarnings("error", "string or file could not be read to its end")  # from which trimesh would make half a mesh
             scene = trimesh.load_scene(self.path, process=False)
-        except (ValueError, LookupError, TypeError, AttributeError, OSError) as error:
-            fail("tree", f"{self.path} cannot be read ({error})", "expected a mesh")
-        for name in [name for name, mesh in scene.geometry.items() if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces)]:
-            scene.delete_geometry(name)  # points, lines, and empty meshes
-        if not scene.geometry or not scene.area > 0:
-            fail("tree", f"{self.path} has no triangles", "expected a mesh")
-        return scene
+            for name in [name for name, mesh in scene.geometry.items() if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces)]:
+                scene.delete_geometry(name)  # points, lines, and empty meshes
+            for mesh in scene.geometry.values():
+                if not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+                    raise ValueError("a face refers to a vertex that it does not have")
+                check_finite(self.path, mesh.vertices)
+            if not scene.geometry or not scene.area > 0:
+                fail("tree", f"{self.path} has no triangles", "expected a mesh")
+            check_box(self.path, *scene.bounds)
+            return scene
 
     def mesh(self) -> trimesh.Trimesh:
-        """All triangles of the tree as one mesh in the axes of the file. Raises the errors of :meth:`scene`."""
-        return self.scene().to_mesh()
+        """All triangles of the tree as one mesh in the axes of the file, without materials. Raises the errors of :meth:`scene`."""
+        import trimesh
+
+        scene = self._scene()
+        with reading("tree", self.path, "expected a mesh"):
+            for mesh in scene.geometry.values():
+                mesh.visual = trimesh.visual.ColorVisuals()
+            return scene.to_mesh()

@@ -180,6 +180,8 @@ _BOUNDS = {name: bounds for bounds, names in _RANGES.items() for name in names.s
 _MORE_THAN_LOW = {"ratio", "radius_mod", "prune_width_peak"}
 _LESS_THAN_HIGH = {"lobe_depth", "base_size", "prune_width_peak"}
 _MOST_COLORS = 16
+# How many unknown keys a message names.
+_MOST_NAMED = 10
 
 
 def figure_keys() -> dict[str, Field[Any]]:
@@ -284,7 +286,7 @@ def _entries(path: str | Path | None) -> tuple[Path, dict[str, dict[str, Any]]]:
 def _species(name: str, entry: dict[str, Any]) -> Species:
     expected = figure_keys()
     figures = {key: value for key, value in entry.items() if not key.startswith("_")}
-    suggestions = {key: _suggestion(key, expected) for key in figures if key not in expected}
+    suggestions = {key: _suggestion(key, expected) for key in [key for key in figures if key not in expected][:_MOST_NAMED]}
     unknown = [f"{key} ({suggestion})" if suggestion else key for key, suggestion in suggestions.items()]
     missing = [key for key, field in expected.items() if key not in figures and field.default is MISSING]
     problems = [f"{what} {', '.join(keys)}" for what, keys in (("unknown", unknown), ("missing", missing)) if keys]

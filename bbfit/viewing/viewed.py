@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.request import ViewsRequest
-from bbfit.checks import InputError, check_folder, fail
+from bbfit.checks import InputError, check_folder, check_record, fail
 from bbfit.exporting.config import ExportConfig
 from bbfit.files import read_json
 from bbfit.geometry.cloud import BillboardCloud
@@ -157,6 +157,7 @@ def _open_lod(folder: Path, original_bytes: int) -> ViewedTree:
             if level["planes"] is None:
                 with_tree = True
                 continue
+            check_record("planes", level["planes"], int)
             run = folder / str(level["planes"])
             cloud = BillboardCloud.load(run / CLOUD_FILE)
             halvings = 0 if math.isinf(scale) else max(0, math.floor(math.log2(cloud.texel_density / scale)))

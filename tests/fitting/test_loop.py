@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from bbfit.checks import InputError, MissingFileError
+from bbfit.fitting import loop
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
 from bbfit.fitting.levels import LEAST_SIDE
@@ -19,6 +23,8 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
 from bbfit.operators.drawing.reference import render_reference
+from bbfit.stages.billboards import fit_stage
+from bbfit.stages.stage import Record
 from bbfit.views import ViewDataset, ViewSet
 
 
@@ -161,7 +167,25 @@ def test_a_snapshot_is_a_copy_of_the_cloud_at_its_level(views: ViewDataset) -> N
     assert torch.equal(seen[-1].texels[visible], result.cloud.texels[visible])
 
 
-@pytest.mark.parametrize("spoil", ["other configuration", "cut short"])
+def _changed(path: Path, **changes: Callable) -> None:
+    with safe_open(path, framework="pt") as file:
+        metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
+    for name, change in changes.items():
+        tensors[name] = change(tensors[name])
+    save_file({name: tensor for name, tensor in tensors.items() if tensor is not None}, path, metadata)
+
+
+SPOILED: dict[str, dict] = {
+    "without losses": {"losses": lambda losses: None},
+    "with too many losses": {"losses": lambda losses: torch.rand(500)},
+    "with NaN": {"texels": lambda texels: texels * torch.nan},
+    "without a rectangle": {"start.centers": lambda centers: centers[1:]},
+    "with huge textures": {"start.texture_sizes": lambda sizes: sizes * 0 + (1 << 40)},
+    "with half textures": {"start.half_extents": lambda extents: -extents},
+}
+
+
+@pytest.mark.parametrize("spoil", ["other configuration", "cut short", *SPOILED])
 def test_a_checkpoint_that_does_not_fit_is_not_used(views: ViewDataset, tmp_path: Path, spoil: str) -> None:
     config = quick(billboards=2, steps=4, checkpoint_every=2)
     state, seen = tmp_path / "state", []
@@ -174,10 +198,38 @@ def test_a_checkpoint_that_does_not_fit_is_not_used(views: ViewDataset, tmp_path
         fit(views, config, checkpoint=state, on_step=kill)
     if spoil == "cut short":
         state.write_bytes(state.read_bytes()[:-100])
+    elif spoil in SPOILED:
+        _changed(state, **SPOILED[spoil])
     else:
         config = dataclasses.replace(config, billboards=3)
     fit(views, config, checkpoint=state, on_step=lambda step: seen.append(step.index))
     assert seen == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("name", ["texels", "first_moment", "movement"])
+def test_a_checkpoint_of_another_shape_is_refused_in_one_line(views: ViewDataset, tmp_path: Path, name: str) -> None:
+    config, state = quick(billboards=2, steps=4, checkpoint_every=2), tmp_path / "state"
+
+    def kill(step: Step) -> None:
+        if step.index == 3:
+            raise Killed
+
+    with pytest.raises(Killed):
+        fit(views, config, checkpoint=state, on_step=kill)
+    _changed(state, **{name: lambda tensor: tensor[:-1]})
+    before = state.read_bytes()
+    with pytest.raises(InputError, match=r"^checkpoint: .*state cannot be read \(its tensors are not .*; remove it to start the fit anew$"):
+        fit(views, config, checkpoint=state)
+    assert state.read_bytes() == before
+
+
+def test_a_fit_whose_result_is_not_finite_is_refused(views: ViewDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not recorded as done."""
+    monkeypatch.setattr(loop, "trimmed", lambda cloud: dataclasses.replace(cloud, centers=cloud.centers * math.nan))
+    record = Record(tmp_path)
+    with pytest.raises(InputError, match=r"^fit: the result cannot be used \(centers: expected finite values\); check"):
+        record.run(fit_stage(tmp_path, views, None, quick(billboards=2, steps=2)))
+    assert not record.stages and not (tmp_path / "cloud.safetensors").exists() and not Record(tmp_path).stages
 
 
 def test_held_out_views_are_not_opened(views_folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -193,10 +194,57 @@ def test_a_file_gives_back_the_same_bits(tmp_path: Path, dtype: torch.dtype) -> 
 
 def test_tensors_that_share_memory_or_are_strided_are_saved(tmp_path: Path) -> None:
     cloud, path = small_cloud(), tmp_path / "cloud.safetensors"
-    both = torch.rand(2, 3, 2)
-    shared = replace(cloud, centers=both[..., 0], rights=both[..., 1], ups=both[..., 1])
+    both = torch.stack([cloud.rights, cloud.ups], -1)
+    shared = replace(cloud, centers=both[..., 1], rights=both[..., 0], ups=both[..., 1])
     shared.save(path)
     assert torch.equal(BillboardCloud.load(path).ups, both[..., 1])
+
+
+HALF = math.sqrt(0.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("half_extents", lambda extents: extents.to(torch.int32), "dtype: expected one of torch.float32"),
+        ("half_extents", lambda extents: -extents, "half_extents: expected more than 0"),
+        ("half_extents", lambda extents: extents * 0, "half_extents: expected more than 0"),
+        ("half_extents", lambda extents: extents * 1e20, "half_extents: expected more than 0 and at most 1e\\+06"),
+        ("centers", lambda centers: centers + 1e20, "centers: expected at most 1e\\+06 meters"),
+        ("centers", lambda centers: centers.to(torch.float8_e4m3fn), "centers's dtype: expected one of"),
+        ("centers", lambda centers: centers.to(torch.complex64), "centers's dtype: expected one of"),
+        ("rights", lambda rights: rights * 0, "rights: expected unit vectors"),
+        ("rights", lambda rights: rights * 1000, "rights: expected unit vectors"),
+        ("ups", lambda ups: ups.double(), "ups's dtype: expected one of torch.float32"),
+        ("ups", lambda ups: ups * 1.01, "ups: expected unit vectors"),
+        ("ups", lambda ups: torch.tensor([[1.0, 0, 0], [0, 0, 1.0]]), "ups: expected vectors perpendicular"),
+        ("ups", lambda ups: torch.tensor([[HALF, HALF, 0], [HALF, HALF, 0]]), "ups: expected vectors perpendicular"),
+        ("texels", lambda texels: texels * 1000, r"texels: expected values in \[0, 1\]"),
+        ("texels", lambda texels: texels - 1, r"texels: expected values in \[0, 1\]"),
+        ("texels", lambda texels: texels.to(torch.complex64), "texels's dtype: expected one of"),
+    ],
+)
+def test_malformed_clouds_are_refused_and_never_written(tmp_path: Path, name: str, change: Callable, says: str) -> None:
+    cloud, path = small_cloud(), tmp_path / "cloud.safetensors"
+    malformed = replace(cloud, **{name: change(getattr(cloud, name))})
+    with pytest.raises(InputError, match=says):
+        malformed.save(path)
+    assert not path.exists()
+    save_file(tensors_of(malformed), path, {"format": FORMAT})
+    with pytest.raises(InputError, match=rf"^cloud: .*cloud\.safetensors is damaged \(.*{says}.*\); expected a file written") as caught:
+        BillboardCloud.load(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "alpha", ["[" * 100_000, '{"kind": [}', '{"cutoff": ' + "9" * 5000 + "}", '{"color": 1}', "null", '"blend"', '{"cutoff": NaN}']
+)
+def test_hostile_metadata_of_a_cloud_is_refused_in_one_line(tmp_path: Path, alpha: str) -> None:
+    path = tmp_path / "cloud.safetensors"
+    save_file(tensors_of(small_cloud()), path, {"format": f"{FORMAT} {alpha}"})
+    with pytest.raises(InputError, match=r"^cloud: .*cloud\.safetensors .*expected a file written by bbfit fit$") as caught:
+        BillboardCloud.load(path)
+    assert "\n" not in str(caught.value)
 
 
 def test_an_empty_cloud_is_saved(tmp_path: Path) -> None:
