@@ -147,14 +147,15 @@ class Written:
         existing = self._existing(names)
         inputs = [path for path in inputs if path.exists()]
         for path in existing:
+            shown = os.path.normpath(path)
             if any(path.samefile(given) for given in inputs):
-                fail("out", f"{path} is an input, which the results would replace", "choose another place for the results")
+                fail("out", f"{shown} is an input, which the results would replace", "choose another place for the results")
             relative = self._relative(path)
             known = self._files.get(relative)
             begun = any(fnmatch(relative, name) for name in self._begun.get(by, ()))
             if not begun and (known is None or known["by"] != by):
                 maker = "did not write" if known is None else f"wrote by another step ({known['by']})"
-                fail("out", f"{path} exists, and is a file that bbfit {maker}", "move it away, or choose another place for the results")
+                fail("out", f"{shown} exists, and is a file that bbfit {maker}", "move it away, or choose another place for the results")
         return existing
 
     def begin(self, by: str, names: Sequence[str], inputs: Iterable[Path] = (), *, keep_changed: bool = True) -> None:
