@@ -45,7 +45,12 @@ def one_line(text: str) -> str:
     """
     if len(text) > _LONGEST_MESSAGE:
         text = f"{text[: _LONGEST_MESSAGE - 200]} ... {text[-190:]}"
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+    return "".join(letter if letter.isprintable() else _escape(letter) for letter in text)
+
+
+def _escape(letter: str) -> str:
+    """The code of a character. Python keeps the bytes of a path that are not UTF-8 as characters from U+DC80 on."""
+    return f"\\x{ord(letter) - 0xDC00:02x}" if 0xDC80 <= ord(letter) <= 0xDCFF else repr(letter)[1:-1]
 
 
 def in_words(error: Exception) -> str:
@@ -157,7 +162,7 @@ def check_record(name: str, value: Any, hint: Any) -> None:
             and -_LARGEST_NUMBER < value < _LARGEST_NUMBER
         )
         _require(name, fits, "a finite number")
-    elif isinstance(hint, type):
+    elif hint is not Any and isinstance(hint, type):  # Any is a type since Python 3.11
         _require(name, isinstance(value, hint), hint.__name__)
 
 

@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -36,6 +36,7 @@ _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "DIB", "TGA", "SGI", "JPEG2000
 logging.getLogger("PIL").addHandler(logging.NullHandler())  # what Pillow says of damaged files is in the errors that it raises
 # Channels of the kinds of PNG that have an alpha channel.
 _CHANNELS = {4: 2, 6: 4}
+_PNG = b"\x89PNG\r\n\x1a\n"
 # Guards a global limit of Pillow's.
 _PILLOW = threading.Lock()
 
@@ -57,10 +58,10 @@ def picture_header(name: str, path: str | Path, limits: InputLimits, data: bytes
 
     Raises ``InputError`` with the input's ``name`` if the header is damaged, or announces more pixels than ``limits`` allow.
     """
-    with reading(name, path, _AGAIN):
-        start = data[:_HEADER_BYTES] if data is not None else _start_of(Path(path))
+    with reading(name, path, _AGAIN), Path(path).open("rb") if data is None else io.BytesIO(data) as file:
+        start = file.read(_HEADER_BYTES)
         size = _radiance_size(start) or _openexr_size(start)
-        header = PictureHeader(*size, alpha=False) if size else None
+        header = PictureHeader(*size, alpha=False) if size else _png_header(file) if start.startswith(_PNG) else None
         if header is None:
             try:
                 with _opened(path if data is None else data) as picture:
@@ -71,9 +72,20 @@ def picture_header(name: str, path: str | Path, limits: InputLimits, data: bytes
         return header
 
 
-def _start_of(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(_HEADER_BYTES)
+def _png_header(file: BinaryIO) -> PictureHeader:
+    """The header of a PNG, whatever else the file contains: Pillow would also read texts, profiles and dates before the pixels."""
+    file.seek(len(_PNG))
+    size, alpha = (0, 0), False
+    while len(head := file.read(8)) == 8 and head[4:] != b"IDAT":
+        if head[4:] == b"IHDR":
+            width, height, _, color = struct.unpack(">IIBB", file.read(10))
+            size, alpha = (width, height), color in _CHANNELS
+            file.seek(-10, io.SEEK_CUR)
+        alpha |= head[4:] == b"tRNS"
+        file.seek(int.from_bytes(head[:4], "big") + 4, io.SEEK_CUR)
+    if not all(size):
+        raise ValueError("it has no pixels")
+    return PictureHeader(*size, alpha)
 
 
 @contextlib.contextmanager
@@ -117,7 +129,7 @@ def read_rgba(path: str | Path, limits: InputLimits = _LIMITS) -> NDArray[np.uin
     limits.at_most("max_input_bytes", "image", path, path.stat().st_size, "bytes")
     with reading("image", path, _AGAIN):
         data = path.read_bytes()
-        png, webp = data.startswith(b"\x89PNG\r\n\x1a\n"), data[:4] == b"RIFF" and data[8:12] == b"WEBP"
+        png, webp = data.startswith(_PNG), data[:4] == b"RIFF" and data[8:12] == b"WEBP"
         if not png and not webp:  # OpenCV would premultiply a TIFF and return an EXR in linear light
             fail("image", f"{path} is {'neither PNG nor WebP' if data else 'empty'}", _AGAIN)
         if png and not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
@@ -138,15 +150,18 @@ def _decoded_png(data: bytes) -> NDArray[Any]:
 
     Pillow discards half of 16 bits. OpenCV decodes those, after a check of all that it would complain about.
     """
-    start, needed, pixels = 8, [data[8:33]], [b""]
-    while start + 12 <= len(data):  # Pillow does not compute the checksums of the pixels
+    start, needed, pixels, kind = len(_PNG), [_PNG], [b""], b""
+    while kind != b"IEND":  # what follows is of no concern, nor are texts, profiles and dates
         kind, end = data[start + 4 : start + 8], start + 8 + int.from_bytes(data[start : start + 4], "big")
-        if kind.isupper() and zlib.crc32(data[start + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            raise ValueError("its checksum is wrong")
-        if kind == b"IDAT":
+        if end + 4 > len(data):
+            raise ValueError("it is cut short")
+        if kind in (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"):
+            if zlib.crc32(data[start + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+                raise ValueError("its checksum is wrong")
             needed.append(data[start : end + 4])
-            pixels.append(data[start + 8 : end])
+            pixels += [data[start + 8 : end]] if kind == b"IDAT" else []
         start = end + 4
+    data = b"".join(needed)
     with _opened(data) as picture:
         picture.load()
         if data[24] != 16:
@@ -159,7 +174,7 @@ def _decoded_png(data: bytes) -> NDArray[Any]:
         raise ValueError("it has 16 bits, and is of a kind that cannot be read")
     if len(rows) != stride * height or not inflate.eof or inflate.unused_data or max(rows[::stride]) > 4:
         raise ValueError("its pixels are damaged")
-    return _decoded_by_opencv(data[:8] + b"".join(needed) + b"\0\0\0\0IEND\xaeB`\x82")
+    return _decoded_by_opencv(data)
 
 
 def _decoded_by_opencv(data: bytes) -> NDArray[Any]:
