@@ -119,6 +119,8 @@ def check_record(name: str, value: Any, hint: Any) -> None:
     file is not what a caller gave, so this raises ``TypeError``, to be caught where the file is read.
     """
     origin, arguments = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return
     if origin is Annotated:
         check_record(name, value, arguments[0])
     elif origin in (Union, UnionType):

@@ -201,7 +201,12 @@ def _initial_state(
 ) -> _FitState:
     """Place the billboards evenly, or search for a placement."""
     if config.placement == "even":
-        return _FitState([], start_cloud(views.train, config), None, {}, 0.0)
+        try:
+            start = start_cloud(views.train, config)
+            start.check_rectangles()
+        except (torch.linalg.LinAlgError, InputError) as error:
+            fail("views", f"their cameras do not show a tree from around it ({error})", "check the cameras")
+        return _FitState([], start, None, {}, 0.0)
     points = hull_points(views.train, seed=config.seed) if tree is None else mesh_points(tree, views.train, seed=config.seed)
     placement = find_placement(views.train, points, config, on_place)
     density = config.texel_density * float(pixels_per_meter(views.train.cameras))
