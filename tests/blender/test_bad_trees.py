@@ -154,7 +154,7 @@ def test_trees_of_an_impossible_size_or_place(tmp_path: Path) -> None:
     """Also in formats whose numbers only Blender reads."""
     assert (worker_scene.SMALLEST, worker_scene.LARGEST) == (SMALLEST, LARGEST)
     for name, length, said in (
-        ("large", "1e20", r"reaches 1e\+20 meters from the origin, more than 1e\+06"),
+        ("large", "1e20", r"reaches 1e\+20 meters from the origin"),
         ("small", "1e-5", "is smaller"),
     ):
         (tmp_path / f"{name}.obj").write_text(f"v 0 0 0\nv {length} 0 0\nv 0 {length} 0\nf 1 2 3\n")
