@@ -133,6 +133,8 @@ def check_record(name: str, value: Any, hint: Any) -> None:
     file is not what a caller gave, so this raises ``TypeError``, to be caught where the file is read.
     """
     origin, arguments = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return
     if origin is Annotated:
         check_record(name, value, arguments[0])
     elif origin in (Union, UnionType):
@@ -162,7 +164,7 @@ def check_record(name: str, value: Any, hint: Any) -> None:
             and -_LARGEST_NUMBER < value < _LARGEST_NUMBER
         )
         _require(name, fits, "a finite number")
-    elif hint is not Any and isinstance(hint, type):  # Any is a type since Python 3.11
+    elif isinstance(hint, type):
         _require(name, isinstance(value, hint), hint.__name__)
 
 

@@ -34,6 +34,8 @@ _PICTURES = (".png", ".webp", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
 _HEADER = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_model", *_DISTORTION)
 # Least and greatest focal length in sizes of the picture: views of 0.3 millimeters to 3000 kilometers, or of 179.9 to 0.00002 degrees.
 _FOCAL_LENGTHS = (1e-6, 1e7)
+# Greatest ratio of the sides of a pixel.
+_LONGEST_PIXEL = 100.0
 # How far the principal point may lie outside the picture, in sizes of the picture.
 _FARTHEST_CENTER = 10.0
 # Accepted deviation of a camera's axes from orthonormal; many files have four decimals.
@@ -175,7 +177,8 @@ def _intrinsics(frame: Frame, width: int, height: int) -> torch.Tensor:
         sizes = torch.tensor([width, height], dtype=torch.float64)
         focal, center = intrinsics.diagonal()[:2] / sizes, intrinsics[:2, 2] / sizes
         low, high = _FOCAL_LENGTHS
-        if ((focal >= low) & (focal <= high) & (center.abs() <= _FARTHEST_CENTER)).all():  # NaN is not
+        is_sane = ((focal >= low) & (focal <= high) & (center.abs() <= _FARTHEST_CENTER)).all()  # NaN is not
+        if is_sane and focal.max() <= _LONGEST_PIXEL * focal.min():
             return intrinsics
     except (KeyError, TypeError, ValueError, ArithmeticError):
         pass

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import pytest
 
@@ -21,6 +22,7 @@ from bbfit.checks import (
     check_file,
     check_folder,
     check_range,
+    check_record,
     check_shape,
     fail,
 )
@@ -162,3 +164,47 @@ def test_allowed_fields_pass() -> None:
     assert Decided(mode="mask").limit is None
     with pytest.raises(InputError, match=r"^mode: expected one of mask, blend, got None$"):
         Decided()
+
+
+@dataclass(frozen=True)
+class Noted:
+    """What a file may hold."""
+
+    name: str
+    count: int
+    ratio: float | None
+    kind: Literal["a", "b"]
+    items: tuple[float, ...]
+    facts: Mapping[str, Any]
+
+
+NOTED = {"name": "x", "count": 2, "ratio": None, "kind": "a", "items": (1, 2.5), "facts": {"a": object()}}
+
+
+def test_records_of_files_hold_what_their_types_say() -> None:
+    check_record("noted", Noted(**NOTED), Noted)
+    check_record("noted", (Noted(**NOTED | {"ratio": 1}),), tuple[Noted, ...])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("name", 3),
+        ("count", 2.0),
+        ("count", True),
+        ("count", 10**40),
+        ("count", None),
+        ("ratio", math.nan),
+        ("ratio", math.inf),
+        ("ratio", "1"),
+        ("kind", "c"),
+        ("kind", []),
+        ("items", (1, "2")),
+        ("items", 5),
+        ("facts", {1: 2}),
+        ("facts", None),
+    ],
+)
+def test_records_of_files_with_other_values(name: str, value: Any) -> None:
+    with pytest.raises(TypeError, match=rf"noted\.{name}"):
+        check_record("noted", Noted(**NOTED | {name: value}), Noted)

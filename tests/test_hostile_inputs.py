@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import shutil
 import struct
 import time
@@ -23,6 +24,8 @@ from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputError, MissingFileError, one_line
 from bbfit.evaluation.report import Report
 from bbfit.files import read_json
+from bbfit.fitting.config import FitConfig
+from bbfit.fitting.loop import fit
 from bbfit.images import encode_png, read_rgba
 from bbfit.inputs import InputLimits
 from bbfit.layout import REQUEST_FILE, TRAIN_FILE
@@ -506,3 +509,39 @@ def test_messages_are_one_line_whatever_they_name(tmp_path: Path) -> None:
         read_rgba(tmp_path / "a\nb\x1b[31m\udc80.png")
     assert str(caught.value).isprintable() and "a\\nb\\x1b[31m\\x80.png does not exist" in str(caught.value)
     assert len(one_line("x" * 1_000_000)) < 5000
+
+
+# Fits.
+
+
+def together(content: dict[str, Any]) -> None:
+    """Put all cameras into one place."""
+    for frame in content["frames"]:
+        for row in range(3):
+            frame["transform_matrix"][row][3] = 0.0
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (together, "^views: "),
+        (lambda content: content.update(fl_x=1e-4, fl_y=1e7), "^views: .*neither a usable fl_x"),
+        (lambda content: content.update(fl_x=5e-5, fl_y=5e-5), "^(views|fit): "),
+        (lambda content: content["frames"][0]["transform_matrix"][0].__setitem__(3, 9e5), "^(views|fit): "),
+    ],
+)
+@pytest.mark.parametrize("options", [{"placement": "even"}, {"preset": "thesis"}, {"candidates": 1, "refinement_rounds": 0}])
+def test_fits_to_cameras_that_make_no_sense(
+    folder: Path, edit: Callable[[dict[str, Any]], Any], said: str, options: dict[str, Any]
+) -> None:
+    """They are refused, or else end with a cloud that can be read."""
+    for name in (TRAIN_FILE, "transforms_test.json"):
+        content = json.loads((folder / name).read_text())
+        edit(content)
+        (folder / name).write_text(json.dumps(content))
+    try:
+        cloud = fit(ViewDataset.load(folder), FitConfig(billboards=2, steps=2, **options)).cloud
+    except InputError as error:
+        assert re.search(said, str(error)) and str(error).isprintable()
+    else:
+        cloud.check()

@@ -204,7 +204,12 @@ def _initial_state(
 ) -> _FitState:
     """Place the billboards evenly, or search for a placement."""
     if config.placement == "even":
-        return _FitState([], start_cloud(views.train, config), None, {}, 0.0)
+        try:
+            start = start_cloud(views.train, config)
+            start.check_rectangles()
+        except (torch.linalg.LinAlgError, InputError) as error:
+            fail("views", f"their cameras do not show a tree from around it ({error})", "check the cameras")
+        return _FitState([], start, None, {}, 0.0)
     rendered = views.request.tree if views.request else None
     if tree is None:
         points = hull_points(views.train, seed=config.seed, own=views.own)

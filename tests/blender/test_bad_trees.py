@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from bbfit.blender import views_folder
+from bbfit.blender import views_folder, worker_scene
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.views_folder import render_views
 from bbfit.checks import InputError, MissingFileError
+from bbfit.inputs import LARGEST, SMALLEST
 from bbfit.tree_files.tree_file import UP_AXES, TreeFile
 
 from .conftest import FORMATS, SMALL, run_in_blender
@@ -147,6 +148,17 @@ def test_nothing_to_see(tmp_path: Path) -> None:
     refused(tmp_path / "speck.obj", "has zero size")
     (tmp_path / "line.obj").write_text("v 0 0 0\nv 1 1 1\nv 2 2 2\nf 1 2 3\n")
     refused(tmp_path / "line.obj", "has zero size")
+
+
+def test_trees_of_an_impossible_size_or_place(tmp_path: Path) -> None:
+    """Also in formats whose numbers only Blender reads."""
+    assert (worker_scene.SMALLEST, worker_scene.LARGEST) == (SMALLEST, LARGEST)
+    for name, length, said in (
+        ("large", "1e20", r"reaches 1e\+20 meters from the origin"),
+        ("small", "1e-5", "is smaller"),
+    ):
+        (tmp_path / f"{name}.obj").write_text(f"v 0 0 0\nv {length} 0 0\nv 0 {length} 0\nf 1 2 3\n")
+        refused(tmp_path / f"{name}.obj", said)
 
 
 @pytest.mark.parametrize("kind", ["buffers", "images"])

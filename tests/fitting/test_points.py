@@ -161,10 +161,12 @@ def test_a_missing_mesh_is_said_to_be_missing(views: ViewSet, tmp_path: Path) ->
         mesh_points(TreeFile.open(tmp_path / "tree.glb"), views)
 
 
-@pytest.mark.parametrize(("ending", "content"), [("fbx", b"Kaydara FBX Binary"), ("blend", b"BLENDER-v405ENDB")])
-def test_what_only_blender_reads_is_refused(views: ViewSet, tmp_path: Path, ending: str, content: bytes) -> None:
+@pytest.mark.parametrize(
+    ("ending", "start"), [("fbx", b"Kaydara FBX Binary"), ("blend", b"BLENDER-v405ENDB" + bytes(20)), ("usda", b"#usda 1.0\n")]
+)
+def test_what_only_blender_reads_is_refused(views: ViewSet, tmp_path: Path, ending: str, start: bytes) -> None:
     path = tmp_path / f"tree.{ending}"
-    path.write_bytes(content)
+    path.write_bytes(start)
     with pytest.raises(InputError, match=rf"^tree: only Blender .*tree\.{ending}; .*\.glb \.gltf \.obj \.ply \.stl"):
         mesh_points(TreeFile.open(path), views)
 

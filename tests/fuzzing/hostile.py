@@ -109,7 +109,7 @@ def documents(draw: st.DrawFn, valid: Any, most: int = 3) -> Any:
     """Changes of a JSON document: values replaced, removed, repeated, moved, added. Rarely something else altogether."""
     if draw(st.integers(0, 30)) == 0:
         return draw(hostile)
-    document = copy.deepcopy(valid)
+    document, repeats = copy.deepcopy(valid), st.sampled_from([1, 2, 1000])
     for _ in range(draw(st.integers(1, most))):
         place = draw(st.sampled_from(_places(valid)))
         try:
@@ -123,7 +123,8 @@ def documents(draw: st.DrawFn, valid: Any, most: int = 3) -> Any:
             elif kind == 6:
                 del holder[key]
             elif kind == 7 and isinstance(holder, list):
-                holder.extend([before] * (1 if isinstance(before, Raw) else draw(st.sampled_from([1, 2, 1000]))))
+                holder.extend([before] * (1 if isinstance(before, Raw) else draw(repeats)))
+                repeats = st.just(1)  # or the document would grow without bounds
             elif kind == 8:
                 other = draw(st.sampled_from(_places(valid)))
                 holder[key] = copy.deepcopy(_holder(valid, other)[other[-1]])

@@ -515,7 +515,8 @@ def _options(draw: st.DrawFn) -> Files:
     """A command line for inputs that do not exist, so that no work begins."""
     command = draw(st.sampled_from(_COMMANDS))
     names = [name for kind in _KINDS.values() for name in kind.__dataclass_fields__] + ["out", "tree", "seed", "unknown"]
-    words = [command, "--grid", "nowhere.yaml"] if command == "sweep" else [command, *(["nowhere"] * draw(st.integers(0, 3)))]
+    least = int(command == "run")  # which would grow a tree
+    words = [command, "--grid", "nowhere.yaml"] if command == "sweep" else [command, *(["nowhere"] * draw(st.integers(least, 3)))]
     for _ in range(draw(st.integers(1, 3))):
         value = draw(hostile)
         text = dumped(value).decode()[:50_000] if not isinstance(value, str) else value
