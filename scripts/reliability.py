@@ -5,7 +5,7 @@ It prints the table of docs/reliability.md and ends with exit code 1 if a row fa
 run, lod, sweep, compare, watch  the command is killed (SIGKILL) at random moments and started again, until it was killed ``--kills`` times.
           Each time that it ends, its folder is compared with that of a run that nobody disturbed: same files with the same bytes, except
           for seconds, dates and what contains them. Nothing may stay behind: processes, locks, temporary files and folders. ``watch`` is
-          a fit with ``--watch``
+          ``run`` with ``--watch``
 deleted   the output folder is deleted while bbfit renders and while it fits
 full      the folder of temporary files (TMPDIR) is full, then the disk of the output folder
 shm       there is no /dev/shm
@@ -220,13 +220,13 @@ def counts(scratch: Scratch) -> Iterator[Row]:
         yield Row("counts", f"{number - 1} of {number} views for training", result, wrong)
 
 
-def commands(folder_of_views: Path) -> dict[str, Callable[[Path], list[str]]]:
+def commands() -> dict[str, Callable[[Path], list[str]]]:
     """The commands that are killed, by the row's name."""
     grid = ["--grid", "thesis", "--billboards", "2", "--loss", "l1", "--variants", "base", "bounded", "--workers", "2"]
     systems = ["--systems", "bbfit", "crossed", "cloud", "--billboards", "3"]
     return {
         "run": lambda folder: ["run", str(TREE), "--out", str(folder / "out"), *SMALL, *FIT],
-        "watch": lambda folder: ["fit", str(folder_of_views), "--out", str(folder / "out"), *FIT, "--watch", "--port", "0"],
+        "watch": lambda folder: ["run", str(TREE), "--out", str(folder / "out"), *SMALL, *FIT, "--watch", "--port", "0"],
         "lod": lambda folder: ["lod", str(TREE), "--out", str(folder / "lod.glb"), "--planes", "4", "2", *SMALL, *FIT],
         "sweep": lambda folder: ["sweep", "--trees", str(TREE), "--out", str(folder / "out"), *grid, *SMALL, "--steps", "60"],
         "compare": lambda folder: ["compare", str(TREE), "--out", str(folder / "out"), *systems, *SMALL, *FIT],
@@ -243,13 +243,13 @@ def main() -> int:
     chance, failed = random.Random(options.seed), False
     others: dict[str, Callable[[Scratch], Iterator[Row]]] = {"deleted": deleted, "full": full, "shm": shm, "counts": counts}
     print("| row | what happened | result |\n| --- | --- | --- |", flush=True)
-    for name in [*commands(VIEWS), *others]:
+    for name in [*commands(), *others]:
         if options.only and name not in options.only:
             continue
         with tempfile.TemporaryDirectory(prefix="reliability-") as folder:
             scratch = Scratch(Path(folder))
             if name not in others:
-                rows = iter([kills(name, commands(VIEWS)[name], scratch, options.kills, chance)])
+                rows = iter([kills(name, commands()[name], scratch, options.kills, chance)])
             else:
                 rows = others[name](scratch)
             for row in rows:
