@@ -248,7 +248,9 @@ def main() -> int:
             continue
         with tempfile.TemporaryDirectory(prefix="reliability-") as folder:
             scratch = Scratch(Path(folder))
-            if name not in others:
+            if name in ("full", "shm") and subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode:
+                rows = iter([Row(name, "a file system that is full or missing", "skipped: this process may not change its mounts")])
+            elif name not in others:
                 rows = iter([kills(name, commands()[name], scratch, options.kills, chance)])
             else:
                 rows = others[name](scratch)
