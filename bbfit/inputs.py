@@ -87,9 +87,15 @@ def reading(name: str, path: str | Path, hint: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        text = "it needs more memory than there is" if isinstance(error, MemoryError) else getattr(error, "strerror", None) or str(error)
-        reason = " ".join(text.split())[:_LONGEST_REASON] or type(error).__name__
-        raise InputError(f"{name}: {path} cannot be read ({reason}); {hint}") from error
+        raise InputError(f"{name}: {path} cannot be read ({_reason(error)}); {hint}") from error
+
+
+def _reason(error: Exception) -> str:
+    """Why a reader failed, in at most one line."""
+    if isinstance(error, MemoryError):
+        return "it needs more memory than there is"
+    text = f"{error} is missing" if isinstance(error, KeyError) else getattr(error, "strerror", None) or str(error)
+    return " ".join(text.split())[:_LONGEST_REASON] or type(error).__name__
 
 
 def parse_json(name: str, path: str | Path, data: bytes, hint: str, kind: str = "valid JSON") -> Any:

@@ -17,6 +17,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.files import read_json
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
+from bbfit.inputs import reading
 from bbfit.layout import REQUEST_FILE
 from bbfit.stages.stage import RECORD_FILE
 from bbfit.viewing.levels import ViewerLevel
@@ -75,8 +76,12 @@ def open_results(folder: str | Path, *, original_bytes: int = MAX_BYTES) -> View
     no such folder, or is damaged.
     """
     folder = check_folder("run", folder)
-    if (folder / LOD_FILE).is_file():
-        return _open_lod(folder, original_bytes)
+    is_lod = (folder / LOD_FILE).is_file()
+    with reading("run", folder / LOD_FILE if is_lod else folder, "start bbfit again for this folder"):
+        return _open_lod(folder, original_bytes) if is_lod else _open_run(folder, original_bytes)
+
+
+def _open_run(folder: Path, original_bytes: int) -> ViewedTree:
     if not (folder / CLOUD_FILE).is_file():
         done = " yet" if (folder / RECORD_FILE).is_file() or (folder / "fit.checkpoint").is_file() else ""
         fail("run", f"{folder} holds no {CLOUD_FILE}{done}", "give the folder that bbfit run, bbfit fit or bbfit lod wrote")
@@ -149,24 +154,19 @@ def _views(folder: Path, record: dict[str, Any]) -> Path | None:
 def _open_lod(folder: Path, original_bytes: int) -> ViewedTree:
     stored = read_json("run", folder / LOD_FILE)
     coarser, records, with_tree = list[ViewerLevel](), list[dict[str, Any]](), False
-    try:
-        config = stored["config"]
-        focal = config["screen_height"] / 2 / math.tan(math.radians(config["screen_fov_degrees"]) / 2)
-        for index, level in enumerate(stored["levels"]):
-            scale = focal / level["distance_meters"] if index and level["distance_meters"] else math.inf
-            if level["planes"] is None:
-                with_tree = True
-                continue
-            check_record("planes", level["planes"], int)
-            run = folder / str(level["planes"])
-            cloud = BillboardCloud.load(run / CLOUD_FILE)
-            halvings = 0 if math.isinf(scale) else max(0, math.floor(math.log2(cloud.texel_density / scale)))
-            coarser.append(ViewerLevel(cloud, scale, halvings))
-            records.append(_record(run))
-    except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        fail("run", f"{folder / LOD_FILE} is damaged or of another version ({error!r})", "start bbfit lod again")
+    config = stored["config"]
+    focal = config["screen_height"] / 2 / math.tan(math.radians(config["screen_fov_degrees"]) / 2)
+    for index, level in enumerate(stored["levels"]):
+        scale = focal / level["distance_meters"] if index and level["distance_meters"] else math.inf
+        if level["planes"] is None:
+            with_tree = True
+            continue
+        check_record("planes", level["planes"], int)
+        run = folder / str(level["planes"])
+        cloud = BillboardCloud.load(run / CLOUD_FILE)
+        halvings = 0 if math.isinf(scale) else max(0, math.floor(math.log2(cloud.texel_density / scale)))
+        coarser.append(ViewerLevel(cloud, scale, halvings))
+        records.append(_record(run))
     if not coarser:
         fail("run", f"{folder / LOD_FILE} names no billboards", "start bbfit lod again")
     converted = folder / "original.glb"

@@ -77,6 +77,11 @@ def test_a_damaged_record_is_an_error(copied: Path, text: str) -> None:
         open_results(copied)
 
 
+def test_a_record_that_names_no_possible_file_is_an_error(copied: Path) -> None:
+    with pytest.raises(InputError, match=r"^run: .* cannot be read \(File name too long\); start bbfit again"):
+        open_results(edited(copied, {"source": "9" * 5000}))
+
+
 def test_a_damaged_cloud_is_an_error(copied: Path) -> None:
     (copied / "cloud.safetensors").write_bytes(b"no tensors")
     with pytest.raises(InputError, match="damaged"):
