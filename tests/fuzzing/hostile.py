@@ -89,7 +89,11 @@ def dumped(value: Any) -> bytes:
             return {str(key): hidden(item) for key, item in part.items()}
         return [hidden(item) for item in part] if isinstance(part, list) else part
 
-    return re.sub(r'"@@raw(\d+)@@"', lambda match: raws[int(match[1])], json.dumps(hidden(value))).encode()
+    try:
+        text = json.dumps(hidden(value))
+    except RecursionError:  # changes have put a part into itself, which no file can hold
+        text = "[]"
+    return re.sub(r'"@@raw(\d+)@@"', lambda match: raws[int(match[1])], text).encode()
 
 
 def _places(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
