@@ -38,6 +38,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TREE, VIEWS = ROOT / "data" / "tree.glb", ROOT / "data" / "views"
 BBFIT = [sys.executable, "-m", "bbfit.cli"]
 SMALL = ["--count", "6", "--size", "48", "--samples", "1", "--render-workers", "1"]
+QUICK = ["--restarts", "1", "--candidates", "1", "--refinement-rounds", "0"]
 FIT = ["--steps", "60", "--restarts", "1", "--refinement-rounds", "1"]
 # Texts and pictures that contain seconds or dates.
 TIMED = {"run.json", ".bbfit.json", "report.html", "table.png", "quality.png", "compare.md", "table.md"}
@@ -207,9 +208,7 @@ def counts(scratch: Scratch) -> Iterator[Row]:
     """Many billboards, and few views."""
     for number in (64, 200):
         out = scratch.folder / f"{number} billboards"
-        code, errors = scratch.finish(
-            ["fit", str(VIEWS), "--out", str(out), "--billboards", str(number), "--steps", "40", "--restarts", "1"]
-        )
+        code, errors = scratch.finish(["fit", str(VIEWS), "--out", str(out), "--billboards", str(number), "--steps", "40", *QUICK])
         good = code == 0 and (out / "model.glb").stat().st_size > 0
         yield Row("counts", f"{number} billboards", "finished" if good else errors[-200:], [] if good else [f"exit code {code}"])
     for number in (2, 3):
