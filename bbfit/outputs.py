@@ -80,6 +80,13 @@ def claimed_folder(name: str, path: str | Path) -> Iterator[Path]:
         yield folder
 
 
+def wait_until_free(folder: Path) -> None:
+    """Wait until no process works in a folder that processes of a killed parent may not have left yet: at most 30 seconds."""
+    if folder.is_dir():
+        with contextlib.suppress(InputError), _lock(folder / LOCK_FILE, "out", _MOMENT):
+            pass
+
+
 @contextlib.contextmanager
 def single_files(by: str, folder: Path, names: Sequence[str], inputs: Iterable[Path] = ()) -> Iterator[None]:
     """Write files with ``names`` (which may contain ``*``) to any folder, such as that of the user, in the context.

@@ -19,6 +19,7 @@ from multiprocessing.util import Finalize
 from types import FrameType
 from typing import Any
 
+from bbfit.outputs import wait_until_free
 from bbfit.scratch import ScratchFolder, remove_own
 from bbfit.sweep.tasks import Outcome, Task, attempt
 
@@ -169,6 +170,7 @@ def _run_tasks(pipe: Connection, lifeline: Connection, environment: dict[str, st
             task, cores = pipe.recv()
             torch.set_num_threads(cores)
             inputs = {name: paths[0] for name, paths in task.inputs.items()}
+            wait_until_free(task.folder)  # by a process of a killed sweep, which ends with its parent, but not at the same moment
             pipe.send(attempt(partial(task.work, inputs, task.folder, *task.arguments), platform.node()))
     except (EOFError, BrokenPipeError):
         return

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from bbfit.outputs import claimed_folder
+
 _PIPE = "began"
 
 
@@ -62,6 +64,12 @@ def copy(inputs: Mapping[str, Path], folder: Path, marks: str, name: str, gate: 
 def beside(inputs: Mapping[str, Path], folder: Path) -> dict[str, Any]:
     """What lies beside an input, as a glTF's buffers do."""
     return {"name": inputs["tree"].name, "beside": (inputs["tree"].parent / "more" / "part.bin").read_text()}
+
+
+def claim(inputs: Mapping[str, Path], folder: Path) -> dict[str, Any]:
+    """Work in the folder, as a run does, and refuse if another process does."""
+    with claimed_folder("out", folder):
+        return {"name": folder.name}
 
 
 def fault(inputs: Mapping[str, Path], folder: Path) -> dict[str, Any]:

@@ -7,10 +7,12 @@ import select
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import sweep_works
 
+from bbfit.outputs import claimed_folder
 from bbfit.sweep.local import LocalWorkers
 from bbfit.sweep.tasks import Outcome, Task, Work
 
@@ -102,6 +104,16 @@ if __name__ == "__main__":
             parent.send_signal(signal.SIGKILL)
         select.select([process], [], [])  # until it has ended
         os.close(process)
+
+
+def test_a_task_waits_until_a_killed_sweep_has_left_its_folder(tmp_path: Path) -> None:
+    with LocalWorkers(1) as workers:
+        assert carried_out(workers, [task("warm", sweep_works.claim, tmp_path / "warm")])["warm"].reason is None
+        with claimed_folder("out", tmp_path / "run"):
+            workers.submit(task("again", sweep_works.claim, tmp_path / "run"))
+            time.sleep(0.5)  # in which the task would be refused
+        _, outcome = workers.next()
+    assert outcome.reason is None and outcome.facts == {"name": "run"}
 
 
 def test_leaving_ends_what_still_runs(tmp_path: Path) -> None:
