@@ -26,8 +26,9 @@ SIDE = 64
 """Approximate side of the pictures that the search renders, in pixels."""
 # Learning rate of the candidates, and of everything after them.
 _RATE, _LATER_RATE = 0.15, 0.06
-# A clustering supplies three quarters of the billboards. Additions supply the rest, one in four.
-_BILLBOARDS_PER_ADDITION = 4
+# A clustering supplies three quarters of the billboards. Additions supply the rest, one in four, and for many billboards at most eight:
+# each addition fits all billboards anew.
+_BILLBOARDS_PER_ADDITION, _MOST_ADDITIONS = 4, 8
 # Views in every step.
 _BATCH = 8
 
@@ -57,7 +58,7 @@ def find_placement(
 
     Each of ``restarts`` searches clusters the points on the tree, float64 [P, 3], from ``candidates`` random starts and fits each
     clustering, placement and textures, for a few steps. The best 30 % continue for more steps. A search then adds the last quarter of the
-    billboards to the best clouds, by splitting a billboard or by placing one where the loss is largest.
+    billboards, but at most eight, to the best clouds, by splitting a billboard or by placing one where the loss is largest.
 
     ``refinement_rounds`` rounds then refine the cloud with the least loss (:meth:`~bbfit.fitting.moves.Moves.refined`). A round keeps the
     best change only if it lowers the loss.
@@ -78,7 +79,7 @@ class _Search:
         self._pictures = self._targets.pictures(range(len(views)))
         self._radius, self._generator = tree_radius(views), torch.Generator().manual_seed(config.seed)
         self._moves = Moves(points, self._targets.cameras, self._pictures, config, self._radius, self._generator)
-        self._added = config.billboards // _BILLBOARDS_PER_ADDITION
+        self._added = min(config.billboards // _BILLBOARDS_PER_ADDITION, _MOST_ADDITIONS)
         self._clusters, self._survivors = config.billboards - self._added, max(1, round(effort.survivors * config.candidates))
         self._done = 0
         # Clouds that get additions. Every addition halves their number, and few billboards limit it, so that the search stays short.
