@@ -74,6 +74,26 @@ def test_work_is_told_step_by_step(
     assert told == [(done, sum(expected)) for done in accumulate(expected)]
 
 
+def test_many_billboards_get_no_more_than_eight_additions(views: ViewDataset, points: torch.Tensor) -> None:
+    """Each addition fits all billboards, so the work would otherwise grow with the square of their number."""
+
+    class Told(Exception):
+        pass
+
+    def work(billboards: int) -> int:
+        """All work of the search, which is told after its first step."""
+
+        def on_progress(done: int, total: int) -> None:
+            raise Told(total)
+
+        asked = config(billboards=billboards, candidates=1, restarts=1, refinement_rounds=0, backend="reference")
+        with pytest.raises(Told) as told:
+            find_placement(views.train, points[:500], asked, on_progress, Effort(1, 1, 1))
+        return int(told.value.args[0])
+
+    assert [work(billboards) for billboards in (7, 8, 40)] == [1 + 1 + additions * 4 for additions in (1, 2, 8)]
+
+
 @pytest.mark.parametrize("backend", ["fused", "reference"])
 def test_nothing_needs_to_be_told(views: ViewDataset, points: torch.Tensor, backend: str) -> None:
     """And whoever is told gets the same, on either backend."""
