@@ -124,11 +124,11 @@ def compare_table(rows: Sequence[CompareRow]) -> Table:
 
 
 def _table(texts: Sequence[str], numbers: Sequence[str], *, no_wrap: bool = False) -> Table:
-    """An empty table with columns of text and columns of numbers, which ``no_wrap`` keeps on one line."""
+    """An empty table with columns of text and columns of numbers, which ``no_wrap`` keeps on one line and close together."""
     from rich import box
     from rich.table import Table
 
-    table = Table(*texts, box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(*texts, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=no_wrap)
     for name in numbers:
         table.add_column(name, justify="right", no_wrap=no_wrap)
     return table
