@@ -21,8 +21,8 @@ _LARGEST = 2.0
 def matched_colors(cloud: BillboardCloud, views: ViewSet, backend: Backend = "auto") -> BillboardCloud:
     """Multiply each color channel of a cloud by one number so that its mean color is that of the views.
 
-    A mean color is the sum of premultiplied color over the sum of alpha, over all pixels of at most 24 views, evenly spaced. Where texels are
-    larger than leaves, or few billboards stand in for depth, alpha is too low in the middle of the crown, and a fit of color and alpha
+    A mean color is the sum of premultiplied color over the sum of alpha, over all pixels of at most 24 views, evenly spaced. Where texels
+    are larger than leaves, or few billboards stand in for depth, alpha is too low in the middle of the crown, and a fit of color and alpha
     together makes up for it with colors that are too dark or too strong. Before a background of another color, that shows.
     """
     indices = [index * len(views) // _VIEWS for index in range(_VIEWS)] if len(views) > _VIEWS else list(range(len(views)))

@@ -118,7 +118,7 @@ def test_an_antialiased_edge_covers_the_share_of_the_pixel_that_is_inside() -> N
 
 
 def test_layers_of_an_antialiased_mask_cover_the_same_samples_first() -> None:
-    """Front to back 0.25, 0.75, 0.5 and 1: the second shows half, the third nothing, the last the rest, whatever their order in the list."""
+    """Front to back 0.25, 0.75, 0.5 and 1: the second shows half, the third nothing, the last the rest, in any order of the list."""
     depths, alphas = [1.0, 2.0, 3.0, 4.0], [0.25, 0.75, 0.5, 1.0]
     for order in itertools.permutations(range(4)):
         planes = [[torch.full((1, 1, 2, 2), values[i]) for i in order] for values in (alphas, depths)]

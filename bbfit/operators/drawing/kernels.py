@@ -22,8 +22,8 @@ derivative (t_u, t_v) in texel coordinates the rows of the homography receive
 front leave uncovered shows. With the coverage m_k = max over j < k of a_j, its weight is max(a_k - m_k, 0) instead of T_k a_k. If a layer
 shows, the next layer that shows loses what it gains: dL/da_k = e_k - e_next, where e_next is 0 if there is none. Otherwise it is 0.
 
-**Colors of their own.** With ``own_colors``, the colors do not minimize the picture's loss but the squared difference to the view's straight
-color C, weighted by the view's alpha A and by the layer's weight w_k (which is held constant):
+**Colors of their own.** With ``own_colors``, the colors do not minimize the picture's loss but the squared difference to the view's
+straight color C, weighted by the view's alpha A and by the layer's weight w_k (which is held constant):
 
     sum of w_k A |c_k - C|^2,    with the derivative 2 w_k (A c_k - A C) in c_k.
 
@@ -246,7 +246,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         """Add to ``texel_gradient`` [P] and, unless empty, to ``matrix_gradient`` [V, H, N, 3], a sum for every row of pixels.
 
         The picture's gradient is ``image_gradient`` [V, H, W], unless empty, plus ``weight`` times that of the pixel loss against
-        ``target`` [V, H, W], unless empty. The loss is added to ``loss`` [V, H]. With ``own_colors``, colors are fitted to the target's own.
+        ``target`` [V, H, W], unless empty. The loss is added to ``loss`` [V, H]. ``own_colors`` fits colors to the target's own.
         """
         view, row, piece = wp.tid()
         view += first_view

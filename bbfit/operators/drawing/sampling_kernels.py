@@ -149,7 +149,7 @@ def alpha_at(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, to_texel: wp.ma
     at = corners(texture, left, top)
     there = present(texture, left, top)
     weight = weights(fx, fy)
-    alpha = float(0.0)
+    alpha = float(0.0)  # noqa: UP018 - declares a variable
     for c in range(4):
         alpha += texel(texels, at[c])[3] * there[c] * weight[c]
     return alpha

@@ -52,8 +52,8 @@ def pixel_loss_reference(render: Tensor, target: Tensor, kind: Loss) -> Tensor:
 def color_loss_reference(colors: list[Tensor], weights: list[Tensor], target: Tensor) -> Tensor:
     """Loss of the colors of N layers against the views' own, a scalar that is differentiable in the colors alone.
 
-    It is the mean over pixels of the sum over layers of w A |c - C|^2, less a term that does not depend on c. A is the view's alpha and C its
-    straight color. Where a view is half transparent, the best color is therefore the view's color, not a mixture with the background
+    It is the mean over pixels of the sum over layers of w A |c - C|^2, less a term that does not depend on c. A is the view's alpha and C
+    its straight color. Where a view is half transparent, the best color is therefore the view's color, not a mixture with the background
     (as it is for the loss ``backgrounds``, if the layer is opaque there).
 
     Parameters
