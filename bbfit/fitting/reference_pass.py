@@ -38,8 +38,8 @@ class ReferencePass:
         loss = torch.zeros((), device=device)
         for group in cloud.parts(self._groups):
             if config.colors == "views":
-                image, *layers = render_layers_reference(group, cameras)
-                color_loss_reference(*layers, target).backward(retain_graph=True)  # its value is not part of the loss
+                image, colors, weights = render_layers_reference(group, cameras)
+                color_loss_reference(colors, weights, target).backward(retain_graph=True)  # its value is not part of the loss
             else:
                 image = render_reference(group, cameras)
             loss = loss + image_loss_reference(image, target, config.loss, config.ssim_weight, config.sharpness_weight)
