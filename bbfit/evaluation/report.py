@@ -13,6 +13,7 @@ from bbfit.files import read_json, write_json
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.inputs import reading
 
+_EXPECTED = "write it again with bbfit evaluate"
 RING_GAP = 1.0
 """Smallest difference in degrees between the elevations of two rings of views."""
 
@@ -167,7 +168,7 @@ class Report:
         """
         path = check_file("metrics", path)
         content = read_json("metrics", path)
-        with reading("metrics", path, "expected a metrics.json that bbfit evaluate wrote"):
+        with reading("metrics", path, _EXPECTED):
             vertices, sizes = (Cost(content[name]["model"], content[name]["original"]) for name in ("vertices", "bytes"))
             alpha = AlphaMode(content["alpha"]["mode"], content["alpha"]["cutoff"])
             scores = tuple(
@@ -180,3 +181,16 @@ class Report:
                 raise ValueError("it has no views")
             check_record("report", report, Report)
             return report
+
+
+def stage_seconds(path: str | Path) -> dict[str, float]:
+    """The seconds of each stage in a file that :meth:`Report.save` wrote, also in an earlier version of bbfit.
+
+    Raises MissingFileError or InputError if the file is missing or damaged.
+    """
+    path = check_file("metrics", path)
+    content = read_json("metrics", path)
+    with reading("metrics", path, _EXPECTED):
+        seconds = dict(content["seconds"])
+        check_record("seconds", seconds, dict[str, float])
+        return seconds

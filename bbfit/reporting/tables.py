@@ -40,9 +40,9 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
     table = _table(["measure"], [])
     table.title, table.title_style = f"{title}: mean of {count}" if count > 1 else f"{title}: one view", "bold"
     table.add_column("better", justify="center", style="dim")
-    for name in ("mean over backgrounds", "over white", "RGBA"):
+    for name in ("mean over\nbackgrounds", "over\nwhite", "RGBA"):
         table.add_column(name, justify="right")
-    table.add_column("thesis scale" if thesis else "", justify="right", style="dim")
+    table.add_column("thesis\nscale" if thesis else "", justify="right", style="dim")
 
     def cell(text: str) -> str:
         return text if thesis else ""
