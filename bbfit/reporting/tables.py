@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 # Reports with more rings than this are shown without rings.
 _MOST_RINGS = 8
+_MEANS = "PSNR, SSIM and FLIP: means over four backgrounds"
 _UP, _DOWN, _ONE = "↑", "↓", "→ 1"
 
 
@@ -103,6 +104,7 @@ def sweep_table(rows: Sequence[SweepRow]) -> Table:
 
     labels = label_names(rows)
     table = _table(["tree", *labels], ["PSNR, dB", "SSIM", "FLIP", "vertices", "bytes", "seconds"])
+    table.caption, table.caption_justify = _MEANS, "left"
     for row in rows:
         start = [Text(row.tree), *(Text(row.labels.get(name, "")) for name in labels)]
         if row.facts is None:
@@ -118,6 +120,7 @@ def sweep_table(rows: Sequence[SweepRow]) -> Table:
 def compare_table(rows: Sequence[CompareRow]) -> Table:
     """A ``rich`` table with one line per system: its costs and its measures on the held-out views, means over the backgrounds."""
     table = _table(["system"], ["PSNR, dB", "SSIM", "FLIP", "planes", "vertices", "bytes", "seconds"], no_wrap=True)
+    table.caption, table.caption_justify = _MEANS, "left"
     for row in rows:
         over = None if row.measures is None else row.measures.over.mean
         scores = ["-"] * 3 if over is None else [f"{over.psnr:.2f}", f"{over.ssim:.3f}", f"{over.flip:.3f}"]
