@@ -33,6 +33,8 @@ _HAUSDORFF_SHARE = 0.95
 _FLIP_REACH = 10
 # Largest CIELAB chroma of a gray; rounding gives gray pixels one of 0.01 or less.
 _GRAY_CHROMA = 0.1
+# Largest sum of red, green and blue of a black, far below a step of 8 bits.
+_BLACK = 1e-6
 
 
 def mean_squared_error(target: Image, render: Image) -> float:
@@ -210,7 +212,7 @@ def brightness_ratio(target: ColorSum, render: ColorSum) -> float | None:
     Transparency does not count as darkness. ``None`` if a picture is empty or the target is black.
     """
     colors = [color for total in (target, render) if (color := mean_color(total)) is not None]
-    return _ratio(sum(colors[1]), sum(colors[0])) if len(colors) == 2 else None
+    return sum(colors[1]) / sum(colors[0]) if len(colors) == 2 and sum(colors[0]) > _BLACK else None
 
 
 def brightness(target: Image, render: Image) -> float | None:

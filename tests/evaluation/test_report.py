@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -119,3 +120,12 @@ def test_damaged_file(tmp_path: Path, content: str) -> None:
         Report.load(path)
     with pytest.raises(MissingFileError, match="does not exist"):
         Report.load(tmp_path / "other.json")
+
+
+def test_figures_of_any_sums_of_colors_are_finite() -> None:
+    """Also of those in a file that someone edited."""
+    values = (0.0, -1.0, 5e-324, 1e-9, 0.5, 1e300)
+    for first, second, alpha in itertools.product(values, repeat=3):
+        colour = Colour(*[(first, second, first, alpha), (second, first, second, 1.0)] * 2)
+        swapped = Colour(colour.render, colour.target, colour.render_inside, colour.target_inside)
+        json.dumps([colour.to_json(), swapped.to_json()], allow_nan=False)
