@@ -8,6 +8,7 @@ frame).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,20 @@ def split_views(count: int, seed: int) -> tuple[list[int], list[int]]:
     test_count = min(max(round(count * TEST_SHARE), 1), count - 1)
     test = sorted(np.random.default_rng(seed).permutation(count)[:test_count].tolist())
     return sorted(set(range(count)) - set(test)), test
+
+
+def split_rings(counts: Sequence[int], seed: int) -> tuple[list[int], list[int]]:
+    """:func:`split_views` of each ring of views, so that the test views come from all of them. A ring of one view is for training.
+
+    ``counts`` are the numbers of views on rings that follow each other. There are at least two views.
+    """
+    train, test, begin = list[int](), list[int](), 0
+    for ring, count in enumerate(counts):
+        parts = split_views(count, seed + ring) if count > 1 else ([0], [])
+        for indices, part in zip((train, test), parts, strict=True):
+            indices += [begin + index for index in part]
+        begin += count
+    return (train, test) if test else split_views(begin, seed)
 
 
 def write_transforms(folder: Path, camera: Camera, image_paths: list[str], train: list[int], test: list[int]) -> None:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from bbfit.blender.config import ViewsConfig
+from bbfit.blender.config import RING, ViewsConfig
 from bbfit.blender.requirements import check_blender
 from bbfit.budget.choice import check_budget
 from bbfit.budget.config import BudgetConfig
@@ -63,6 +63,10 @@ class RunConfig:
     """Options for writing the model."""
     limits: InputLimits = field(default_factory=InputLimits)
     """What the tree and the views may refer to, and how large they may be."""
+
+    def __post_init__(self) -> None:
+        if self.fit.preset == "thesis" and self.views.elevations is None:
+            object.__setattr__(self, "views", replace(self.views, elevations=RING))
 
     def check(self, *, mesh: bool, rendered: bool, blender: bool) -> None:
         """Check all options together, before a folder is made or a tree is grown or rendered.

@@ -20,9 +20,9 @@ from bbfit.checks import check_file
 VERSIONS: Mapping[str, int] = {
     "grow": 1,
     "convert": 1,
-    "views": 1,
+    "views": 2,
     "budget": 5,
-    "fit": 9,
+    "fit": 10,
     "export": 3,
     "evaluate": 8,
     "report": 2,

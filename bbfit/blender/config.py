@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from bbfit.checks import Count, Range, Seed, check_fields, fail
+from bbfit.geometry.orbit import Orbit
 from bbfit.provenance import EXECUTION
 
 Device = Literal["cpu", "cuda", "optix", "hip", "oneapi", "metal"]
@@ -14,17 +15,24 @@ Axis = Literal["auto", "origin", "center"]
 _Elevation = Annotated[float, Range(-90, 90)]
 _Strength = Annotated[float, Range(0, 1e6)]
 
+DOME = (0.0, 20.0, 40.0, 60.0, 80.0)
+"""Elevations of the rings of a dome in degrees."""
+RING = (0.0,)
+"""Elevation of the ring of the thesis (section 4.1)."""
+
 
 @dataclass(frozen=True)
 class ViewsConfig:
     """How a tree is rendered."""
 
     count: Annotated[int, Range(2)] = 90
-    """Number of pictures, divided among the rings of cameras; a random quarter is held out for the score."""
+    """Number of pictures, divided among the rings of cameras by their circumferences; a random quarter of each ring is held out for the
+    score."""
     size: Annotated[int, Range(11, 16384)] = 384
     """Width and height of a picture in pixels."""
-    elevations: tuple[_Elevation, ...] = (0.0,)
-    """Elevation of each ring of cameras: its angle above the horizon, in degrees."""
+    elevations: tuple[_Elevation, ...] | None = None
+    """Elevation of each ring of cameras: its angle above the horizon, in degrees.
+    Default: a dome, 0 20 40 60 80; for the preset thesis, one ring at eye level, 0."""
     fov_degrees: Annotated[float, Range(1, 170)] = 40.0
     """Field of view in degrees; the cameras move back until the whole tree is in the picture."""
     orthographic: bool = False
@@ -54,8 +62,18 @@ class ViewsConfig:
     Auto is the origin if it lies inside the bounding box seen from above, as it does under most trunks, else the center."""
 
     def __post_init__(self) -> None:
-        if not self.elevations:
+        if self.elevations is not None and not self.elevations:
             fail("elevations", f"expected one or more angles, got {self.elevations!r}")
         check_fields(self)
-        if self.count < len(self.elevations):
-            fail("count", f"expected at least one view for each of {len(self.elevations)} rings, got {self.count}")
+        if self.count < len(self.rings):
+            fail("count", f"expected at least one view for each of {len(self.rings)} rings, got {self.count}")
+
+    @property
+    def rings(self) -> tuple[float, ...]:
+        """Elevation of each ring, with the default filled in."""
+        return DOME if self.elevations is None else tuple(self.elevations)
+
+    @property
+    def orbit(self) -> Orbit:
+        """Directions of the cameras."""
+        return Orbit(self.count, self.rings)

@@ -77,6 +77,7 @@ class ViewsRequest:
                 fail("hdri", f"{panorama} has {pixels}, more than {_PANORAMA:,}", "reduce it; 8192 x 4096 are enough for any light")
             config = replace(config, hdri=panorama)
         known = RenderedTree(tree.path.name, tree.digest, tree.bytes, tree.up_axis)
+        config = replace(config, elevations=config.rings)  # a default is the same as naming it
         return ViewsRequest(identity(config), known, bbfit=installed_version("bbfit") or "unknown")
 
     @staticmethod

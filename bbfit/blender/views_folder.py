@@ -18,8 +18,7 @@ from bbfit.blender.request import ViewsRequest
 from bbfit.checks import fail
 from bbfit.files import remove_parts
 from bbfit.geometry.camera import Camera
-from bbfit.geometry.orbit import Orbit
-from bbfit.layout import REQUEST_FILE, SINGLE_FILE, TEST_FILE, TRAIN_FILE, split_views, write_transforms
+from bbfit.layout import REQUEST_FILE, SINGLE_FILE, TEST_FILE, TRAIN_FILE, split_rings, write_transforms
 from bbfit.outputs import Written, claimed_folder, output_folder
 from bbfit.tree_files.tree_file import TreeFile
 
@@ -116,7 +115,7 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
         on_done(finished)
         clips = [clip_distances(points, camera.position[0])] * config.count
         pool.render(frames(camera, paths, missing, clips, config.seed), config.render_workers, finished, on_done)
-    train, test = split_views(config.count, config.seed)
+    train, test = split_rings(config.orbit.ring_counts, config.seed)
     write_transforms(out, camera, [f"images/{path.name}" for path in paths], train, test)
     save(complete=True)
     written.finish("views", written.digests([REQUEST_FILE, TRAIN_FILE, TEST_FILE, "images/*.png"]))
@@ -138,8 +137,7 @@ def _earlier(out: Path, request: ViewsRequest) -> ViewsRequest | None:
 def _cameras(points: NDArray[np.float64], config: ViewsConfig) -> tuple[Camera, torch.Tensor, float]:
     """Cameras that see every point, the point that they look at, and their distance from it in meters."""
     target = vertical_axis(points.min(0), points.max(0), config.axis)
-    orbit = Orbit(config.count, tuple(config.elevations))
-    camera = orbit.frame(
+    camera = config.orbit.frame(
         points,
         target=target,
         width=config.size,

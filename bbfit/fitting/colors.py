@@ -1,4 +1,4 @@
-"""Matching of color: the mean color of a cloud is that of the tree."""
+"""The colors of a finished fit: their mean is that of the tree, and they are rounded to few bits."""
 
 from __future__ import annotations
 
@@ -37,6 +37,12 @@ def matched_colors(cloud: BillboardCloud, views: ViewSet, backend: Backend = "au
             factors = (target / drawn.clamp_min(1e-6)).clamp(1 / _LARGEST, _LARGEST).to(cloud.texels)
             cloud = cloud.with_texels(torch.cat([(cloud.texels[:, :3] * factors).clamp(0, 1), cloud.texels[:, 3:]], 1))
     return cloud
+
+
+def rounded(cloud: BillboardCloud, color_bits: int, alpha_bits: int) -> BillboardCloud:
+    """Round texels to multiples of 2 ** (8 - bits) of 255, and the largest to 255: PNG compresses fewer values better."""
+    steps = torch.tensor([float(1 << 8 - bits) for bits in (color_bits,) * 3 + (alpha_bits,)]).to(cloud.texels)
+    return cloud.with_texels(((cloud.texels * 255 / steps).round() * steps).clamp(max=255) / 255)
 
 
 def _mean_color(pictures: Iterable[Tensor]) -> Tensor | None:

@@ -20,21 +20,28 @@ Colors = Literal["views", "matched", "joint"]
 _Binarization = Annotated[float, Range(0, 10)]
 _Density = Annotated[float, Range(0, 16, open_low=True)]
 _Rate = Annotated[float, Range(0, 10, open_low=True)]
+_Bits = Annotated[int, Range(1, 8)]
 _Rounds = Annotated[int, Range(0)]
 _Sharpness = Annotated[float, Range(0, 1000)]
 _Unit = Annotated[float, Range(0, 1)]
 _Decay = Annotated[float, Range(0, 0.9999)]
 _Config = TypeVar("_Config", bound="FitConfig")
 
+EVEN = 8
+"""Number of evenly placed billboards of the default preset."""
+# From so many billboards on, searches are short: different clusterings lead to nearly equal results.
+_MANY = 12
+
 _PRESETS: dict[str, dict[str, Any]] = {
     "default": {
         "alpha": "mask",
-        "billboards": 8,
         "placement": "clusters",
         "placement_learning_rate": 0.015,
         "bounds": "silhouette",
         "loss": "backgrounds",
         "ssim_weight": 0.01,
+        "color_bits": 5,
+        "alpha_bits": 6,
         "levels": 4,
         "steps": 1200,
         "views_per_step": 2,
@@ -54,6 +61,8 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "loss": "l2",
         "colors": "joint",
         "antialiased": False,
+        "color_bits": 8,
+        "alpha_bits": 8,
         "ssim_weight": 0.0,
         "sharpness_weight": 0.0,
         "binarization_weight": 0.0,
@@ -70,9 +79,9 @@ _PRESETS: dict[str, dict[str, Any]] = {
 # Values of the default preset that depend on the alpha mode. A cutoff leaves no half-transparent texels that could smooth an edge, and
 # stochastic alpha is the noisier the more of them there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
-    "mask": {"colors": "views", "antialiased": True, "texel_density": 1.0, "sharpness_weight": 8.0, "binarization_weight": 0.02},
-    "blend": {"colors": "matched", "antialiased": False, "texel_density": 1.25, "sharpness_weight": 14.0, "binarization_weight": 0.004},
-    "hash": {"colors": "views", "antialiased": False, "texel_density": 1.25, "sharpness_weight": 14.0, "binarization_weight": 0.03},
+    "mask": {"colors": "views", "antialiased": True, "texel_density": 0.7, "sharpness_weight": 8.0, "binarization_weight": 0.02},
+    "blend": {"colors": "matched", "antialiased": False, "texel_density": 0.85, "sharpness_weight": 14.0, "binarization_weight": 0.004},
+    "hash": {"colors": "views", "antialiased": False, "texel_density": 0.85, "sharpness_weight": 14.0, "binarization_weight": 0.03},
 }
 
 
@@ -88,7 +97,11 @@ class FitConfig:
     alpha_cutoff: Cutoff = 0.5
     """Least alpha that shows with mask, in (0, 1)."""
     billboards: Count | None = None
-    """Number of billboards. Preset: 8; thesis: 4."""
+    """Number of billboards. Preset: as many as pay for this tree, within least_billboards and most_billboards; thesis: 4."""
+    least_billboards: Count = 16
+    """Least number of billboards that the preset chooses by itself."""
+    most_billboards: Count = 32
+    """Largest number of billboards that the preset chooses by itself."""
     placement: Placement | None = None
     """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
     A search compares clusterings of points on the mesh or, without a mesh, in the visual hull of the views.
@@ -96,12 +109,13 @@ class FitConfig:
     orientation: Orientation = "any"
     """Orientation of clustered billboards: upright, in any direction (free), or whichever of the two fits better (any)."""
     restarts: Count | None = None
-    """Independent searches for a placement; the best result is kept. Default: two for eight billboards or more, else one."""
-    candidates: Count = 12
-    """Clusterings that a search compares; more take longer and may find a better placement."""
+    """Independent searches for a placement; the best result is kept. Default: two for eight to eleven billboards, else one."""
+    candidates: Count | None = None
+    """Clusterings that a search compares; more take longer and may find a better placement.
+    Default: 12, or 4 for twelve billboards or more, of which any clustering is about as good as any other."""
     refinement_rounds: _Rounds | None = None
     """Rounds that refine the best placement by moving, splitting and merging billboards.
-    Default: three fewer than there are billboards, at least one and at most six."""
+    Default: three fewer than there are billboards, at least one and at most six; none for twelve billboards or more."""
     placement_learning_rate: _Unit | None = None
     """Initial step size of the billboards' placement: radians a step, and fractions of the tree's radius. With 0 they do not move.
     Preset: 0.015; thesis: 0."""
@@ -113,7 +127,7 @@ class FitConfig:
     Preset: silhouette; thesis: viewport."""
     texel_density: _Density | None = None
     """Texels per pixel of a view along each side, for a billboard that faces the camera at the tree's axis.
-    Preset: 1 (mask) or 1.25; thesis: 1."""
+    Preset: 0.7 (mask) or 0.85; thesis: 1."""
     loss: Loss | None = None
     """Loss to minimize: absolute (l1) or squared (l2) differences of premultiplied RGBA, or squared ones over random backgrounds.
     It is summed over channels and averaged over pixels; for backgrounds it is the expectation.
@@ -127,6 +141,10 @@ class FitConfig:
     """Fit a mask for programs that smooth its edges by alpha to coverage. Preset: yes; thesis: no. Other alpha modes ignore it."""
     max_texels: Count | None = None
     """Most texels of all billboards together; their density is lowered to stay within it. Default: no limit."""
+    color_bits: _Bits | None = None
+    """Bits of each color channel of a texel, 1 to 8. Fewer make the file smaller, and leaves hide the steps. Preset: 5; thesis: 8."""
+    alpha_bits: _Bits | None = None
+    """Bits of a texel's alpha, 1 to 8. Preset: 6; thesis: 8."""
     ssim_weight: _Unit | None = None
     """Weight of 1 - SSIM, which preserves structure, beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: _Sharpness | None = None
@@ -176,29 +194,44 @@ class FitConfig:
         """
         if isinstance(self, ResolvedFit):
             return self
+        if self.least_billboards > self.most_billboards:
+            fail(
+                "least_billboards", f"{self.least_billboards} are more than most_billboards allows, {self.most_billboards}", "exchange them"
+            )
         preset, given = _PRESETS[self.preset], {name: value for name, value in vars(self).items() if value is not None}
         values = _BY_ALPHA[given.get("alpha", preset["alpha"])] | preset | given
-        count = values["billboards"]
-        return ResolvedFit(**{"restarts": min(2, max(1, count // 4)), "refinement_rounds": min(6, max(1, count - 3))} | values)
+        if values["placement"] == "even":
+            values = {"billboards": EVEN} | values
+        return ResolvedFit(**_effort(values.get("billboards")) | values)
+
+
+def _effort(count: int | None) -> dict[str, Any]:
+    """The defaults that depend on the number of billboards: how long to search for a placement of them."""
+    if count is None:
+        return {}
+    if count >= _MANY:
+        return {"restarts": 1, "candidates": 4, "refinement_rounds": 0}
+    return {"restarts": min(2, max(1, count // 4)), "candidates": 12, "refinement_rounds": min(6, max(1, count - 3))}
 
 
 class ResolvedFit(FitConfig):
-    """A :class:`FitConfig` in which only ``max_texels`` may be ``None``.
+    """A :class:`FitConfig` in which only ``max_texels`` may be ``None``, and, until the fit has chosen it, the number of billboards.
+
+    The length of the search depends on that number, and is then ``None`` too.
 
     Raises InputError if a value is missing, or values contradict each other.
     """
 
     alpha: AlphaKind
-    billboards: Count
     placement: Placement
-    restarts: Count
-    refinement_rounds: _Rounds
     placement_learning_rate: _Unit
     bounds: Bounds
     texel_density: _Density
     loss: Loss
     colors: Colors
     antialiased: bool
+    color_bits: _Bits
+    alpha_bits: _Bits
     ssim_weight: _Unit
     sharpness_weight: _Sharpness
     binarization_weight: _Binarization
@@ -210,9 +243,14 @@ class ResolvedFit(FitConfig):
     beta2: _Decay
     schedule: Schedule
 
+    def counted(self, count: int) -> ResolvedFit:
+        """The same with a number of billboards, if it is not chosen yet, and with a search of the length that suits it."""
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        return ResolvedFit(**{"billboards": count} | _effort(count) | given)
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        textures = self.billboards * (1 if self.sides == "one" else 2)
+        textures = (self.billboards or self.most_billboards) * (1 if self.sides == "one" else 2)
         if self.max_texels is not None and self.max_texels < textures:
             fail("max_texels", f"{self.max_texels} are too few for {textures} textures", "allow more")
         if self.sides == "pair" and self.placement == "clusters":

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bbfit.checks import fail
 from bbfit.fitting.bounds import facing_view_bounds, silhouette_bounds
-from bbfit.fitting.config import FitConfig
+from bbfit.fitting.config import EVEN, FitConfig
 from bbfit.geometry.camera import Camera, convergence_point
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.views import ViewSet
@@ -30,7 +30,7 @@ def start_cloud(views: ViewSet, config: FitConfig) -> BillboardCloud:
     density = resolved.texel_density * float(focal)
     size = torch.tensor([camera.height, camera.width])
     planes = even_upright(
-        resolved.billboards,
+        resolved.billboards or EVEN,
         axis=axis,
         half_extents=size.flip(0) / focal / 2,
         texture_sizes=_at_least_one(size * resolved.texel_density),

@@ -17,7 +17,7 @@ from torch import Tensor
 from bbfit.checks import InputError, InputTypeError, check_range, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
-from bbfit.fitting.colors import matched_colors
+from bbfit.fitting.colors import matched_colors, rounded
 from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.coverage import matched_coverage
 from bbfit.fitting.initialize import bounded, pixels_per_meter, random_textures, sized, start_cloud, tree_radius
@@ -25,7 +25,7 @@ from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.points import hull_points, mesh_points
 from bbfit.fitting.requirements import check_cameras, check_device
-from bbfit.fitting.search import find_placement
+from bbfit.fitting.search import choose_count, find_placement
 from bbfit.fitting.steps import BLEND, HARDEST, Stepper
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
@@ -151,6 +151,7 @@ def fit(
             _save(checkpoint, key, replace(state, seconds=time.perf_counter() - started))
     started -= state.seconds
 
+    config = config.counted(len(state.start))
     start, fitted, losses = state.start, state.placement, state.losses
     density, radius = config.texel_density * float(pixels_per_meter(views.train.cameras)), tree_radius(views.train)
     for level in (levels := resolution_levels(config, views.train.cameras)):
@@ -186,6 +187,8 @@ def fit(
         fitted = replace(drawn, alpha=fitted.alpha)
     if config.colors != "joint":
         fitted = matched_colors(fitted, views.train, config.backend)
+    if min(config.color_bits, config.alpha_bits) < 8:
+        fitted = rounded(fitted, config.color_bits, config.alpha_bits)
     # No view determines the colors of transparent texels, but filtering shows them.
     bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
@@ -219,6 +222,8 @@ def _initial_state(
         points = hull_points(views.train, seed=config.seed, own=views.own)
     else:
         points = mesh_points(tree, views.train, rendered=rendered, seed=config.seed)
+    if config.billboards is None:
+        config = config.counted(choose_count(views.train, points, config, on_place))
     placement = find_placement(views.train, points, config, on_place)
     density = config.texel_density * float(pixels_per_meter(views.train.cameras))
     return _FitState([], sized(placement, density, config.max_texels), placement, {}, 0.0)

@@ -26,9 +26,8 @@ SIDE = 64
 """Approximate side of the pictures that the search renders, in pixels."""
 # Learning rate of the candidates, and of everything after them.
 _RATE, _LATER_RATE = 0.15, 0.06
-# A clustering supplies three quarters of the billboards. Additions supply the rest, one in four, and for many billboards at most eight:
-# each addition fits all billboards anew.
-_BILLBOARDS_PER_ADDITION, _MOST_ADDITIONS = 4, 8
+# A clustering supplies three quarters of the billboards. Additions supply the rest, one in four, unless there are too many.
+_BILLBOARDS_PER_ADDITION = 4
 # Views in every step.
 _BATCH = 8
 
@@ -45,10 +44,18 @@ class Effort:
     """Steps of every alternative in additions and refinement rounds."""
     survivors: float = 0.3
     """Fraction of the candidates that survive."""
+    most_additions: int = 8
+    """Most billboards that are added one by one, each of which fits all of them anew. A clustering supplies the others."""
 
 
 USUAL = Effort()
 """The effort of every fit."""
+QUICK = Effort(more_steps=30, most_additions=0)
+"""The effort of a comparison of numbers of billboards."""
+COUNTS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
+"""Numbers of billboards that are compared."""
+LEAST_GAIN_DB = 1.5
+"""Least gain at a low resolution, in dB, for which the area of the billboards may double."""
 
 
 def find_placement(
@@ -69,6 +76,32 @@ def find_placement(
     return _Search(views, points, config, on_progress or (lambda done, total: None), effort).best()
 
 
+def choose_count(views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None] | None = None) -> int:
+    """Choose the number of billboards at the knee of the curve: from which on more of them cost more than they gain.
+
+    What a graphics card pays for is the area that it shades and the textures on it, and both grow with the area of the billboards. Short
+    searches try increasing numbers of billboards, from ``least_billboards`` to ``most_billboards``. A number replaces the last one that
+    was accepted if every doubling of the area lowers the loss at a low resolution by at least :data:`LEAST_GAIN_DB`.
+
+    Parameters and progress are those of :func:`find_placement`; ``config.billboards`` is not used.
+    """
+    counts = sorted({config.least_billboards, config.most_billboards} | set(COUNTS))
+    counts = [count for count in counts if config.least_billboards <= count <= config.most_billboards]
+    if len(counts) == 1:
+        return counts[0]
+    accepted: tuple[int, float, float] | None = None
+    for number, count in enumerate(counts):
+        search = _Search(views, points, config.counted(count), lambda done, total: None, QUICK)
+        cloud, loss = search.searched(0)
+        area, decibels = float(cloud.half_extents.double().prod(-1).sum()), -10 * math.log10(max(loss, 1e-12))
+        if accepted is None or decibels - accepted[2] >= LEAST_GAIN_DB * max(math.log2(area / accepted[1]), 0.0):
+            accepted = count, area, decibels
+        if on_progress is not None:
+            on_progress(number + 1, len(counts))
+    assert accepted is not None
+    return accepted[0]
+
+
 class _Search:
     def __init__(
         self, views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None], effort: Effort = USUAL
@@ -79,7 +112,9 @@ class _Search:
         self._pictures = self._targets.pictures(range(len(views)))
         self._radius, self._generator = tree_radius(views), torch.Generator().manual_seed(config.seed)
         self._moves = Moves(points, self._targets.cameras, self._pictures, config, self._radius, self._generator)
-        self._added = min(config.billboards // _BILLBOARDS_PER_ADDITION, _MOST_ADDITIONS)
+        assert config.billboards and config.candidates and config.restarts and config.refinement_rounds is not None  # see counted()
+        self._restarts, self._candidates, self._rounds = config.restarts, config.candidates, config.refinement_rounds
+        self._added = min(config.billboards // _BILLBOARDS_PER_ADDITION, effort.most_additions)
         self._clusters, self._survivors = config.billboards - self._added, max(1, round(effort.survivors * config.candidates))
         self._done = 0
         # Clouds that get additions. Every addition halves their number, and few billboards limit it, so that the search stays short.
@@ -90,16 +125,15 @@ class _Search:
 
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
-        best = min((self._searched(number) for number in range(self._config.restarts)), key=itemgetter(1))
-        for number in range(self._config.refinement_rounds):
+        best = min((self.searched(number) for number in range(self._restarts)), key=itemgetter(1))
+        for number in range(self._rounds):
             best = min(best, self._best_of([best[0], *self._moves.refined(best[0], number, self._losses)]), key=itemgetter(1))
         return best[0]
 
-    def _searched(self, number: int) -> tuple[BillboardCloud, float]:
+    def searched(self, number: int) -> tuple[BillboardCloud, float]:
         """Run search ``number``. Return its cloud and the loss."""
-        config = self._config
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-            starts = range(number * config.candidates, (number + 1) * config.candidates)
+            starts = range(number * self._candidates, (number + 1) * self._candidates)
             clouds = list(pool.map(lambda start: self._moves.clustered(start, self._clusters), starts))
         clouds, losses = self._fitted(clouds, self._effort.steps, _RATE)
         survivors = sorted(range(len(clouds)), key=losses.__getitem__)[: self._survivors]

@@ -25,7 +25,7 @@ class Orbit:
     """
 
     count: int = 90
-    """Number of views, divided among the rings as evenly as possible."""
+    """Number of views, divided among the rings in proportion to their circumferences, so that all directions are about equally dense."""
     elevations_degrees: tuple[float, ...] = (0.0,)
     """Elevation of each ring, in [-90, 90]."""
 
@@ -37,12 +37,20 @@ class Orbit:
             check_range("elevations", elevation, -90, 90)
 
     @property
+    def ring_counts(self) -> tuple[int, ...]:
+        """Number of views on each ring, at least one, by the method of largest remainders."""
+        weights = np.cos(np.radians(self.elevations_degrees)).clip(1e-9)
+        quotas = (self.count - len(weights)) * weights / weights.sum()  # one of each ring's views is certain
+        counts = 1 + np.floor(quotas + 1e-9).astype(int)
+        largest = np.argsort(-(quotas - (counts - 1)).round(9), kind="stable")[: self.count - counts.sum()]
+        counts[largest] += 1
+        return tuple(counts.tolist())
+
+    @property
     def angles_degrees(self) -> NDArray[np.float64]:
         """Azimuth and elevation of every view, [V, 2]; rings one after another, successive rings turned by half a step."""
-        rings = len(self.elevations_degrees)
         rows = []
-        for ring, elevation in enumerate(self.elevations_degrees):
-            n = self.count // rings + (ring < self.count % rings)
+        for ring, (n, elevation) in enumerate(zip(self.ring_counts, self.elevations_degrees, strict=True)):
             azimuth = (np.arange(n) + 0.5 * (ring % 2)) * 360.0 / n
             rows.append(np.stack([azimuth, np.full(n, float(elevation))], -1))
         return np.concatenate(rows)

@@ -19,7 +19,7 @@ from bbfit.checks import fail
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.polygons import area, sides
-from bbfit.operators.drawing.compositing import composite, opacity, thresholds
+from bbfit.operators.drawing.compositing import composite, coverage, opacity, thresholds
 from bbfit.operators.drawing.reference import EDGE_ON
 
 # Distance outside a polygon, as a share of the atlas, at which a pixel's center still counts as inside, so that rounding opens no seams.
@@ -54,6 +54,8 @@ class Hits:
     """Level of detail, float64 [M]; negative where texels are magnified."""
     depth: Tensor
     """Depth in meters, float64 [M]."""
+    to_uv: Tensor
+    """From a pixel (x, y, 1) to homogeneous texture coordinates, [3, 3]."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ def hits(cards: Cards, sheet: Sheet, camera: Camera) -> Hits:
     # d(a / c) = (da - (a / c) dc) / c, in x and in y
     size = torch.tensor(cards.atlas.image.shape[1::-1], dtype=torch.float64)
     rates = [((to_uv[:2, axis] - uv * to_uv[2, axis]) * size).norm(dim=-1) for axis in (0, 1)]
-    return Hits(x, y, uv, (torch.maximum(*rates) / scale.abs()).log2(), depth)
+    return Hits(x, y, uv, (torch.maximum(*rates) / scale.abs()).log2(), depth, to_uv)
 
 
 def filtered(levels: MipChain, uv: Tensor, detail: Tensor) -> Tensor:
@@ -197,6 +199,9 @@ def _view(cards: Cards, sheets: list[Sheet], levels: MipChain, camera: Camera) -
         straight = filtered(levels, met.uv, met.detail) / 255
         if cards.alpha.kind == "hash":
             straight[:, 3] = (straight[:, 3] >= thresholds(met.x, met.y, sheet.first)).to(straight)
+        elif cards.alpha.antialiased:
+            across, down = ((filtered(levels, uv, met.detail)[:, 3] / 255 - straight[:, 3]).abs() for uv in _beside(met))
+            straight[:, 3] = coverage(straight[:, 3], across + down, cards.alpha)
         else:
             straight[:, 3] = opacity(straight[:, 3], cards.alpha)
         if (straight[:, 3] > 0).any():
@@ -206,7 +211,16 @@ def _view(cards: Cards, sheets: list[Sheet], levels: MipChain, camera: Camera) -
             colors.append(layer[None, :3])
             alphas.append(layer[None, 3:])
             depths.append(depth[None, None])
-    return composite(colors, alphas, depths)[0].permute(1, 2, 0) if colors else torch.zeros(height, width, 4)
+    return (
+        composite(colors, alphas, depths, nested=cards.alpha.antialiased)[0].permute(1, 2, 0) if colors else torch.zeros(height, width, 4)
+    )
+
+
+def _beside(met: Hits) -> list[Tensor]:
+    """Texture coordinates, [M, 2], at the other pixel of each hit's row and at that of its column in its square of 2 x 2 pixels."""
+    places = [(met.x ^ 1, met.y), (met.x, met.y ^ 1)]
+    rows = [torch.stack([row[0] * x + row[1] * y + row[2] for row in met.to_uv], -1) for x, y in places]
+    return [row[:, :2] / row[:, 2:] for row in rows]
 
 
 def _faces(sheet: Sheet, camera: Camera) -> bool:

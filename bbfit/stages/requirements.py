@@ -11,14 +11,13 @@ from bbfit.budget.choice import LEAST_VIEWS, validation_split
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.requirements import check_cameras
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
-from bbfit.geometry.orbit import Orbit
-from bbfit.layout import split_views
+from bbfit.layout import split_rings, split_views
 
 
 def check_planned_views(views: ViewsConfig, fit: FitConfig, *, mesh: bool, budget: bool) -> None:
     """Require that views that are not rendered yet will suffice for a fit, on a ``mesh`` or without one, and for trials of a ``budget``."""
     cameras = planned_cameras(views)
-    if all(abs(elevation) == 90 for elevation in views.elevations):
+    if all(abs(elevation) == 90 for elevation in views.rings):
         hint = "add a ring around the tree, as in --elevations 0 90"
     else:
         hint = f"give a larger --count than {views.count}"
@@ -36,7 +35,7 @@ def check_training(cameras: Camera, fit: FitConfig, *, mesh: bool, budget: bool,
 
 def planned_cameras(config: ViewsConfig) -> Camera:
     """The training cameras of views that are not rendered yet, at a distance of one meter."""
-    directions = Orbit(config.count, tuple(config.elevations)).directions[split_views(config.count, config.seed)[0]]
+    directions = config.orbit.directions[split_rings(config.orbit.ring_counts, config.seed)[0]]
     intrinsics = pinhole_intrinsics(config.fov_degrees, config.size, config.size).repeat(len(directions), 1, 1)
     transforms = look_at(directions, torch.zeros(3, dtype=directions.dtype))
     return Camera(transforms, intrinsics, config.size, config.size, config.orthographic)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from bbfit.blender.config import RING
 from bbfit.blender.requirements import check_blender
 from bbfit.checks import InputError, check_file, check_folder, fail
 from bbfit.exporting.config import ExportConfig
@@ -108,6 +109,8 @@ def run_sweep(
         fail("budget", "a sweep runs the configurations of its grid", "omit the budget")
     grid = Grid.load(config.grid).narrowed(config)
     cells = grid.cells(stages.fit, max_cells=config.max_cells)
+    if stages.views.elevations is None and all(cell.config.preset == "thesis" for cell in cells):
+        stages = replace(stages, views=replace(stages.views, elevations=RING))
     all_sources = sources(species if species or trees or views else grid.trees, trees, views, stages.grow.species_file)
     _check(Path(out), all_sources, cells, config, stages)
     with claimed_folder("out", out) as folder:

@@ -71,15 +71,20 @@ def opacity(alpha: Tensor, mode: AlphaMode) -> Tensor:
     if mode.kind == "blend":
         return alpha
     if mode.antialiased:
-        rate = (1 / contrast(alpha.detach()).clamp_min(LEAST_CONTRAST)).clamp_max(mode.hardness)
-        gentle, ramp = ((0.5 + (alpha - mode.cutoff) * slope).clamp(0, 1) for slope in (rate.clamp_max(STEEPEST), rate))
-        return torch.where(alpha > 0, gentle + (ramp - gentle).detach(), 0)
+        return coverage(alpha, contrast(alpha.detach()), mode)
     steepness = min(mode.hardness, STEEPEST)
     ramp = (0.5 + (alpha - mode.cutoff) * steepness).clamp(0, 1)
     if mode.hardness == steepness:
         return ramp
     hard = (alpha >= mode.cutoff).to(alpha) if math.isinf(mode.hardness) else (0.5 + (alpha - mode.cutoff) * mode.hardness).clamp(0, 1)
     return ramp + (hard - ramp).detach()
+
+
+def coverage(alpha: Tensor, contrast: Tensor, mode: AlphaMode) -> Tensor:
+    """The share of a pixel that an antialiased mask covers, for the filtered alpha at its center and the :func:`contrast`, of one shape."""
+    rate = (1 / contrast.clamp_min(LEAST_CONTRAST)).clamp_max(mode.hardness)
+    gentle, ramp = ((0.5 + (alpha - mode.cutoff) * slope).clamp(0, 1) for slope in (rate.clamp_max(STEEPEST), rate))
+    return torch.where(alpha > 0, gentle + (ramp - gentle).detach(), 0)
 
 
 def contrast(alpha: Tensor) -> Tensor:
