@@ -105,6 +105,9 @@ class Report:
     """Share of the model's area that is drawn although nothing is visible there, in [0, 1]."""
     sizes: tuple[SizeScore, ...] = ()
     """The exported model in smaller and smaller pictures, the largest first."""
+    antialiased: Measures | None = None
+    """The means over the views of a mask that is drawn with alpha to coverage (:class:`~bbfit.geometry.alpha.AlphaMode`), while all other
+    scores are those of its hard edges; ``None`` for other alpha modes."""
 
     @property
     def mean(self) -> Measures:
@@ -138,7 +141,8 @@ class Report:
             "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
             "colour": {"delta_e", "chroma", "brightness", "target", "render", "target_inside", "render_inside"},
             "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw",
-            "alpha": {"mode", "cutoff"}, "seconds": {stage: ..}, "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
+            "antialiased": {the same measures} or None, "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
+            "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
             "rings": [{"elevation_degrees", "views", and the same measures}],
             "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures}]}``
         """
@@ -146,6 +150,7 @@ class Report:
             "vertices": self.vertices.to_json(),
             "bytes": self.bytes.to_json(),
             "overdraw": self.overdraw,
+            "antialiased": None if self.antialiased is None else self.antialiased.to_json(),
             "alpha": {"mode": self.alpha.kind, "cutoff": self.alpha.cutoff},
             "seconds": dict(self.seconds),
             "sizes": [asdict(size) for size in self.sizes],
@@ -176,7 +181,8 @@ class Report:
                 for view in content["views"]
             )
             afar = tuple(SizeScore(**size) for size in content["sizes"])
-            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar)
+            antialiased = None if content["antialiased"] is None else Measures.from_json(content["antialiased"])
+            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, antialiased)
             if not scores:
                 raise ValueError("it has no views")
             check_record("report", report, Report)

@@ -13,7 +13,7 @@ from torch import Tensor
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.evaluation import metrics, thesis_scale
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
-from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
+from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale, mean_measures
 from bbfit.evaluation.report import Cost, Report, ViewScore
 from bbfit.evaluation.sizes import HALVINGS, score_sizes
 from bbfit.exporting.config import ExportConfig
@@ -85,16 +85,26 @@ def evaluate_model(
 ) -> Report:
     """Do what :func:`evaluate` does for a model whose polygons or file may already be computed."""
     started, original, on_progress = time.perf_counter(), original or OriginalTree(), on_progress or (lambda done, total: None)
-    total = len(views) + HALVINGS + 1
-    scores = score_views(lambda index: held_out(model.draw, views, index)[1], views, on_view=lambda done, _: on_progress(done, total))
-    sizes = score_sizes(model.draw, views, on_size=lambda done, _: on_progress(len(views) + done, total))
+    models = [model] if model.cloud.alpha.kind != "mask" else [model, model.antialiased()]
+    total, scored = len(models) * len(views) + HALVINGS + 1, list[tuple[ViewScore, ...]]()
+    for each in models:
+        before = len(scored) * len(views)
+        scored.append(
+            score_views(
+                lambda index, draw=each.draw: held_out(draw, views, index)[1],  # type: ignore[misc]
+                views,
+                on_view=lambda done, _, before=before: on_progress(before + done, total),  # type: ignore[misc]
+            )
+        )
+    sizes = score_sizes(model.draw, views, on_size=lambda done, _: on_progress(len(models) * len(views) + done, total))
     return Report(
-        views=scores,
+        views=scored[0],
         vertices=Cost(model.cards.vertex_count, original.vertices),
         bytes=Cost(len(model.glb), original.bytes),
         alpha=model.cloud.alpha,
         overdraw=model.overdraw,
         sizes=sizes,
+        antialiased=mean_measures([view.measures for view in scored[1]]) if len(models) > 1 else None,
         seconds={"evaluate": time.perf_counter() - started},
     )
 

@@ -72,6 +72,10 @@ class ShippedModel:
             return draw_cards(self.cards, camera)
         return render(self.cloud, camera.to(self.cloud.texels.device))
 
+    def antialiased(self) -> ShippedModel:
+        """The same model as a program draws it that smooths the edges of masks by alpha to coverage."""
+        return replace(self, cloud=replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=True)))
+
     def save(self, path: str | Path) -> list[Path]:
         """Write the files as :func:`export` does, with the same results and errors."""
         path = check_model_path("model file", path)

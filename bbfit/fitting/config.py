@@ -79,9 +79,9 @@ _PRESETS: dict[str, dict[str, Any]] = {
 # Values of the default preset that depend on the alpha mode. A cutoff leaves no half-transparent texels that could smooth an edge, and
 # stochastic alpha is the noisier the more of them there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
-    "mask": {"colors": "views", "antialiased": True, "texel_density": 0.7, "sharpness_weight": 8.0, "binarization_weight": 0.02},
-    "blend": {"colors": "matched", "antialiased": False, "texel_density": 0.85, "sharpness_weight": 14.0, "binarization_weight": 0.004},
-    "hash": {"colors": "views", "antialiased": False, "texel_density": 0.85, "sharpness_weight": 14.0, "binarization_weight": 0.03},
+    "mask": {"colors": "views", "antialiased": True, "texel_density": 0.85, "sharpness_weight": 8.0, "binarization_weight": 0.02},
+    "blend": {"colors": "matched", "antialiased": False, "texel_density": 1.0, "sharpness_weight": 14.0, "binarization_weight": 0.004},
+    "hash": {"colors": "views", "antialiased": False, "texel_density": 1.0, "sharpness_weight": 14.0, "binarization_weight": 0.03},
 }
 
 
@@ -127,7 +127,7 @@ class FitConfig:
     Preset: silhouette; thesis: viewport."""
     texel_density: _Density | None = None
     """Texels per pixel of a view along each side, for a billboard that faces the camera at the tree's axis.
-    Preset: 0.7 (mask) or 0.85; thesis: 1."""
+    Preset: 0.85 (mask) or 1; thesis: 1."""
     loss: Loss | None = None
     """Loss to minimize: absolute (l1) or squared (l2) differences of premultiplied RGBA, or squared ones over random backgrounds.
     It is summed over channels and averaged over pixels; for backgrounds it is the expectation.

@@ -28,9 +28,10 @@ _PIXELS = 1 << 22
 def matched_coverage(cloud: BillboardCloud, views: ViewSet, backend: Backend = "auto") -> BillboardCloud:
     """Adjust the alpha of a masked cloud so that it covers as much of the views as the tree does, and round its texels to 8 bits.
 
-    After a fit, the alpha of texels that are in some views and not in others lies within a thousandth of the cutoff. Rounding to 8 bits
-    would move all of them to the same side of the cutoff. This function therefore spreads the distances from the cutoff and keeps the order
-    of texels. It then shifts alpha by one number per billboard, except where alpha is 0.
+    After a fit for hard edges, the alpha of texels that are in some views and not in others lies within a thousandth of the cutoff.
+    Rounding to 8 bits would move all of them to the same side of the cutoff. This function therefore spreads the distances from the cutoff
+    and keeps the order of texels. For an antialiased mask it does not, because there alpha's slope is the width of an edge. It then shifts
+    alpha by one number per billboard, except where alpha is 0.
 
     Before the shifts, a cloud may cover a fifth less than the tree from sides that few of its billboards face, and a tenth more from
     others. The shifts are a ridge regression of the relative errors of coverage in single views, of which at most 24, evenly spaced, are
@@ -49,7 +50,9 @@ def matched_coverage(cloud: BillboardCloud, views: ViewSet, backend: Backend = "
     rounded = (cloud.texels * 255).round() / 255
     alpha, cutoff = cloud.texels[:, 3], cloud.alpha.cutoff
     room = torch.where(alpha >= cutoff, 1 - cutoff, cutoff)
-    spread = cutoff + (alpha - cutoff).sign() * room * ((alpha - cutoff).abs() / room) ** _SPREAD
+    spread = alpha
+    if not cloud.alpha.antialiased:
+        spread = cutoff + (alpha - cutoff).sign() * room * ((alpha - cutoff).abs() / room) ** _SPREAD
     billboard = torch.repeat_interleave((cloud.texture_sizes.prod(-1) * (1 + cloud.two_sided.long())).to(alpha.device))
     hardness = max(_HARDNESS, 0.5 / min(cutoff, 1 - cutoff))
     soft = replace(cloud, alpha=replace(cloud.alpha, hardness=hardness))

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal, get_args
 
-from bbfit.checks import Range, check_choice, check_range
+from bbfit.checks import Range, check_choice, check_range, fail
 
 AlphaKind = Literal["mask", "blend", "hash"]
 Cutoff = Annotated[float, Range(0, 1, open_low=True, open_high=True)]
@@ -27,9 +27,11 @@ class AlphaMode:
     the slope at which alpha 0 is nothing and alpha 1 opaque."""
     antialiased: bool = False
     """Whether a mask is drawn with alpha to coverage, which smooths its edges: the opacity rises from nothing to opaque over one pixel
-    around the cutoff (:func:`bbfit.operators.drawing.compositing.opacity`). Other modes ignore it."""
+    around the cutoff (:func:`bbfit.operators.drawing.compositing.opacity`). Other modes are never antialiased."""
 
     def __post_init__(self) -> None:
         check_choice("alpha", self.kind, get_args(AlphaKind))
+        if self.antialiased and self.kind != "mask":
+            fail("antialiased", f"alpha to coverage smooths masks, not {self.kind}", "choose mask")
         check_range("alpha_cutoff", self.cutoff, 0, 1, open_low=True, open_high=True)
         check_range("hardness", min(self.hardness, 1e30), 0.5 / min(self.cutoff, 1 - self.cutoff), 1e30)

@@ -62,6 +62,14 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
     table.add_row("color brightness", _ONE, "", "", _share(color.brightness), "")
     table.add_row("... with holes", _ONE, "", "", _share(mean.brightness), "")
 
+    if report.antialiased is not None:
+        table.add_section()
+        table.add_row("with alpha to coverage", "", "", "", "", "", style="bold")
+        smooth = report.antialiased
+        for name, better, field, digits in (("PSNR, dB", _UP, "psnr", 2), ("SSIM", _UP, "ssim", 4), ("FLIP", _DOWN, "flip", 4)):
+            values = [f"{getattr(one, field):.{digits}f}" for one in (smooth.over.mean, smooth.over_white)]
+            table.add_row(name, better, *values, "", "")
+
     if 1 < len(report.rings) <= _MOST_RINGS:
         table.add_section()
         for ring in report.rings:

@@ -154,7 +154,16 @@ def test_the_mode_stays_with_the_cloud(known_cloud: BillboardCloud, tmp_path: ob
 
 
 @pytest.mark.parametrize(
-    "bad", [{"kind": "opaque"}, {"cutoff": 0.0}, {"cutoff": 1}, {"cutoff": math.nan}, {"cutoff": "half"}, {"hardness": 0.9}]
+    "bad",
+    [
+        {"kind": "opaque"},
+        {"kind": "blend", "antialiased": True},
+        {"cutoff": 0.0},
+        {"cutoff": 1},
+        {"cutoff": math.nan},
+        {"cutoff": "half"},
+        {"hardness": 0.9},
+    ],
 )
 def test_bad_modes_are_refused(bad: dict[str, object]) -> None:
     with pytest.raises(InputError, match=r"alpha|hardness"):
