@@ -17,7 +17,16 @@ const FILTERS = {
 const SHOWN = 0;
 const HIDDEN = 1;
 
-const renderer = new THREE.WebGLRenderer({ antialias: false, alpha: false });
+// With ?smooth=centered, masks are drawn with alpha to coverage as docs/engines.md describes: three.js gets the usual ramp around the cutoff.
+// With ?smooth=own it keeps its own, which begins at the cutoff.
+const smooth = new URLSearchParams(location.search).get("smooth");
+if (smooth === "centered") {
+  THREE.ShaderChunk.alphatest_fragment = THREE.ShaderChunk.alphatest_fragment.replace(
+    "smoothstep( alphaTest, alphaTest + fwidth( diffuseColor.a ), diffuseColor.a )",
+    "clamp( ( diffuseColor.a - alphaTest ) / max( fwidth( diffuseColor.a ), 0.0001 ) + 0.5, 0.0, 1.0 )",
+  );
+}
+const renderer = new THREE.WebGLRenderer({ antialias: smooth !== null, alpha: false });
 renderer.setPixelRatio(1);
 renderer.setClearColor(0xffffff, 1);
 renderer.outputColorSpace = THREE.SRGBColorSpace;
@@ -48,6 +57,7 @@ window.load = async (node) => {
     object.geometry.computeBoundingBox(); // of the vertices; the loader's is what the file says it is
     box.union(object.geometry.boundingBox.clone().applyMatrix4(object.matrixWorld));
     materials.add(object.material);
+    object.material.alphaToCoverage = smooth !== null && object.material.alphaTest > 0;
   });
   return { low: box.min.toArray(), high: box.max.toArray(), materials: [...materials].map(describe) };
 };

@@ -69,8 +69,8 @@ class ThreeShow:
 class ThreeViewer:
     """A page with three.js, which shows one model after another; made by :func:`open_three`."""
 
-    def __init__(self, browser: Browser, thread: ThreadPoolExecutor) -> None:
-        self._browser, self._thread = browser, thread
+    def __init__(self, browser: Browser, thread: ThreadPoolExecutor, query: str = "") -> None:
+        self._browser, self._thread, self._query = browser, thread, query
         self._page: Page | None = None
         self._glb = Path()
         self._errors, self._warnings = list[str](), list[str]()
@@ -108,7 +108,7 @@ class ThreeViewer:
         page.on("pageerror", lambda error: self._errors.append(str(error)))
         page.route("**/*", lambda route: _answer(route, self._glb))
         try:
-            page.goto(f"{ORIGIN}/three.html")
+            page.goto(f"{ORIGIN}/three.html{self._query}")
             assert not self._errors, self._errors
         except BaseException:
             page.close()
@@ -132,11 +132,11 @@ class ThreeViewer:
 
 
 @contextmanager
-def open_three(browser: Browser, thread: ThreadPoolExecutor) -> Iterator[ThreeViewer]:
-    """A page for as many GLBs as wanted; the test fails where there is no three.js."""
+def open_three(browser: Browser, thread: ThreadPoolExecutor, query: str = "") -> Iterator[ThreeViewer]:
+    """A page for as many GLBs as wanted; the test fails where there is no three.js. three_page.js says what a ``query`` is."""
     if not (NODE / "node_modules" / "three").is_dir():
         pytest.fail(f"three.js is not installed: install Node.js and run `npm ci` in {NODE}")
-    with closing(ThreeViewer(browser, thread)) as viewer:
+    with closing(ThreeViewer(browser, thread, query)) as viewer:
         yield viewer
 
 
@@ -185,7 +185,7 @@ def _material(found: dict[str, Any]) -> ThreeMaterial:
 
 def _answer(route: Route, glb: Path) -> None:
     """Serve the page, three.js and the model under the page's own origin; refuse everything else."""
-    path = route.request.url.removeprefix(ORIGIN)
+    path = route.request.url.removeprefix(ORIGIN).partition("?")[0]
     if path == "/model.glb":
         file = glb
     elif path.startswith("/three/"):
