@@ -185,13 +185,13 @@ def fit(
     if config.alpha == "mask":
         drawn = matched_coverage(replace(fitted, alpha=replace(fitted.alpha, antialiased=config.antialiased)), views.train, config.backend)
         fitted = replace(drawn, alpha=fitted.alpha)
-    if config.colors != "joint":
-        fitted = matched_colors(fitted, views.train, config.backend)
-    if min(config.color_bits, config.alpha_bits) < 8:
-        fitted = rounded(fitted, config.color_bits, config.alpha_bits)
+    fitted = rounded(fitted, 8, config.alpha_bits)
     # No view determines the colors of transparent texels, but filtering shows them.
     bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
+    if config.colors != "joint":
+        fitted = matched_colors(fitted, views.train, config.backend)
+    fitted = rounded(fitted, config.color_bits, 8)
     if config.placement != "even" or config.placement_learning_rate:
         fitted = trimmed(fitted)
     try:

@@ -25,7 +25,8 @@ class Orbit:
     """
 
     count: int = 90
-    """Number of views, divided among the rings in proportion to their circumferences, so that all directions are about equally dense."""
+    """Number of views, divided among the rings in proportion to the square roots of their circumferences: in proportion to the
+    circumferences, a fit to a dome is visibly worse at 60 degrees than at eye level."""
     elevations_degrees: tuple[float, ...] = (0.0,)
     """Elevation of each ring, in [-90, 90]."""
 
@@ -39,7 +40,7 @@ class Orbit:
     @property
     def ring_counts(self) -> tuple[int, ...]:
         """Number of views on each ring, at least one, by the method of largest remainders."""
-        weights = np.cos(np.radians(self.elevations_degrees)).clip(1e-9)
+        weights = np.sqrt(np.cos(np.radians(self.elevations_degrees)).clip(1e-18))
         quotas = (self.count - len(weights)) * weights / weights.sum()  # one of each ring's views is certain
         counts = 1 + np.floor(quotas + 1e-9).astype(int)
         largest = np.argsort(-(quotas - (counts - 1)).round(9), kind="stable")[: self.count - counts.sum()]
