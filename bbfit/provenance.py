@@ -23,11 +23,11 @@ VERSIONS: Mapping[str, int] = {
     "views": 1,
     "budget": 4,
     "fit": 9,
-    "export": 3,
-    "evaluate": 7,
-    "report": 1,
-    "lod": 1,
-    "compare": 1,
+    "export": 4,
+    "evaluate": 8,
+    "report": 2,
+    "lod": 2,
+    "compare": 2,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""
 EXECUTION = {"affects_result": False}

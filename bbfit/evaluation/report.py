@@ -153,6 +153,8 @@ class Report:
     """Share of the model's area that is drawn although nothing is visible there, in [0, 1]."""
     sizes: tuple[SizeScore, ...] = ()
     """The exported model in smaller and smaller pictures, the largest first."""
+    shaded: float | None = None
+    """Fragments that a graphics card shades over the pixels that the targets cover (:func:`bbfit.evaluation.scoring.score_shading`)."""
 
     @property
     def mean(self) -> Measures:
@@ -183,7 +185,7 @@ class Report:
         -------
         dict
             ``{"over_white": {"psnr", "ssim", "flip"}, "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
-            "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw",
+            "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw", "shaded",
             "alpha": {"mode", "cutoff"}, "seconds": {stage: ..}, "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
             "rings": [{"elevation_degrees", "views", and the same measures}],
             "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures}]}``
@@ -192,6 +194,7 @@ class Report:
             "vertices": self.vertices.to_json(),
             "bytes": self.bytes.to_json(),
             "overdraw": self.overdraw,
+            "shaded": self.shaded,
             "alpha": {"mode": self.alpha.kind, "cutoff": self.alpha.cutoff},
             "seconds": dict(self.seconds),
             "sizes": [asdict(size) for size in self.sizes],
@@ -222,7 +225,7 @@ class Report:
                 for view in content["views"]
             )
             afar = tuple(SizeScore(**size) for size in content["sizes"])
-            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar)
+            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, content["shaded"])
             if not scores:
                 raise ValueError("it has no views")
             check_record("report", report, Report)

@@ -12,10 +12,11 @@ from bbfit.checks import check_count, check_range
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.polygons import area, kept_half, sides
 
-# Margin of a polygon around the visible part in texels, far more than the rounding of float32 and the vertex snapping of graphics cards.
-_MARGIN = 1 / 64
-# The least alpha above 0. Bilinear filtering between alpha 1/255 and 0 reaches it within a millionth of a texel from the 0.
-_ANY = 1e-9
+MARGIN = 1 / 64
+"""Margin of a polygon around the visible part in texels, far more than the rounding of float32 and the vertex snapping of graphics
+cards."""
+ANY = 1e-9
+"""The least alpha above 0. Bilinear filtering between alpha 1/255 and 0 reaches it within a millionth of a texel from the 0."""
 # Candidate directions of sides: this many around the circle, and those of the hull's longest edges.
 _AROUND, _EDGES = 72, 56
 # Samples of all cards that overdraw is measured with.
@@ -83,7 +84,7 @@ def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
     made = []
     for card in cards.cards:
         polygon = texel_corners(cards, card)
-        points = _shown_points(rimmed_alpha(cards, card.rectangle), polygon, max(least, _ANY))
+        points = _shown_points(rimmed_alpha(cards, card.rectangle), polygon, max(least, ANY))
         hull = _hull_within(points, polygon) if len(points) else points
         if len(hull) >= 3 and area(hull) > 0:
             smaller = _enclosing(hull, polygon, vertices)
@@ -119,9 +120,12 @@ def overdraw(cards: Cards, least: float) -> float:
         counts = np.maximum(np.ceil(size * np.sqrt(_SAMPLES / len(cards.cards) / size.prod())).astype(int), 8)
         x, y = (start + (np.arange(count) + 0.5) * extent / count for start, count, extent in zip(low, counts, size, strict=True))
         points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-        normals, offsets = sides(polygon)
-        points = points[(points @ normals.T <= offsets).all(-1)]
-        reached = bilinear(rimmed_alpha(cards, card.rectangle), points) >= max(least, _ANY)
+        inside = np.zeros(len(points), bool)
+        for part in card.parts:
+            normals, offsets = sides(polygon[part])
+            inside |= (points @ normals.T <= offsets).all(-1)
+        points = points[inside]
+        reached = bilinear(rimmed_alpha(cards, card.rectangle), points) >= max(least, ANY)
         shaded += abs(area(polygon))
         shown += abs(area(polygon)) * float(reached.mean()) if len(points) else 0.0
     return 1 - shown / shaded
@@ -165,7 +169,7 @@ def _hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> N
 
     if np.linalg.eigvalsh(np.cov(points.T, bias=True))[0] > 1e-3:  # points on one line have no hull of their own
         points = points[ConvexHull(points).vertices]
-    hull = (points[:, None] + _MARGIN * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])).reshape(-1, 2)
+    hull = (points[:, None] + MARGIN * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])).reshape(-1, 2)
     hull = hull[ConvexHull(hull).vertices]
     for normal, offset in zip(*sides(polygon), strict=True):
         hull = kept_half(hull, hull @ normal - offset)

@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 
 from bbfit.geometry.alpha import AlphaMode
 
+MASK_RIM = 0.5
+"""Share of a mask's cutoff from which outlines contain alpha. Programs that draw smooth edges (alpha to coverage) show half a pixel
+outside the cutoff's contour, where the ramp ``(alpha - cutoff) / fwidth(alpha) + 0.5`` is above 0; at 1 outlines end at the contour."""
+
 
 @dataclass(frozen=True)
 class Atlas:
@@ -30,7 +34,7 @@ class Atlas:
 
 @dataclass(frozen=True)
 class Card:
-    """A flat convex polygon that shows a texture of the atlas or a part of it."""
+    """A flat polygon without holes that shows a texture of the atlas or a part of it."""
 
     corners: NDArray[np.float64]
     """K >= 3 points in meters, counter-clockwise as seen from where the normal points, [K, 3]."""
@@ -44,12 +48,19 @@ class Card:
     """Index of its texture in the atlas."""
     origin: NDArray[np.float64] | None = None
     """Point in meters by which programs sort the card if it is blended, [3]; such a card gets its own node."""
+    faces: NDArray[np.int64] | None = None
+    """Triangles of a polygon with notches, as indices of corners, with the winding of the polygon, [T, 3]; ``None`` if it is convex."""
 
     @property
     def triangles(self) -> NDArray[np.int64]:
-        """A fan of triangles with the winding of the polygon, [K - 2, 3]."""
+        """Triangles with the winding of the polygon, [K - 2, 3]; a fan if it is convex."""
         middle = np.arange(1, len(self.corners) - 1)
-        return np.stack([np.zeros_like(middle), middle, middle + 1], -1)
+        return np.stack([np.zeros_like(middle), middle, middle + 1], -1) if self.faces is None else self.faces
+
+    @property
+    def parts(self) -> list[NDArray[np.int64]]:
+        """Convex polygons that make up the card, as indices of corners, [L] each; they share edges, but no area."""
+        return [np.arange(len(self.corners))] if self.faces is None else list(self.faces)
 
 
 @dataclass(frozen=True)
@@ -75,6 +86,11 @@ class Cards:
     def visible_alpha(self) -> float:
         """The least alpha that is visible: the cutoff of mask, and 0 for the other modes, which show any alpha above 0."""
         return self.alpha.cutoff if self.alpha.kind == "mask" else 0.0
+
+    @property
+    def outlined_alpha(self) -> float:
+        """The least alpha that outlines contain: all that is visible, and for mask also the rim of smooth edges (:data:`MASK_RIM`)."""
+        return self.visible_alpha * MASK_RIM
 
     def with_cards(self, cards: list[Card]) -> Cards:
         """Other cards with the same textures."""
