@@ -17,10 +17,10 @@ CORNERS = 8
 """Most corners of a card's outline in exported files."""
 # A texel of a texture with shorter sides than this is divided into boxes, at most this many along a side.
 _FINE, _PARTS = 512, 4
-# Centers that are tried: the mean of what is visible, and points along its two main directions, in standard deviations.
-_CENTERS = np.array([[0.0, 0.0], [0.9, 0.0], [-0.9, 0.0]])
-# Number of the best of them whose polygons are refined.
-_REFINED = 1
+# Centers are chosen on a grid of so many places along a side, by the least area that is seen from them, for at most so many boxes.
+_GRID, _SEEN = 5, 1000
+# Number of centers that are tried for one polygon and for each of two, and of those whose polygons are refined.
+_CENTERS, _CENTERS_OF_TWO, _REFINED = 3, 1, 1
 # Directions of lines between two polygons, least width of the gap around such a line in texels, and number of lines that are tried.
 _LINES, _GAP, _TRIED = 24, 1.0, 2
 # Fewest corners of a polygon.
@@ -80,10 +80,16 @@ def visible_boxes(rimmed: NDArray[np.float64], rectangle: NDArray[np.float64], l
 def smallest_outline(boxes: Boxes, rectangle: NDArray[np.float64], corners: int) -> list[NDArray[np.float64]]:
     """The smallest outline of boxes that is found, as one or two polygons [K, 2] in texels of positive area; empty if none is found."""
     normals, offsets = sides(rectangle)
-    found = [_finished(_rough(boxes, normals, offsets, corners), corners)]
+    found = [_finished(_rough(boxes, normals, offsets, corners, _CENTERS), corners)]
     for normal, place, first in _gaps(boxes) if corners >= 2 * _FEWEST else []:
         halves = [
-            _rough(boxes.take(part), np.concatenate([normals, [sign * normal]]), np.append(offsets, sign * place), corners - _FEWEST, 1)
+            _rough(
+                boxes.take(part),
+                np.concatenate([normals, [sign * normal]]),
+                np.append(offsets, sign * place),
+                corners - _FEWEST,
+                _CENTERS_OF_TWO,
+            )
             for part, sign in ((first, 1.0), (~first, -1.0))
         ]
         sizes = [{k: min(area(made[k]) for _, made in half if k in made) for _, made in half for k in made} for half in halves]
@@ -94,13 +100,17 @@ def smallest_outline(boxes: Boxes, rectangle: NDArray[np.float64], corners: int)
     return min((polygons for polygons in found if polygons), key=lambda polygons: sum(map(area, polygons)), default=[])
 
 
-def _rough(boxes: Boxes, normals: NDArray[np.float64], offsets: NDArray[np.float64], most: int, tried: int | None = None) -> _Rough:
-    """Rough polygons about all or the first ``tried`` of the centers."""
-    middles = (boxes.low + boxes.high) / 2
-    spread, axes = np.linalg.eigh(np.cov(middles.T, bias=True)) if len(middles) > 1 else (np.zeros(2), np.eye(2))
-    centers = middles.mean(0) + (_CENTERS[:tried] * np.sqrt(np.maximum(spread[::-1], 0))) @ axes[:, ::-1].T
-    inside = (centers @ normals.T < offsets - 2 * LEAST_RADIUS).all(-1)
-    made = [(stars, rough_polygons(stars, most)) for stars in (stars_around(boxes, center, normals, offsets) for center in centers[inside])]
+def _rough(boxes: Boxes, normals: NDArray[np.float64], offsets: NDArray[np.float64], most: int, count: int) -> _Rough:
+    """Rough polygons about the ``count`` best centers."""
+    low, high = boxes.low.min(0), boxes.high.max(0)
+    places = (np.arange(_GRID) + 0.5) / _GRID
+    centers = low + np.stack(np.meshgrid(places, places), -1).reshape(-1, 2) * (high - low)
+    centers = np.concatenate([centers, [(boxes.low + boxes.high).mean(0) / 2]])
+    centers = centers[(centers @ normals.T < offsets - 2 * LEAST_RADIUS).all(-1)]
+    some = boxes.take(np.arange(0, len(boxes), -(-len(boxes) // _SEEN)))
+    seen = [float((stars_around(some, center, normals, offsets).reach ** 2).sum()) for center in centers]
+    chosen = centers[np.argsort(seen, kind="stable")[:count]]
+    made = [(stars, rough_polygons(stars, most)) for stars in (stars_around(boxes, center, normals, offsets) for center in chosen)]
     return [(stars, polygons) for stars, polygons in made if polygons]
 
 

@@ -59,6 +59,7 @@ def test_schema() -> None:
         "vertices",
         "bytes",
         "overdraw",
+        "shaded",
         "alpha",
         "seconds",
         "sizes",
