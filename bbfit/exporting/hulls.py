@@ -85,9 +85,9 @@ def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
     for card in cards.cards:
         polygon = texel_corners(cards, card)
         points = _shown_points(rimmed_alpha(cards, card.rectangle), polygon, max(least, ANY))
-        hull = _hull_within(points, polygon) if len(points) else points
+        hull = hull_within(points, polygon) if len(points) else points
         if len(hull) >= 3 and area(hull) > 0:
-            smaller = _enclosing(hull, polygon, vertices)
+            smaller = enclosing(hull, polygon, vertices)
         else:
             shrunk = min(1.0, abs(area(polygon)) ** -0.5)
             smaller = polygon.mean(0) + (polygon[:vertices] - polygon.mean(0)) * shrunk
@@ -163,7 +163,7 @@ def _shown_points(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], lea
     return np.concatenate(points)
 
 
-def _hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> NDArray[np.float64]:
+def hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> NDArray[np.float64]:
     """The convex hull of the points plus the margin, clipped to the convex polygon, counter-clockwise, [N, 2]."""
     from scipy.spatial import ConvexHull
 
@@ -176,7 +176,7 @@ def _hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> N
     return hull
 
 
-def _enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices: int) -> NDArray[np.float64] | None:
+def enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices: int) -> NDArray[np.float64] | None:
     """The smallest polygon around the hull and inside the convex polygon with at most ``vertices`` corners; None if there is none."""
     middle = hull.mean(0)
     hull, (normals, offsets) = hull - middle, sides(polygon - middle)

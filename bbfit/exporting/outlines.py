@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.checks import check_count, check_range
-from bbfit.exporting.hulls import ANY, MARGIN, rimmed_alpha, texel_corners, with_hulls, with_texel_corners
+from bbfit.exporting.hulls import ANY, MARGIN, enclosing, hull_within, rimmed_alpha, texel_corners, with_hulls, with_texel_corners
 from bbfit.exporting.star_polygons import LEAST_RADIUS, Boxes, Stars, refined, rough_polygons, stars_around
 from bbfit.geometry.cards import Card, Cards
-from bbfit.geometry.polygons import area, sides
+from bbfit.geometry.polygons import area, kept_half, sides
 
 CORNERS = 8
 """Most corners of a card's outline in exported files."""
@@ -19,10 +19,10 @@ CORNERS = 8
 _FINE, _PARTS = 512, 4
 # Centers are chosen on a grid of so many places along a side, by the least area that is seen from them, for at most so many boxes.
 _GRID, _SEEN = 5, 1000
-# Number of centers that are tried for one polygon and for each of two, and of those whose polygons are refined.
-_CENTERS, _CENTERS_OF_TWO, _REFINED = 3, 1, 1
+# Number of centers that are tried, and of those whose polygons are refined.
+_CENTERS, _REFINED = 3, 1
 # Directions of lines between two polygons, least width of the gap around such a line in texels, and number of lines that are tried.
-_LINES, _GAP, _TRIED = 24, 1.0, 2
+_LINES, _GAP, _TRIED = 24, 1.0, 4
 # Fewest corners of a polygon.
 _FEWEST = 3
 
@@ -33,11 +33,11 @@ def with_outlines(cards: Cards, corners: int, least: float) -> Cards:
     """Replace each rectangle by one or two polygons around its visible part with together at most ``corners`` >= 4 corners.
 
     The polygons contain each point of the card where the bilinearly filtered alpha reaches ``least``, and lie inside the card. They may
-    have notches, which mapbox_earcut triangulates. Two polygons of a card do not touch. ``least``, in [0, 1], is as in
+    have notches, which mapbox_earcut triangulates. Two polygons of a card share no area. ``least``, in [0, 1], is as in
     :func:`~bbfit.exporting.hulls.with_hulls`, and so is what holds for mip levels.
 
     The smallest of three candidates is taken: the convex polygon of :func:`~bbfit.exporting.hulls.with_hulls`; a polygon that is
-    star-shaped about one of several centers; and two star-shaped polygons on the two sides of a straight gap. A search for a shortest
+    star-shaped about one of several centers; and two convex polygons on the two sides of a straight gap. A search for a shortest
     cycle finds the star-shaped polygons roughly. Then their corners move as long as the area falls. A still smaller polygon may exist.
 
     Cards keep their order, normals, winding, textures and origins. A card with an origin or of another shape, as splitting makes them,
@@ -82,22 +82,22 @@ def smallest_outline(boxes: Boxes, rectangle: NDArray[np.float64], corners: int)
     normals, offsets = sides(rectangle)
     found = [_finished(_rough(boxes, normals, offsets, corners, _CENTERS), corners)]
     for normal, place, first in _gaps(boxes) if corners >= 2 * _FEWEST else []:
-        halves = [
-            _rough(
-                boxes.take(part),
-                np.concatenate([normals, [sign * normal]]),
-                np.append(offsets, sign * place),
-                corners - _FEWEST,
-                _CENTERS_OF_TWO,
-            )
-            for part, sign in ((first, 1.0), (~first, -1.0))
-        ]
-        sizes = [{k: min(area(made[k]) for _, made in half if k in made) for _, made in half for k in made} for half in halves]
-        shares = [(sizes[0][k] + sizes[1][m], k, m) for k in sizes[0] for m in sizes[1] if k + m <= corners]
-        if shares:
-            _, *counts = min(shares)
-            found.append([polygon for half, count in zip(halves, counts, strict=True) for polygon in _finished(half, count)])
+        height = rectangle @ normal - place
+        halves = [(boxes.take(part), kept_half(rectangle, sign * height)) for part, sign in ((first, 1.0), (~first, -1.0))]
+        sizes = range(_FEWEST, corners - _FEWEST + 1)
+        made = [{count: _convex(part, half, count) for count in sizes} for part, half in halves]
+        pairs = [[made[0][count], made[1][corners - count]] for count in sizes]
+        found += [[polygon for polygon in pair if polygon is not None] for pair in pairs if not any(polygon is None for polygon in pair)]
     return min((polygons for polygons in found if polygons), key=lambda polygons: sum(map(area, polygons)), default=[])
+
+
+def _convex(boxes: Boxes, region: NDArray[np.float64], most: int) -> NDArray[np.float64] | None:
+    """The smallest convex polygon around boxes in a convex region, of positive area; ``None`` if none has at most ``most`` corners."""
+    points = np.concatenate(
+        [boxes.low, boxes.high, np.stack([boxes.low[:, 0], boxes.high[:, 1]], -1), np.stack([boxes.high[:, 0], boxes.low[:, 1]], -1)]
+    )
+    polygon = enclosing(hull_within(points, region), region, most)
+    return polygon if polygon is None or area(polygon) > 0 else polygon[::-1]
 
 
 def _rough(boxes: Boxes, normals: NDArray[np.float64], offsets: NDArray[np.float64], most: int, count: int) -> _Rough:

@@ -36,6 +36,13 @@ def islands() -> NDArray[np.float64]:
     return made
 
 
+def angle() -> NDArray[np.float64]:
+    """Two strips of about 56 by 6 texels that share a corner."""
+    made = np.zeros((60, 60))
+    made[2:58, 3:9], made[52:58, 3:58] = 1, 1
+    return made
+
+
 def apart() -> NDArray[np.float64]:
     """Two rectangles in opposite corners, of 9 by 18 and 18 by 8 texels."""
     made = np.zeros((60, 60))
@@ -99,9 +106,7 @@ def test_random_pictures_are_kept(seed: int, width: int, height: int, least: flo
 
 def test_an_angle_gets_a_notch_and_an_island_a_piece_of_its_own() -> None:
     """The convex polygon around an angle is half of its square; two strips of 56 by 6 texels are a fifth of it."""
-    angle = np.zeros((60, 60))
-    angle[2:58, 3:9], angle[52:58, 3:58] = 1, 1
-    cards = cards_of(angle)
+    cards = cards_of(angle())
     (tight,), (convex,) = with_outlines(cards, 8, 0.5).cards, with_hulls(cards, 8, 0.5).cards
     assert tight.faces is not None and len(tight.corners) <= 8
     assert doubled_area(texels(cards, tight)) < 0.6 * doubled_area(texels(cards, convex))
@@ -113,7 +118,7 @@ def test_an_angle_gets_a_notch_and_an_island_a_piece_of_its_own() -> None:
 
 @pytest.mark.parametrize("kind", ["blend", "mask", "hash"])
 def test_the_picture_is_that_of_the_rectangles(kind: str, orbit: Camera, tmp_path: Path) -> None:
-    cards = cards_of(islands(), leaf(0.6), apart())
+    cards = cards_of(angle(), leaf(0.6), apart())
     cards = replace(cards, alpha=AlphaMode(kind))  # type: ignore[arg-type]
     tight = with_outlines(cards, 8, cards.outlined_alpha)
     assert len(tight.cards) == 1 + len(cards.cards) and any(card.faces is not None for card in tight.cards)
