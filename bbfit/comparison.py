@@ -16,7 +16,7 @@ from bbfit.blender.pictures import render_pictures
 from bbfit.blender.requirements import check_blender
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, check_record, fail
-from bbfit.evaluation.report import Measures, mean_measures
+from bbfit.evaluation.measures import Measures, mean_measures
 from bbfit.evaluation.scoring import held_out, score_views
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
@@ -246,7 +246,7 @@ class _Comparison:
             return image
 
         on_view = partial(self._on_progress, f"{system} score")
-        return mean_measures(score_views(draw_and_save, self._views.test, on_view=on_view))
+        return mean_measures([view.measures for view in score_views(draw_and_save, self._views.test, on_view=on_view)])
 
     def _fitted(self, system: str, folder: Path) -> _SystemResult:
         """Run bbfit with the options of a system."""

@@ -223,7 +223,7 @@ def _levels(
                 error_meters=switch.error,
                 error_pixels=switch.error * largest_scale,
                 held_out_error_pixels=switch.held_out_error * largest_scale,
-                psnr=None if fitted is None else fitted.report.mean.over_white.psnr,
+                psnr=None if fitted is None else fitted.report.mean.over.mean.psnr,
                 tree_pixels=None if math.isinf(switch.scale) else height * switch.scale,
                 distance_meters=focal / switch.scale,
                 screen_coverage=min(1.0, math.pi * (radius * next_scale) ** 2 / (config.screen_width * config.screen_height)),

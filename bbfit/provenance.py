@@ -21,7 +21,7 @@ VERSIONS: Mapping[str, int] = {
     "grow": 1,
     "convert": 1,
     "views": 1,
-    "budget": 4,
+    "budget": 5,
     "fit": 9,
     "export": 4,
     "evaluate": 8,

@@ -55,7 +55,7 @@ def draw_acer(views: bbfit.ViewDataset, thesis: bbfit.BillboardCloud, default: b
     figure, axes = plt.subplots(2, 3, figsize=(12, 8.4))
     for column, (title, cloud) in zip(axes.T, columns.items(), strict=True):
         if cloud is not None:
-            mean = bbfit.evaluate(cloud, views.test).mean.over_white
+            mean = bbfit.evaluate(cloud, views.test).mean.over.mean
             title += f": {cloud.vertex_count} vertices, {mean.psnr:.2f} dB, FLIP {mean.flip:.3f}"
         column[0].set_title(title, fontsize=10)
         for axis, index in zip(column, (0, len(views.test) // 3), strict=True):

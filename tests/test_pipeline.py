@@ -45,7 +45,7 @@ def test_everything_is_written(done: RunResult) -> None:
     assert sorted(path.name for path in done.folder.iterdir()) == sorted([*FILES, *MODELS, WRITTEN_FILE])
     assert done.skipped == ()
     metrics = json.loads((done.folder / "metrics.json").read_text())
-    assert set(metrics) >= {"over_white", "rgba", "thesis_scale", "vertices", "bytes", "seconds", "views"}
+    assert set(metrics) >= {"over_white", "over", "colour", "rgba", "thesis_scale", "vertices", "bytes", "seconds", "views"}
     assert metrics["vertices"]["model"] == shipped_model(done.cloud).cards.vertex_count >= done.cloud.vertex_count == 8
     assert metrics["bytes"]["model"] == (done.folder / "model.glb").stat().st_size
     assert set(metrics["seconds"]) == {"fit", "export", "evaluate"}

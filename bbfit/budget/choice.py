@@ -13,7 +13,7 @@ import numpy as np
 
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import fail
-from bbfit.evaluation import metrics
+from bbfit.evaluation.backgrounds import mean_psnr
 from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
@@ -21,7 +21,6 @@ from bbfit.fitting.config import FitConfig, Placement, ResolvedFit, Sides
 from bbfit.fitting.levels import resize_textures
 from bbfit.fitting.loop import fit
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import over_color
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset, ViewSet
 
@@ -66,7 +65,7 @@ class Trial:
     bytes: int
     """Size of the model as GLB, in bytes."""
     psnr: float
-    """Mean PSNR over white of the validation views, in dB."""
+    """PSNR in dB, the mean over the validation views and the backgrounds (:data:`bbfit.evaluation.backgrounds.BACKGROUNDS`)."""
     seconds: float
     """Duration of the trial."""
 
@@ -322,17 +321,17 @@ class _Trials:
             started = time.perf_counter()
             cloud = fit(self._views, config, tree=self._tree).cloud
             size, seconds = model_bytes(cloud, self._export), round(time.perf_counter() - started, 1)
-            psnr = round(mean_psnr(cloud, self._views.test), 3)
+            psnr = round(validation_psnr(cloud, self._views.test), 3)
             trial = Trial(count, sides, placement, max_texels, cloud.vertex_count, len(cloud.texels), size, psnr, seconds)
         self._trials.append(trial)
         self._on_trial(list(self._trials), self._total)
         return trial
 
 
-def mean_psnr(cloud: BillboardCloud, views: ViewSet) -> float:
-    """Compute the PSNR over white of a cloud, averaged over views, in dB."""
-    pairs = (held_out(shipped_model(cloud).draw, views, index) for index in range(len(views)))
-    return float(np.mean([metrics.psnr(*(over_color(picture).numpy() for picture in pair)) for pair in pairs]))
+def validation_psnr(cloud: BillboardCloud, views: ViewSet) -> float:
+    """Compute the PSNR of a cloud in dB, averaged over views and :data:`~bbfit.evaluation.backgrounds.BACKGROUNDS`."""
+    draw = shipped_model(cloud).draw
+    return float(np.mean([mean_psnr(*held_out(draw, views, index)) for index in range(len(views))]))
 
 
 def _gain(more: Trial, fewer: Trial) -> float:

@@ -26,7 +26,7 @@ class BudgetConfig:
     bytes: int | str | None = None
     """Most bytes of model.glb, such as 500k or 2M."""
     target_psnr: Annotated[float, Range(0, 100, open_low=True)] | None = None
-    """PSNR over white, in dB, to reach on validation views with as few billboards as possible."""
+    """PSNR in dB, the mean over four backgrounds, to reach on validation views with as few billboards as possible."""
     auto: bool = False
     """Add billboards until twice as many gain less than 0.75 dB."""
 

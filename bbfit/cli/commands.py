@@ -197,7 +197,7 @@ def evaluate_command(
         limits: What the tree and the views may refer to, and how large they may be.
     """
     from bbfit.checks import check_output_file
-    from bbfit.evaluation.report import Report
+    from bbfit.evaluation.report import stage_seconds
     from bbfit.evaluation.scoring import evaluate
     from bbfit.geometry.cloud import BillboardCloud
     from bbfit.outputs import claimed_folder, single_files, used_folder
@@ -213,7 +213,7 @@ def evaluate_command(
     original = original_tree(dataset, mesh)
     dataset.test.check(may_be_empty=True)
     earlier = cloud.with_name("metrics.json")
-    seconds = Report.load(earlier).seconds if earlier.is_file() else {}
+    seconds = stage_seconds(earlier) if earlier.is_file() else {}
     inputs = [cloud, *dataset.train.paths, *dataset.test.paths, *(mesh.files if mesh else ())]
     use = claimed_folder if out == earlier else used_folder  # no other process may be at work in the run's folder
     with use("out", out.parent) as folder, single_files("evaluate", folder, [out.name], inputs):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from bbfit.evaluation.report import ThesisScale
+from bbfit.evaluation.measures import ThesisScale
 
 _FIGURE_11 = Path(__file__).with_name("thesis_figure_11.csv")
 RATIOS_PERCENT = {

@@ -2,69 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from bbfit.checks import check_file, check_record
+from bbfit.evaluation.measures import Measures, mean_measures
 from bbfit.files import read_json, write_json
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.inputs import reading
 
+_EXPECTED = "write it again with bbfit evaluate"
 RING_GAP = 1.0
 """Smallest difference in degrees between the elevations of two rings of views."""
-
-
-@dataclass(frozen=True)
-class OverWhite:
-    """RGB composited over white, data range 1 (:mod:`bbfit.evaluation.metrics`)."""
-
-    psnr: float
-    """Peak signal-to-noise ratio in dB, at most 120."""
-    ssim: float
-    """Structural similarity with a Gaussian window, in [-1, 1]."""
-    flip: float
-    """Mean perceived difference, in [0, 1]."""
-
-
-@dataclass(frozen=True)
-class Rgba:
-    """Premultiplied RGBA, data range 1 (:mod:`bbfit.evaluation.metrics`)."""
-
-    rmse: float
-    """Root mean squared error over all four channels, in [0, 1]."""
-    psnr: float
-    """Peak signal-to-noise ratio in dB, at most 120."""
-    iou: float
-    """Intersection over union of the silhouettes, alpha >= 0.5, in [0, 1]."""
-
-
-@dataclass(frozen=True)
-class ThesisScale:
-    """Premultiplied RGBA with a peak of 4095, as in the thesis (:mod:`bbfit.evaluation.thesis_scale`)."""
-
-    rmse: float
-    """Root mean squared error over 4095."""
-    ssim: float
-    """Structural similarity with a data range of 4095."""
-    psnr: float
-    """Peak signal-to-noise ratio in dB, 72.25 above that of data range 1."""
-    sre: float
-    """Signal-to-reconstruction-error ratio in dB, without the square of the error's norm."""
-
-
-@dataclass(frozen=True)
-class Measures:
-    """All measures of one view, or their means over views."""
-
-    over_white: OverWhite
-    rgba: Rgba
-    thesis_scale: ThesisScale
-    sharpness: float | None
-    """Ratio of the mean absolute gradient to that of the target; ``None`` for a flat target."""
-    brightness: float | None
-    """Ratio of the mean color inside the target's silhouette to that of the target; ``None`` for an empty or black silhouette."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +32,8 @@ class ViewScore:
 
     def to_json(self) -> dict[str, Any]:
         """The name, the angles and the groups of measures in one dictionary."""
-        return {name: value for name, value in asdict(self).items() if name != "measures"} | asdict(self.measures)
+        angles = {"azimuth_degrees": self.azimuth_degrees, "elevation_degrees": self.elevation_degrees}
+        return {"name": self.name} | angles | self.measures.to_json()
 
 
 @dataclass(frozen=True)
@@ -96,7 +48,7 @@ class RingScore:
 
     def to_json(self) -> dict[str, Any]:
         """The elevation, the number of views and the groups of measures in one dictionary."""
-        return {"elevation_degrees": self.elevation_degrees, "views": self.views} | asdict(self.measures)
+        return {"elevation_degrees": self.elevation_degrees, "views": self.views} | self.measures.to_json()
 
 
 @dataclass(frozen=True)
@@ -108,7 +60,7 @@ class SizeScore:
     height: int
     """Height of the pictures in pixels."""
     psnr: float
-    """Peak signal-to-noise ratio over white in dB, at most 120, the mean over views (:func:`bbfit.evaluation.metrics.psnr`)."""
+    """Peak signal-to-noise ratio in dB, at most 120, the mean over views and :data:`bbfit.evaluation.backgrounds.BACKGROUNDS`."""
     coverage: float | None
     """Ratio of the mean alpha of the renders to that of the targets, over all views: 1 is as dense, below is thinner, above is denser;
     ``None`` if the targets are empty."""
@@ -158,8 +110,8 @@ class Report:
 
     @property
     def mean(self) -> Measures:
-        """The means over the views (:func:`mean_measures`)."""
-        return mean_measures(self.views)
+        """The means over the views (:func:`bbfit.evaluation.measures.mean_measures`)."""
+        return mean_measures([view.measures for view in self.views])
 
     @property
     def rings(self) -> tuple[RingScore, ...]:
@@ -173,7 +125,7 @@ class Report:
             RingScore(
                 round(sum(view.elevation_degrees for view in ring) / len(ring), 3),
                 len(ring),
-                mean_measures(ring),
+                mean_measures([view.measures for view in ring]),
             )
             for ring in rings
         )
@@ -184,13 +136,15 @@ class Report:
         Returns
         -------
         dict
-            ``{"over_white": {"psnr", "ssim", "flip"}, "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
+            ``{"over_white": {"psnr", "ssim", "flip"}, "over": {"white", "black", "grass", "sky", "mean": {"psnr", "ssim", "flip"} each},
+            "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
+            "colour": {"delta_e", "chroma", "brightness", "target", "render", "target_inside", "render_inside"},
             "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw", "shaded",
             "alpha": {"mode", "cutoff"}, "seconds": {stage: ..}, "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
             "rings": [{"elevation_degrees", "views", and the same measures}],
             "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures}]}``
         """
-        return asdict(self.mean) | {
+        return self.mean.to_json() | {
             "vertices": self.vertices.to_json(),
             "bytes": self.bytes.to_json(),
             "overdraw": self.overdraw,
@@ -213,15 +167,15 @@ class Report:
         Raises
         ------
         MissingFileError, InputError
-            if the file is missing, damaged or not a report.
+            if the file is missing, damaged, of an earlier version or not a report.
         """
         path = check_file("metrics", path)
         content = read_json("metrics", path)
-        with reading("metrics", path, "expected a metrics.json that bbfit evaluate wrote"):
+        with reading("metrics", path, _EXPECTED):
             vertices, sizes = (Cost(content[name]["model"], content[name]["original"]) for name in ("vertices", "bytes"))
             alpha = AlphaMode(content["alpha"]["mode"], content["alpha"]["cutoff"])
             scores = tuple(
-                ViewScore(view["name"], view["azimuth_degrees"], view["elevation_degrees"], measures_from_json(view))
+                ViewScore(view["name"], view["azimuth_degrees"], view["elevation_degrees"], Measures.from_json(view))
                 for view in content["views"]
             )
             afar = tuple(SizeScore(**size) for size in content["sizes"])
@@ -232,25 +186,14 @@ class Report:
             return report
 
 
-def mean_measures(views: Sequence[ViewScore]) -> Measures:
-    """The means over views; decibels are averaged as decibels, as in the thesis. A measure's mean leaves out views where it is ``None``."""
-    means: Measures = _mean(Measures, [view.measures for view in views])
-    return means
+def stage_seconds(path: str | Path) -> dict[str, float]:
+    """The seconds of each stage in a file that :meth:`Report.save` wrote, also in an earlier version of bbfit.
 
-
-def measures_from_json(content: Mapping[str, Any]) -> Measures:
-    """The measures of a dictionary like that of ``dataclasses.asdict``; other keys are ignored."""
-    groups = OverWhite(**content["over_white"]), Rgba(**content["rgba"]), ThesisScale(**content["thesis_scale"])
-    return Measures(*groups, content["sharpness"], content["brightness"])
-
-
-def _mean(group: type[Any], items: Sequence[Any]) -> Any:
-    """Field by field mean of dataclasses of numbers, ``None`` and further such dataclasses."""
-    means: dict[str, Any] = {}
-    for entry in fields(group):
-        values = [value for item in items if (value := getattr(item, entry.name)) is not None]
-        if values and is_dataclass(values[0]):
-            means[entry.name] = _mean(type(values[0]), values)
-        else:
-            means[entry.name] = sum(values) / len(values) if values else None
-    return group(**means)
+    Raises MissingFileError or InputError if the file is missing or damaged.
+    """
+    path = check_file("metrics", path)
+    content = read_json("metrics", path)
+    with reading("metrics", path, _EXPECTED):
+        seconds = dict(content["seconds"])
+        check_record("seconds", seconds, dict[str, float])
+        return seconds

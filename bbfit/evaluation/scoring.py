@@ -12,14 +12,15 @@ from torch import Tensor
 
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.evaluation import metrics, thesis_scale
-from bbfit.evaluation.report import Cost, Measures, OverWhite, Report, Rgba, ThesisScale, ViewScore
+from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
+from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
+from bbfit.evaluation.report import Cost, Report, ViewScore
 from bbfit.evaluation.sizes import HALVINGS, score_sizes
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import over_color
 from bbfit.rendering.cards import fragments
 from bbfit.views import ViewSet
 
@@ -150,15 +151,22 @@ def measure(target: Tensor, image: Tensor) -> Measures:
     """All measures of one view, from premultiplied RGBA in [0, 1], [H, W, 4], of at least 11 x 11 pixels."""
     check_shape("target", tuple(target.shape), (None, None, 4))
     check_shape("image", tuple(image.shape), tuple(target.shape))
-    rgba = tuple(picture.detach().cpu().double().numpy() for picture in (target, image))
-    white = tuple(over_color(picture.detach().cpu().double()).numpy() for picture in (target, image))
+    target, image = (picture.detach().cpu().double() for picture in (target, image))
+    rgba = target.numpy(), image.numpy()
+    white = over_background(target, image, "white")
+    inside = rgba[0][..., 3] >= metrics.ALPHA_THRESHOLD
     return Measures(
-        OverWhite(metrics.psnr(*white), metrics.ssim(*white), metrics.flip(*white)),
+        Over(**{name: _over(*over_background(target, image, name)) for name in BACKGROUNDS}),
         Rgba(metrics.root_mean_squared_error(*rgba), metrics.psnr(*rgba), metrics.alpha_iou(*rgba)),
         ThesisScale(thesis_scale.rmse(*rgba), thesis_scale.ssim(*rgba), thesis_scale.psnr(*rgba), thesis_scale.sre(*rgba)),
+        Colour(*map(metrics.color_sum, rgba), *(metrics.color_sum(picture, inside) for picture in rgba)),
         metrics.sharpness(*white),
         metrics.brightness(*rgba),
     )
+
+
+def _over(target: metrics.Image, image: metrics.Image) -> OverBackground:
+    return OverBackground(metrics.psnr(target, image), metrics.ssim(target, image), metrics.flip(target, image))
 
 
 def view_angles(camera: Camera) -> Tensor:

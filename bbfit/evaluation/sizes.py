@@ -11,9 +11,9 @@ from torch import Tensor
 
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.evaluation import metrics
+from bbfit.evaluation.backgrounds import mean_psnr
 from bbfit.evaluation.report import SizeScore
 from bbfit.geometry.camera import Camera
-from bbfit.images import over_color
 from bbfit.views import ViewSet
 
 HALVINGS = 4
@@ -87,7 +87,7 @@ def _score(draw: Callable[[Camera], Tensor], views: ViewSet, halving: int, width
         if not images.isfinite().all():
             fail("draw", f"returned values that are not finite for view {name} at {width} x {height} pixels", "check the model")
         centered, *shifted = images.clamp(0, 1)
-        psnrs.append(metrics.psnr(over_color(target).numpy(), over_color(centered).numpy()))
+        psnrs.append(mean_psnr(target, centered))
         squares.append(metrics.mean_squared_error(target[..., 3].numpy(), centered[..., 3].numpy()))
         covers = [float(image[..., 3].sum()) for image in shifted or [centered]]
         render_cover += sum(covers) / len(covers)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.checks import check_shape
-from bbfit.evaluation.metrics import MSE_FLOOR, Image, check_size
+from bbfit.evaluation.metrics import MSE_FLOOR, Image, mean_similarity
 
 PEAK = 4095.0
 """The package's default ``max_p``."""
@@ -40,11 +40,7 @@ def ssim(target: Image, render: Image) -> float:
 
     Raises InputError if the picture is too small (:func:`bbfit.evaluation.metrics.check_size`).
     """
-    from skimage.metrics import structural_similarity
-
-    check_shape("render", render.shape, target.shape)
-    check_size(target.shape[1], target.shape[0])
-    return float(structural_similarity(target.astype(np.float64), render.astype(np.float64), data_range=PEAK, channel_axis=2))
+    return mean_similarity(target, render, 7, data_range=PEAK)
 
 
 def sre(target: Image, render: Image) -> float:

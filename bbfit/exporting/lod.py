@@ -35,7 +35,7 @@ class LodLevel:
     held_out_error_pixels: float
     """The same error in the worst held-out view, which did not influence the levels."""
     psnr: float | None
-    """PSNR over white in dB in the held-out views at their full size; ``None`` for the tree itself."""
+    """PSNR in dB in the held-out views at their full size, the mean over four backgrounds; ``None`` for the tree itself."""
     tree_pixels: float | None
     """Height of the tree on the screen in pixels below which the level is shown; ``None`` for the finest level."""
     distance_meters: float

@@ -16,6 +16,7 @@ Placement = Literal["even", "clusters"]
 Orientation = Literal["any", "upright", "free"]
 Bounds = Literal["viewport", "thesis", "silhouette"]
 Schedule = Literal["cosine", "growth"]
+Colors = Literal["views", "matched", "joint"]
 _Binarization = Annotated[float, Range(0, 10)]
 _Density = Annotated[float, Range(0, 16, open_low=True)]
 _Rate = Annotated[float, Range(0, 10, open_low=True)]
@@ -51,6 +52,8 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "texel_density": 1.0,
         "bounds": "viewport",
         "loss": "l2",
+        "colors": "joint",
+        "antialiased": False,
         "ssim_weight": 0.0,
         "sharpness_weight": 0.0,
         "binarization_weight": 0.0,
@@ -67,9 +70,9 @@ _PRESETS: dict[str, dict[str, Any]] = {
 # Values of the default preset that depend on the alpha mode. A cutoff leaves no half-transparent texels that could smooth an edge, and
 # stochastic alpha is the noisier the more of them there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
-    "mask": {"texel_density": 1.0, "sharpness_weight": 24.0, "binarization_weight": 0.06},
-    "blend": {"texel_density": 1.25, "sharpness_weight": 14.0, "binarization_weight": 0.004},
-    "hash": {"texel_density": 1.25, "sharpness_weight": 14.0, "binarization_weight": 0.03},
+    "mask": {"colors": "views", "antialiased": True, "texel_density": 1.0, "sharpness_weight": 8.0, "binarization_weight": 0.02},
+    "blend": {"colors": "matched", "antialiased": False, "texel_density": 1.25, "sharpness_weight": 14.0, "binarization_weight": 0.004},
+    "hash": {"colors": "views", "antialiased": False, "texel_density": 1.25, "sharpness_weight": 14.0, "binarization_weight": 0.03},
 }
 
 
@@ -115,16 +118,23 @@ class FitConfig:
     """Loss to minimize: absolute (l1) or squared (l2) differences of premultiplied RGBA, or squared ones over random backgrounds.
     It is summed over channels and averaged over pixels; for backgrounds it is the expectation.
     Preset: backgrounds; thesis: l2."""
+    colors: Colors | None = None
+    """What colors are fitted to. views: the color of the views, whatever alpha is there, so that leaves keep their color before any
+    background. joint: the loss, together with alpha. matched: the same, after which one factor per channel makes the mean color that of the
+    views, as it does after a fit to the views.
+    Preset: views (mask, hash) or matched (blend); thesis: joint."""
+    antialiased: bool | None = None
+    """Fit a mask for programs that smooth its edges by alpha to coverage. Preset: yes; thesis: no. Other alpha modes ignore it."""
     max_texels: Count | None = None
     """Most texels of all billboards together; their density is lowered to stay within it. Default: no limit."""
     ssim_weight: _Unit | None = None
     """Weight of 1 - SSIM, which preserves structure, beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: _Sharpness | None = None
     """Weight of the sharpness loss: the squared difference in mean contrast between neighboring pixels, at full resolution.
-    Preset: 24 (mask) or 14; thesis: 0."""
+    Preset: 8 (mask) or 14; thesis: 0."""
     binarization_weight: _Binarization | None = None
     """Weight that pushes alpha to 0 or 1: of alpha * (1 - alpha), summed over texels, over a view's pixels, at full resolution.
-    Preset: 0.06 (mask), 0.004 (blend) or 0.03 (hash); thesis: 0."""
+    Preset: 0.02 (mask), 0.004 (blend) or 0.03 (hash); thesis: 0."""
     levels: Count | None = None
     """Number of resolutions, from coarse to fine; each doubles the sides of the one before. Steps are divided evenly among them.
     Preset: 4; thesis: 1."""
@@ -187,6 +197,8 @@ class ResolvedFit(FitConfig):
     bounds: Bounds
     texel_density: _Density
     loss: Loss
+    colors: Colors
+    antialiased: bool
     ssim_weight: _Unit
     sharpness_weight: _Sharpness
     binarization_weight: _Binarization

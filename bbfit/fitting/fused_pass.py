@@ -48,7 +48,7 @@ class FusedPass:
         target = self._targets.packed(chosen).to(device)
         if groups > 1:
             target = target.repeat(groups, 1, 1, 1)
-        loss = PixelLoss(target, self._targets.shrunk is None, config.loss, 1 / pixels)
+        loss = PixelLoss(target, self._targets.shrunk is None, config.loss, 1 / pixels, config.colors == "views")
         structure, of_image = self._structure(state, projection, loss)
         sums, of_matrices = differentiate(
             state.texels, projection, state.gradient, image_gradient=of_image, loss=loss, occupied=state.occupied, placement=moves

@@ -17,6 +17,7 @@ from torch import Tensor
 from bbfit.checks import InputError, InputTypeError, check_range, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
+from bbfit.fitting.colors import matched_colors
 from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.coverage import matched_coverage
 from bbfit.fitting.initialize import bounded, pixels_per_meter, random_textures, sized, start_cloud, tree_radius
@@ -181,7 +182,10 @@ def fit(
     assert fitted is not None
     fitted = replace(fitted, alpha=AlphaMode(config.alpha, config.alpha_cutoff))
     if config.alpha == "mask":
-        fitted = matched_coverage(fitted, views.train, config.backend)
+        drawn = matched_coverage(replace(fitted, alpha=replace(fitted.alpha, antialiased=config.antialiased)), views.train, config.backend)
+        fitted = replace(drawn, alpha=fitted.alpha)
+    if config.colors != "joint":
+        fitted = matched_colors(fitted, views.train, config.backend)
     # No view determines the colors of transparent texels, but filtering shows them.
     bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
@@ -252,7 +256,7 @@ def step_alpha(config: ResolvedFit, level: ResolutionLevel, index: int) -> Alpha
     progress = (index - level.begin) / (_HARDENING * (level.end - level.begin))
     first = max(2.0, 0.5 / min(config.alpha_cutoff, 1 - config.alpha_cutoff))
     hardness = first * (max(first, HARDEST) / first) ** progress if progress < 1 else math.inf
-    return AlphaMode("mask", config.alpha_cutoff, hardness)
+    return AlphaMode("mask", config.alpha_cutoff, hardness, config.antialiased)
 
 
 def learning_rate(config: ResolvedFit, index: int) -> float:

@@ -14,8 +14,8 @@ from bbfit.fitting.movement import Movement
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.adam.reference import AdamReference
-from bbfit.operators.drawing.reference import render_reference
-from bbfit.operators.image_loss.reference import image_loss_reference
+from bbfit.operators.drawing.reference import render_layers_reference, render_reference
+from bbfit.operators.image_loss.reference import color_loss_reference, image_loss_reference
 
 
 class ReferencePass:
@@ -37,7 +37,11 @@ class ReferencePass:
         cameras, target = self._targets.cameras[list(chosen)].to(device), self._targets.pictures(chosen).to(device)
         loss = torch.zeros((), device=device)
         for group in cloud.parts(self._groups):
-            image = render_reference(group, cameras)
+            if config.colors == "views":
+                image, colors, weights = render_layers_reference(group, cameras)
+                color_loss_reference(colors, weights, target).backward(retain_graph=True)  # its value is not part of the loss
+            else:
+                image = render_reference(group, cameras)
             loss = loss + image_loss_reference(image, target, config.loss, config.ssim_weight, config.sharpness_weight)
         loss.backward()
         assert texels.grad is not None

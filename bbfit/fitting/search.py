@@ -73,7 +73,7 @@ class _Search:
     def __init__(
         self, views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None], effort: Effort = USUAL
     ) -> None:
-        self._config, self._on_progress, self._effort = replace(config.coarse(), ssim_weight=0.0), on_progress, effort
+        self._config, self._on_progress, self._effort = replace(config.coarse(), ssim_weight=0.0, colors="joint"), on_progress, effort
         side = min(views.cameras.width, views.cameras.height)
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))

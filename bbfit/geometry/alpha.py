@@ -25,6 +25,9 @@ class AlphaMode:
     hardness: float = math.inf
     """Slope, with mask, of the ramp from nothing to opaque, whose middle is the cutoff. Finite only while textures are fitted; at least
     the slope at which alpha 0 is nothing and alpha 1 opaque."""
+    antialiased: bool = False
+    """Whether a mask is drawn with alpha to coverage, which smooths its edges: the opacity rises from nothing to opaque over one pixel
+    around the cutoff (:func:`bbfit.operators.drawing.compositing.opacity`). Other modes ignore it."""
 
     def __post_init__(self) -> None:
         check_choice("alpha", self.kind, get_args(AlphaKind))

@@ -38,7 +38,7 @@ class Chart:
 
 
 MEASURES = (("psnr", "PSNR, dB", max), ("ssim", "SSIM", max), ("flip", "FLIP", min))
-"""Measures over white: name, title, and the function that gives the better of two values."""
+"""Measures that are means over the backgrounds: name, title, and the function that gives the better of two values."""
 # Hues of medium lightness, which contrast with white and with black.
 _HUES = ("#3b82c4", "#d9702b", "#3f9e4d", "#c94f4f", "#8f6bc1", "#a06a4e", "#d066a8", "#7d8590", "#a3a21f", "#2aa6b5")
 
@@ -52,13 +52,13 @@ def worst_views(views: Sequence[ViewScore]) -> dict[str, int]:
     """The index of the worst view by each of :data:`MEASURES`."""
     worst = {}
     for name, _, better in MEASURES:
-        values = [float(getattr(view.measures.over_white, name)) for view in views]
+        values = [float(getattr(view.measures.over.mean, name)) for view in views]
         worst[name] = values.index(min(values) if better is max else max(values))
     return worst
 
 
 def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
-    """PSNR, SSIM and FLIP over white of every view against its azimuth, with the worst view of each measure marked.
+    """PSNR, SSIM and FLIP, means over the backgrounds, of every view against its azimuth, with the worst view of each measure marked.
 
     The id of a point is ``azimuth-MEASURE-INDEX``, with the view's index in ``views``. Lines join views of one elevation, which is written
     at their end if there are several elevations; with fewer than four views per elevation on average there are no lines.
@@ -73,7 +73,7 @@ def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
     for index in sorted(range(len(views)), key=lambda index: views[index].azimuth_degrees):
         rings.setdefault(round(views[index].elevation_degrees), []).append(index)
     for axes, (name, title, _) in zip(panels, MEASURES, strict=True):
-        values = [float(getattr(view.measures.over_white, name)) for view in views]
+        values = [float(getattr(view.measures.over.mean, name)) for view in views]
         angles = [view.azimuth_degrees for view in views]
         axes.axvline(0, color=_FAINT, linewidth=1, gid=f"cursor-{name}")
         if len(rings) <= len(views) / 4:

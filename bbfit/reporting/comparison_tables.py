@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bbfit.evaluation.report import Measures, measures_from_json
+from bbfit.evaluation.measures import Measures
 from bbfit.evaluation.scoring import OriginalTree, view_angles
 from bbfit.files import write_bytes
 from bbfit.images import encode_png, over_color, premultiply, read_rgba, to_bytes
@@ -23,6 +23,13 @@ from bbfit.views import ViewSet
 
 # Tiles of the picture: side in pixels, tiles per row, size of the text.
 _TILE, _COLUMNS, _TEXT = 340, 5, 13
+# Columns of compare.csv.
+_MEASURES = (
+    *("psnr", "ssim", "flip", "white_psnr", "white_ssim", "white_flip", "rgba_rmse", "rgba_psnr", "iou", "sharpness", "brightness"),
+    *("color_delta_e", "color_chroma", "color_brightness", "thesis_psnr"),
+)
+# Headings of the measures in compare.md.
+_SHOWN = ("PSNR, dB", "SSIM", "FLIP", "PSNR over white", "silhouette IoU", "sharpness", "color ΔE", "chroma", "brightness")
 
 
 @dataclass(frozen=True)
@@ -48,21 +55,21 @@ class CompareRow:
 
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON holds them."""
-        return asdict(self)
+        fields = {name: value for name, value in vars(self).items() if name != "measures"}
+        return fields | {"measures": None if self.measures is None else self.measures.to_json()}
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> CompareRow:
         """The row that :meth:`to_json` returned."""
         measures = content["measures"]
-        return CompareRow(**{**content, "measures": None if measures is None else measures_from_json(measures)})
+        return CompareRow(**{**content, "measures": None if measures is None else Measures.from_json(measures)})
 
 
 def compare_csv(rows: Sequence[CompareRow]) -> bytes:
     """CSV with one line per system: all measures and costs."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    names = ("psnr", "ssim", "flip", "rgba_rmse", "rgba_psnr", "iou", "sharpness", "brightness", "thesis_psnr")
-    writer.writerow(["system", "title", "planes", "vertices", "bytes", "seconds", *names, "note"])
+    writer.writerow(["system", "title", "planes", "vertices", "bytes", "seconds", *_MEASURES, "note"])
     for row in rows:
         writer.writerow([row.system, row.title, row.planes, row.vertices, row.bytes, row.seconds, *_measures(row.measures), row.note])
     return text.getvalue().encode(errors="backslashreplace")
@@ -70,30 +77,33 @@ def compare_csv(rows: Sequence[CompareRow]) -> bytes:
 
 def _measures(measures: Measures | None) -> list[float | None]:
     if measures is None:
-        return [None] * 9
-    white, rgba = measures.over_white, measures.rgba
-    own = [white.psnr, white.ssim, white.flip, rgba.rmse, rgba.psnr, rgba.iou]
-    return [*own, measures.sharpness, measures.brightness, measures.thesis_scale.psnr]
+        return [None] * len(_MEASURES)
+    over, white, rgba, color = measures.over.mean, measures.over_white, measures.rgba, measures.colour
+    own = [over.psnr, over.ssim, over.flip, white.psnr, white.ssim, white.flip, rgba.rmse, rgba.psnr, rgba.iou]
+    colors = [color.delta_e, color.chroma, color.brightness]
+    return [*own, measures.sharpness, measures.brightness, *colors, measures.thesis_scale.psnr]
 
 
 def compare_markdown(rows: Sequence[CompareRow], original: OriginalTree) -> str:
     """A Markdown document with a table of all systems, the tree itself first."""
-    table = [["the tree", "", _count(original.vertices), _count(original.bytes), *[""] * 7]]
+    table = [["the tree", "", _count(original.vertices), _count(original.bytes), "", *[""] * len(_SHOWN)]]
     for row in rows:
         seconds = "" if row.seconds is None else f"{row.seconds:,.1f}"
         planes = "" if row.planes is None else str(row.planes)
         table.append([row.title, planes, _count(row.vertices), _count(row.bytes), seconds, *_shown(row.measures)])
-    head = ["system", "planes", "vertices", "bytes", "seconds", "PSNR, dB", "SSIM", "FLIP", "silhouette IoU", "sharpness", "brightness"]
+    head = ["system", "planes", "vertices", "bytes", "seconds", *_SHOWN]
     notes = "".join(f"- {row.title}: {row.note}\n" for row in rows if row.note)
-    return f"# Comparison\n\nMeans over the held-out views, which are the same for all systems.\n\n{markdown(head, table)}\n{notes}"
+    means = "Means over the held-out views, which are the same for all systems. PSNR, SSIM and FLIP are also means over four backgrounds."
+    return f"# Comparison\n\n{means}\n\n{markdown(head, table)}\n{notes}"
 
 
 def _shown(measures: Measures | None) -> list[str]:
     if measures is None:
-        return [""] * 6
-    white = measures.over_white
-    shares = ["" if value is None else f"{value:.2f}" for value in (measures.sharpness, measures.brightness)]
-    return [f"{white.psnr:.2f}", f"{white.ssim:.4f}", f"{white.flip:.4f}", f"{measures.rgba.iou:.3f}", *shares]
+        return [""] * len(_SHOWN)
+    over, color = measures.over.mean, measures.colour
+    scores = [f"{over.psnr:.2f}", f"{over.ssim:.4f}", f"{over.flip:.4f}", f"{measures.over_white.psnr:.2f}", f"{measures.rgba.iou:.3f}"]
+    ratios = (measures.sharpness, color.delta_e, color.chroma, color.brightness)
+    return [*scores, *("" if value is None else f"{value:.2f}" for value in ratios)]
 
 
 def _count(value: int | None) -> str:
@@ -101,7 +111,7 @@ def _count(value: int | None) -> str:
 
 
 def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
-    """Write a PNG with PSNR over white and FLIP against bytes and vertices, one point for each system that was drawn."""
+    """Write a PNG with PSNR and FLIP, means over the backgrounds, against bytes and vertices, one point for each system that was drawn."""
     from matplotlib.figure import Figure
 
     drawn = [row for row in rows if row.measures is not None]
@@ -109,13 +119,13 @@ def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
         return
     figure = Figure(figsize=(13, 8.5), dpi=110, layout="constrained")
     axes = figure.subplots(2, 2, sharex="col", sharey="row")
-    for line, name in enumerate(("PSNR over white, dB", "FLIP, lower is better")):
+    for line, name in enumerate(("PSNR, dB, mean over backgrounds", "FLIP, mean over backgrounds, lower is better")):
         for column, cost in enumerate(("bytes", "vertices")):
             axis = axes[line][column]
             for number, row in enumerate(drawn):
                 assert row.measures is not None
-                white, own = row.measures.over_white, row.system.startswith("bbfit")
-                x, y = getattr(row, cost), white.psnr if line == 0 else white.flip
+                over, own = row.measures.over.mean, row.system.startswith("bbfit")
+                x, y = getattr(row, cost), over.psnr if line == 0 else over.flip
                 axis.scatter(x, y, s=90 if own else 45, marker="*" if own else "o", color=f"C{number % 10}", zorder=3, label=row.title)
                 axis.annotate(row.system, (x, y), (4, 4), textcoords="offset points", fontsize=7, color="#70767e")
             axis.set_xscale("log")
@@ -129,7 +139,7 @@ def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
 
 
 def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) -> None:
-    """Write ``systems.png``: one held-out view over white, and the picture of each system that was drawn.
+    """Write ``systems.png``: one held-out view over white, and the picture of each system that was drawn, with its mean scores.
 
     ``folder`` holds a folder for each system, with its pictures in ``held_out`` under the views' names.
     """
@@ -141,8 +151,8 @@ def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) ->
     for row in drawn:
         assert row.measures is not None and row.vertices is not None and row.bytes is not None
         straight = torch.from_numpy(read_rgba(folder / row.system / "held_out" / f"{views.names[index]}.png")).float() / 255
-        white = row.measures.over_white
-        caption = f"{white.psnr:.2f} dB  ·  FLIP {white.flip:.3f}  ·  {row.vertices:,} vertices  ·  {row.bytes / 1e6:.2g} MB"
+        over = row.measures.over.mean
+        caption = f"{over.psnr:.2f} dB  ·  FLIP {over.flip:.3f}  ·  {row.vertices:,} vertices  ·  {row.bytes / 1e6:.2g} MB"
         pictures.append((row.title, caption, premultiply(straight)))
     part = _around(views.targets([index])[0][..., 3])
     gap, line = 14, 3 * _TEXT + 8

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.resources import files
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bbfit.evaluation import metrics
+from bbfit.evaluation.backgrounds import BACKGROUNDS, mean_flip_map
 from bbfit.evaluation.report import Report, ViewScore
 from bbfit.evaluation.scoring import held_out
 from bbfit.evaluation.sizes import shrunk
@@ -21,7 +21,7 @@ from bbfit.exporting.encoders import encode_webp
 from bbfit.exporting.model import ShippedModel
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
-from bbfit.images import over_color, to_bytes, unpremultiply
+from bbfit.images import to_bytes, unpremultiply
 from bbfit.model_files import generator
 from bbfit.reporting.charts import MEASURES, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
 from bbfit.reporting.plots import magma, spread_views
@@ -55,9 +55,9 @@ class RunFacts:
 def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunFacts, glb: bytes) -> str:
     """The report on V held-out ``views`` as HTML. The page loads nothing from elsewhere, and names that users chose are escaped.
 
-    It shows the key figures beside the original's, held-out views (target, result, FLIP map) with a slider, every measure by azimuth with
-    the worst views, the model in 3D, textures and a plan of the billboards, the quality from a distance, the loss, and the options. Of the
-    views it shows the worst ones and at most 36 others, no wider than 512 pixels.
+    It shows the key figures beside the original's, held-out views (target, result, FLIP map) with a slider and over the background that the
+    reader chooses, every measure by azimuth with the worst views, the model in 3D, textures and a plan of the billboards, the quality from
+    a distance, the loss, and the options. Of the views it shows the worst ones and at most 36 others, no wider than 512 pixels.
 
     ``glb`` is the model for the 3D view, with pictures that browsers read (PNG or WebP). Raises InputError if a view cannot be read, or if
     there are none.
@@ -84,7 +84,8 @@ def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunF
         cloud=cloud,
         views=[_view(model, views, report.views[index], index) for index in shown],
         worst=worst,
-        first=shown.index(sorted(shown, key=lambda index: report.views[index].measures.over_white.flip)[len(shown) // 2]),  # a typical one
+        backgrounds={name: "rgb({:g}% {:g}% {:g}%)".format(*(100 * value for value in color)) for name, color in BACKGROUNDS.items()},
+        first=shown.index(sorted(shown, key=lambda index: report.views[index].measures.over.mean.flip)[len(shown) // 2]),  # a typical one
         azimuth=Markup(azimuth.svg),
         plan=Markup(plan.svg),
         marks={**azimuth.marks, **plan.marks},
@@ -111,22 +112,21 @@ def _least_seen(cloud: BillboardCloud) -> float:
 def _view(model: ShippedModel, views: ViewSet, score: ViewScore, index: int) -> dict[str, Any]:
     """The pictures and measures of a held-out view."""
     target, result = held_out(model.draw, views, index)
-    error = metrics.flip_map(over_color(target).numpy(), over_color(result).numpy())
+    error = mean_flip_map(target, result)
     height, width = error.shape
     size = (min(width, _MAX_WIDTH), max(1, height * min(width, _MAX_WIDTH) // width))
     mapped = magma(shrunk(torch.from_numpy(error)[..., None], *size)[..., 0].numpy())
     pictures = [to_bytes(unpremultiply(shrunk(picture, *size))) for picture in (target, result)]
     opaque = np.full((*mapped.shape[:2], 1), 255, np.uint8)
-    white, rgba = score.measures.over_white, score.measures.rgba
+    over = score.measures.over
     return {
         "index": index,
         "name": score.name,
         "azimuth": score.azimuth_degrees,
         "elevation": score.elevation_degrees,
-        "psnr": white.psnr,
-        "ssim": white.ssim,
-        "flip": white.flip,
-        "iou": rgba.iou,
+        **asdict(over.mean),
+        "over": {name: getattr(over, name).psnr for name in BACKGROUNDS},
+        "iou": score.measures.rgba.iou,
         "width": size[0],
         "height": size[1],
         "pictures": [_webp(picture) for picture in (*pictures, np.concatenate([mapped, opaque], -1))],
@@ -136,12 +136,12 @@ def _view(model: ShippedModel, views: ViewSet, score: ViewScore, index: int) -> 
 def _worst(views: Sequence[ViewScore]) -> list[dict[str, Any]]:
     """The worst view by each measure and the three views with the largest FLIP, with their measures."""
     worst = worst_views(views)
-    most = sorted(range(len(views)), key=lambda index: -views[index].measures.over_white.flip)[:3]
+    most = sorted(range(len(views)), key=lambda index: -views[index].measures.over.mean.flip)[:3]
     titles = {name: title.removesuffix(", dB") for name, title, _ in MEASURES}
     return [
         {
             "index": index,
-            "by": [(titles[name], getattr(views[index].measures.over_white, name), worst[name] == index) for name in worst],
+            "by": [(titles[name], getattr(views[index].measures.over.mean, name), worst[name] == index) for name in worst],
         }
         for index in dict.fromkeys([worst["flip"], *worst.values(), *most])
     ]

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from bbfit.budget.choice import Choice, pareto_front
 from bbfit.checks import check_count, fail
 from bbfit.evaluation import metrics
+from bbfit.evaluation.backgrounds import over_background
 from bbfit.evaluation.scoring import held_out, view_angles
 from bbfit.evaluation.sizes import shrunk
 from bbfit.exporting.lod import LodLevel
@@ -30,15 +32,17 @@ if TYPE_CHECKING:
 Cost = Literal["vertices", "texels", "bytes"]
 """What a budget can limit."""
 INK, FAINT, _LINE, PAPER = (32, 36, 42), (112, 118, 126), (214, 217, 222), (242, 243, 245)
-_CELL_LEAST = 220  # pixels, for the text under a small picture
+_ROW_BACKGROUNDS = ("white", "grass", "sky", "black")  # of the rows of a comparison, in turn
+_CELL_LEAST = 300  # pixels, for the text under a small picture
 
 
 def comparison_picture(model: ShippedModel, views: ViewSet, path: str | Path, *, count: int = 4, title: str = "") -> None:
     """Write a PNG with one row per view, completely or not at all: target, result, and perceived difference, under a heading ``title``.
 
-    The rows are ``count`` held-out views, spread evenly in azimuth (:func:`spread_views`). Pictures are shown over white, pixel for pixel.
-    The difference is the FLIP map (:func:`bbfit.evaluation.metrics.flip_map`) in the colors of magma; black is no difference. The text
-    under each row has the view's name, azimuth, PSNR and SSIM over white and mean FLIP. Raises InputError like
+    The rows are ``count`` held-out views, spread evenly in azimuth (:func:`spread_views`). Pictures are shown pixel for pixel, the rows in
+    turn over white, grass, sky and black (:data:`bbfit.evaluation.backgrounds.BACKGROUNDS`). The difference is the FLIP map over the same
+    background (:func:`bbfit.evaluation.metrics.flip_map`) in the colors of magma; black is no difference. The text under each row has the
+    view's name, azimuth and background, and PSNR, SSIM and mean FLIP over that background. Raises InputError like
     :func:`bbfit.evaluation.scoring.evaluate`.
     """
     from PIL import Image, ImageDraw
@@ -72,16 +76,16 @@ def comparison_picture(model: ShippedModel, views: ViewSet, path: str | Path, *,
 
     for number, index in enumerate(rows):
         top = head + number * row + text // 4
-        target, result = (over_color(picture) for picture in held_out(model.draw, views, index))
-        pair = target.numpy(), result.numpy()
+        background = _ROW_BACKGROUNDS[number % len(_ROW_BACKGROUNDS)]
+        pair = over_background(*held_out(model.draw, views, index), background)
         error = metrics.flip_map(*pair)
-        for x, picture in zip(left, (to_bytes(target), to_bytes(result), magma(error)), strict=True):
+        for x, picture in zip(left, (*(to_bytes(torch.from_numpy(one)) for one in pair), magma(error)), strict=True):
             x += (cell - width) // 2
             draw.rectangle((x - 1, top - 1, x + width, top + height), outline=_LINE)
             sheet.paste(Image.fromarray(picture), (x, top))
         captions = (
             f"{views.names[index]}  ·  azimuth {angles[index, 0]:.0f}°" + _height(angles[index, 1]),
-            f"PSNR {metrics.psnr(*pair):.2f} dB  ·  SSIM {metrics.ssim(*pair):.3f}",
+            f"over {background}: PSNR {metrics.psnr(*pair):.2f} dB  ·  SSIM {metrics.ssim(*pair):.3f}",
             f"mean FLIP {error.mean():.3f}",
         )
         for x, caption in zip(left, captions, strict=True):
@@ -180,7 +184,7 @@ def pareto_plot(choice: Choice, path: str | Path, *, cost: Cost = "vertices") ->
     figure = plain_figure((9 if len(costs) == 1 else 14, 5), 120, panels=(1, len(costs)), between=0.6)
     for axes, name in zip(figure.subplots(1, len(costs), squeeze=False)[0], costs, strict=True):
         _draw_front(axes, choice, name)
-    figure.axes[0].set_ylabel("PSNR over white of validation views, dB")
+    figure.axes[0].set_ylabel("PSNR of validation views, mean over backgrounds, dB")
     figure.axes[0].set_title("Short fits; numbers are billboards", loc="left", fontsize=11)
     figure.axes[0].legend(frameon=False, fontsize=9, loc="lower right")
     write_figure(figure, path)

@@ -14,7 +14,8 @@ _STYLES = ("-", "--", ":", "-.")
 
 
 def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
-    """Write a PNG: PSNR over white and FLIP against the number of billboards, a column for each tree and a line for each configuration.
+    """Write a PNG: PSNR and FLIP, means over the backgrounds, against the number of billboards, with a column for each tree and a line for
+    each configuration.
 
     If all runs have the same number of billboards, the axis shows the labels instead. Without finished runs no file is written.
     """
@@ -43,7 +44,7 @@ def sweep_plot(rows: Sequence[SweepRow], path: Path) -> None:
         if line == 0:
             axis.set_title(tree)
         if column == 0:
-            axis.set_ylabel(measure.name + (", less is better" if measure.more is False else ""))
+            axis.set_ylabel(f"{measure.name}, mean over backgrounds" + ("\nless is better" if measure.more is False else ""))
         if not counted:
             axis.tick_params(axis="x", rotation=60)
         elif line == len(_MEASURES) - 1:

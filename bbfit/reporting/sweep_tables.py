@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from bbfit.evaluation.measures import ThesisScale
 from bbfit.evaluation.published import RATIOS_PERCENT, Experiment, published_figures
-from bbfit.evaluation.report import ThesisScale
 
 BILLBOARDS = "billboards"
+_MEANS = "Means over the held-out views. PSNR, SSIM and FLIP are also means over four backgrounds: white, black, grass and sky."
 
 
 @dataclass(frozen=True)
@@ -80,22 +81,26 @@ THESIS_SCALE = (
     Measure("SRE", ("thesis_scale", "sre"), ".2f", True),
 )
 MEASURES = (
-    Measure("PSNR, dB", ("over_white", "psnr"), ".2f", True),
-    Measure("SSIM", ("over_white", "ssim"), ".4f", True),
-    Measure("FLIP", ("over_white", "flip"), ".4f", False),
+    Measure("PSNR, dB", ("over", "mean", "psnr"), ".2f", True),
+    Measure("SSIM", ("over", "mean", "ssim"), ".4f", True),
+    Measure("FLIP", ("over", "mean", "flip"), ".4f", False),
+    Measure("PSNR over white, dB", ("over_white", "psnr"), ".2f", True),
     Measure("silhouette IoU", ("rgba", "iou"), ".3f", True),
     Measure("sharpness", ("sharpness",), ".2f", None),
-    Measure("brightness", ("brightness",), ".2f", None),
+    Measure("color ΔE", ("colour", "delta_e"), ".2f", False),
+    Measure("color chroma", ("colour", "chroma"), ".2f", None),
+    Measure("color brightness", ("colour", "brightness"), ".2f", None),
+    Measure("brightness with holes", ("brightness",), ".2f", None),
 )
 _COLUMNS = {
-    "psnr": ("over_white", "psnr"),
-    "ssim": ("over_white", "ssim"),
-    "flip": ("over_white", "flip"),
+    **{name: ("over", "mean", name) for name in ("psnr", "ssim", "flip")},
+    **{f"white_{name}": ("over_white", name) for name in ("psnr", "ssim", "flip")},
     "rgba_rmse": ("rgba", "rmse"),
     "rgba_psnr": ("rgba", "psnr"),
     "iou": ("rgba", "iou"),
     "sharpness": ("sharpness",),
     "brightness": ("brightness",),
+    **{f"color_{name}": ("colour", name) for name in ("delta_e", "chroma", "brightness")},
     "vertices": ("vertices", "model"),
     "original_vertices": ("vertices", "original"),
     "vertex_ratio": ("vertices", "ratio"),
@@ -131,7 +136,7 @@ def table_markdown(rows: Sequence[SweepRow]) -> str:
     column the best mean, as in figure 11 of the thesis.
     """
     done = [row for row in rows if row.reason is None]
-    parts = ["# Sweep\n", f"{len(done)} of {len(rows)} runs done, {_steps(done)} steps each. Means over the held-out views.\n"]
+    parts = ["# Sweep\n", f"{len(done)} of {len(rows)} runs done, {_steps(done)} steps each. {_MEANS}\n"]
     if done:
         parts += ["## Measures\n", pivot(done, MEASURES)]
         if changes := effects(done):
@@ -190,11 +195,11 @@ class Effect:
     published_psnr: float | None
     """The same difference between the thesis's results."""
     psnr: float | None
-    """Difference in PSNR over white, in dB."""
+    """Difference in PSNR, the mean over the backgrounds, in dB."""
     ssim: float | None
-    """Difference in SSIM."""
+    """Difference in SSIM, the mean over the backgrounds."""
     flip: float | None
-    """Difference in FLIP."""
+    """Difference in FLIP, the mean over the backgrounds."""
 
 
 def effects(rows: Sequence[SweepRow]) -> list[Effect]:
@@ -221,7 +226,7 @@ def effect_table(changes: Sequence[Effect]) -> str:
     def shown(value: float | None, digits: int) -> str:
         return "" if value is None else f"{value:+.{digits}f}"
 
-    head = ["change", "tree", "pairs", "PSNR over white, dB", "SSIM", "FLIP", "PSNR, thesis scale", "thesis's own"]
+    head = ["change", "tree", "pairs", "PSNR, dB", "SSIM", "FLIP", "PSNR, thesis scale", "thesis's own"]
     lines = []
     for one in changes:
         numbers = [shown(one.psnr, 2), shown(one.ssim, 4), shown(one.flip, 4), shown(one.thesis_psnr, 2), shown(one.published_psnr, 2)]

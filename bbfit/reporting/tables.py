@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 # Reports with more rings than this are shown without rings.
 _MOST_RINGS = 8
+_MEANS = "PSNR, SSIM and FLIP: means over four backgrounds"
 _UP, _DOWN, _ONE = "↑", "↓", "→ 1"
 
 
@@ -40,45 +41,48 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
     table = _table(["measure"], [])
     table.title, table.title_style = f"{title}: mean of {count}" if count > 1 else f"{title}: one view", "bold"
     table.add_column("better", justify="center", style="dim")
-    for name in ("over white", "premultiplied RGBA"):
+    for name in ("mean over\nbackgrounds", "over\nwhite", "RGBA"):
         table.add_column(name, justify="right")
-    table.add_column("thesis scale" if thesis else "", justify="right", style="dim")
+    table.add_column("thesis\nscale" if thesis else "", justify="right", style="dim")
 
     def cell(text: str) -> str:
         return text if thesis else ""
 
-    white, rgba, scale = mean.over_white, mean.rgba, mean.thesis_scale
-    table.add_row("PSNR, dB", _UP, f"{white.psnr:.2f}", f"{rgba.psnr:.2f}", cell(f"{scale.psnr:.3f}"))
-    table.add_row("RMSE", _DOWN, "", f"{rgba.rmse:.4f}", cell(f"{scale.rmse:.2e}"))
-    table.add_row("SSIM", _UP, f"{white.ssim:.4f}", "", cell(f"{scale.ssim:.7f}"))
+    over, white, rgba, scale, color = mean.over.mean, mean.over_white, mean.rgba, mean.thesis_scale, mean.colour
+    table.add_row("PSNR, dB", _UP, f"{over.psnr:.2f}", f"{white.psnr:.2f}", f"{rgba.psnr:.2f}", cell(f"{scale.psnr:.3f}"))
+    table.add_row("SSIM", _UP, f"{over.ssim:.4f}", f"{white.ssim:.4f}", "", cell(f"{scale.ssim:.7f}"))
+    table.add_row("FLIP", _DOWN, f"{over.flip:.4f}", f"{white.flip:.4f}", "", "")
+    table.add_row("RMSE", _DOWN, "", "", f"{rgba.rmse:.4f}", cell(f"{scale.rmse:.2e}"))
     if thesis:
-        table.add_row("SRE, dB", _UP, "", "", f"{scale.sre:.3f}")
-    table.add_row("FLIP", _DOWN, f"{white.flip:.4f}", "", "")
-    table.add_row("silhouette IoU", _UP, "", f"{rgba.iou:.4f}", "")
-    table.add_row("sharpness", _ONE, _share(mean.sharpness), "", "")
-    table.add_row("brightness", _ONE, "", _share(mean.brightness), "")
+        table.add_row("SRE, dB", _UP, "", "", "", f"{scale.sre:.3f}")
+    table.add_row("silhouette IoU", _UP, "", "", f"{rgba.iou:.4f}", "")
+    table.add_row("sharpness", _ONE, "", _share(mean.sharpness), "", "")
+    table.add_row("color ΔE", _DOWN, "", "", "-" if color.delta_e is None else f"{color.delta_e:.2f}", "")
+    table.add_row("color chroma", _ONE, "", "", _share(color.chroma), "")
+    table.add_row("color brightness", _ONE, "", "", _share(color.brightness), "")
+    table.add_row("... with holes", _ONE, "", "", _share(mean.brightness), "")
 
     if 1 < len(report.rings) <= _MOST_RINGS:
         table.add_section()
         for ring in report.rings:
-            white, rgba, scale = ring.measures.over_white, ring.measures.rgba, ring.measures.thesis_scale
-            name = f"PSNR, dB, at {ring.elevation_degrees:.0f}°"
-            table.add_row(name, _UP, f"{white.psnr:.2f}", f"{rgba.psnr:.2f}", cell(f"{scale.psnr:.3f}"))
+            measures = ring.measures
+            values = [f"{one.psnr:.2f}" for one in (measures.over.mean, measures.over_white, measures.rgba)]
+            table.add_row(f"PSNR, dB, at {ring.elevation_degrees:.0f}°", _UP, *values, cell(f"{measures.thesis_scale.psnr:.3f}"))
 
     if report.sizes:
         table.add_section()
-        table.add_row("as exported", "", "PSNR, dB", "coverage", "", style="bold")
+        table.add_row("as exported", "", "PSNR, dB", "", "coverage", "", style="bold")
         for size in report.sizes:
-            table.add_row(f"{size.width} x {size.height} pixels", f"{_UP} {_ONE}", f"{size.psnr:.2f}", _share(size.coverage), "")
+            table.add_row(f"{size.width} x {size.height} pixels", f"{_UP} {_ONE}", f"{size.psnr:.2f}", "", _share(size.coverage), "")
 
     table.add_section()
-    table.add_row("cost", "", "model", "original", Text("ratio", style="not dim"), style="bold")
+    table.add_row("cost", "", "model", "", "original", Text("ratio", style="not dim"), style="bold")
     for name, cost in (("vertices", report.vertices), ("file, bytes", report.bytes)):
-        table.add_row(name, _DOWN, _count(cost.model), _count(cost.original), _percent(cost))
+        table.add_row(name, _DOWN, _count(cost.model), "", _count(cost.original), _percent(cost))
     if report.overdraw is not None:
-        table.add_row("empty area drawn", _DOWN, f"{100 * report.overdraw:.3g} %", "", "")
+        table.add_row("empty area drawn", _DOWN, f"{100 * report.overdraw:.3g} %", "", "", "")
     if report.shaded is not None:
-        table.add_row("shaded / covered pixels", _DOWN, f"{report.shaded:.2f}", "", "")
+        table.add_row("shaded / covered pixels", _DOWN, f"{report.shaded:.2f}", "", "", "")
     if report.seconds:
         table.caption = "seconds: " + "  ·  ".join(f"{stage} {seconds:,.1f}" for stage, seconds in report.seconds.items())
         table.caption_justify = "left"
@@ -97,11 +101,12 @@ def lod_table(levels: Sequence[LodLevel]) -> Table:
 
 
 def sweep_table(rows: Sequence[SweepRow]) -> Table:
-    """A ``rich`` table with one line per run: measures and costs, or the reason of its failure."""
+    """A ``rich`` table with one line per run: measures, which are means over the backgrounds, and costs, or the reason of its failure."""
     from rich.text import Text  # of names and reasons, in which brackets are no markup
 
     labels = label_names(rows)
     table = _table(["tree", *labels], ["PSNR, dB", "SSIM", "FLIP", "vertices", "bytes", "seconds"])
+    table.caption, table.caption_justify = _MEANS, "left"
     for row in rows:
         start = [Text(row.tree), *(Text(row.labels.get(name, "")) for name in labels)]
         if row.facts is None:
@@ -115,11 +120,12 @@ def sweep_table(rows: Sequence[SweepRow]) -> Table:
 
 
 def compare_table(rows: Sequence[CompareRow]) -> Table:
-    """A ``rich`` table with one line per system: its measures on the held-out views and its costs."""
+    """A ``rich`` table with one line per system: its costs and its measures on the held-out views, means over the backgrounds."""
     table = _table(["system"], ["PSNR, dB", "SSIM", "FLIP", "planes", "vertices", "bytes", "seconds"], no_wrap=True)
+    table.caption, table.caption_justify = _MEANS, "left"
     for row in rows:
-        white = None if row.measures is None else row.measures.over_white
-        scores = ["-"] * 3 if white is None else [f"{white.psnr:.2f}", f"{white.ssim:.3f}", f"{white.flip:.3f}"]
+        over = None if row.measures is None else row.measures.over.mean
+        scores = ["-"] * 3 if over is None else [f"{over.psnr:.2f}", f"{over.ssim:.3f}", f"{over.flip:.3f}"]
         seconds = "-" if row.seconds is None else f"{row.seconds:,.1f}"
         table.add_row(row.title, *scores, _count(row.planes), _count(row.vertices), _count(row.bytes), seconds)
     return table

@@ -14,7 +14,7 @@ import pytest
 import torch
 from billboard_scene import crossing_billboards
 
-from bbfit.budget.choice import COUNTS, MIN_GAIN_DB, Choice, Trial, choose, lookup, mean_psnr, model_bytes, pareto_front, within_bytes
+from bbfit.budget.choice import COUNTS, MIN_GAIN_DB, Choice, Trial, choose, lookup, model_bytes, pareto_front, validation_psnr, within_bytes
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError
 from bbfit.evaluation.scoring import evaluate
@@ -134,9 +134,9 @@ def test_a_texel_for_each_is_the_end_and_not_an_error(noise: BillboardCloud) -> 
 def test_the_mean_psnr_is_that_of_the_report(views: ViewDataset, known_cloud: BillboardCloud) -> None:
     worse = known_cloud.with_texels(known_cloud.texels**2)
     for split in (views.test, views.train.take([3, 7])):
-        found = mean_psnr(worse, split)
-        assert found == pytest.approx(evaluate(worse, split).mean.over_white.psnr, abs=1e-9) and 10 < found < 40
-    assert mean_psnr(known_cloud, views.test) > found + 5
+        found = validation_psnr(worse, split)
+        assert found == pytest.approx(evaluate(worse, split).mean.over.mean.psnr, abs=1e-9) and 10 < found < 40
+    assert validation_psnr(known_cloud, views.test) > found + 5
 
 
 # Rules, with qualities that are made up.
@@ -529,7 +529,7 @@ def test_a_trial_is_a_short_fit_measured_on_views_it_has_not_seen(views: ViewDat
         cloud = fit(rest, dataclasses.replace(asked, **given), tree=tree).cloud
         assert trial.max_texels is None
         assert (trial.vertices, trial.texels, trial.bytes) == (cloud.vertex_count, len(cloud.texels), model_bytes(cloud, export))
-        assert trial.psnr == pytest.approx(mean_psnr(cloud, held), abs=6e-4) and trial.seconds >= 0
+        assert trial.psnr == pytest.approx(validation_psnr(cloud, held), abs=6e-4) and trial.seconds >= 0
 
 
 class Noted(World):
@@ -661,7 +661,7 @@ def test_a_choice_on_real_views() -> None:
     rest = dataclasses.replace(views, train=views.train.take([index for index in range(len(views.train)) if index not in held]))
     cloud = fit(rest, dataclasses.replace(found.config, restarts=1)).cloud
     assert (best.vertices, best.texels, best.bytes) == (cloud.vertex_count, len(cloud.texels), model_bytes(cloud, ExportConfig()))
-    assert best.psnr == pytest.approx(mean_psnr(cloud, views.train.take(held)), abs=6e-4)
+    assert best.psnr == pytest.approx(validation_psnr(cloud, views.train.take(held)), abs=6e-4)
 
 
 @pytest.mark.slow

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
+import flip_evaluator
 import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from bbfit.checks import InputError
-from bbfit.evaluation import metrics
+from bbfit.evaluation import metrics, thesis_scale
 
 
 @pytest.fixture
@@ -178,3 +179,22 @@ def test_silhouettes_are_as_far_apart_as_most_of_their_pixels() -> None:
     assert metrics.silhouette_distance(target, holed) == metrics.silhouette_distance(holed, target) >= 2
     with pytest.raises(InputError, match="render"):
         metrics.silhouette_distance(target, target[:-1])
+
+
+@pytest.mark.parametrize("place", [(0, 0, 9, 13), (70, 60, 21, 4), (100, 90, 20, 30), (40, 37, 1, 1), (0, 0, 120, 120)])
+@pytest.mark.parametrize("noisy", [False, True])
+def test_what_is_equal_may_be_left_out_of_ssim_and_flip(place: tuple[int, int, int, int], noisy: bool) -> None:
+    """Pictures that differ in a rectangle, at corners and borders too, before a plain or a noisy background."""
+    rng = np.random.default_rng(3)
+    target = rng.random((120, 120, 3)) if noisy else np.full((120, 120, 3), (0.25, 0.35, 0.12))
+    row, column, height, width = place
+    render = target.copy()
+    render[row : row + height, column : column + width] = rng.random((height, width, 3))
+    found, _, _ = flip_evaluator.evaluate(
+        target.astype(np.float32), render.astype(np.float32), "LDR", applyMagma=False, computeMeanError=False, parameters={}
+    )
+    np.testing.assert_allclose(metrics.flip_map(target, render), found[..., 0], rtol=0, atol=1e-9)
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "channel_axis": 2, "data_range": 1.0}
+    assert metrics.ssim(target, render) == pytest.approx(structural_similarity(target, render, **options), abs=1e-12)
+    flat = structural_similarity(target, render, data_range=4095, channel_axis=2)
+    assert thesis_scale.ssim(target, render) == pytest.approx(flat, abs=1e-12)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,13 +10,14 @@ from pathlib import Path
 import pytest
 
 from bbfit.checks import InputError, MissingFileError
-from bbfit.evaluation.report import Cost, Measures, OverWhite, Report, Rgba, SizeScore, ThesisScale, ViewScore
+from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
+from bbfit.evaluation.report import Cost, Report, SizeScore, ViewScore, stage_seconds
 
 
 def score(name: str, scale: float, sharpness: float | None = 1.0) -> ViewScore:
-    measures = Measures(
-        OverWhite(20 * scale, 0.8, 0.1), Rgba(0.1, 22 * scale, 0.7), ThesisScale(2e-5, 0.99999, 92 * scale, 17), sharpness, 0.5
-    )
+    over = Over(*(OverBackground((20 + step) * scale, 0.8, 0.1 + step / 10) for step in range(4)))
+    colour = Colour((4.0 * scale, 5.0, 2.0, 10.0), (2.0, 3.0, 1.0, 8.0), (4.0, 4.0, 2.0, 9.0), (2.0, 2.0, 1.0, 6.0))
+    measures = Measures(over, Rgba(0.1, 22 * scale, 0.7), ThesisScale(2e-5, 0.99999, 92 * scale, 17), colour, sharpness, 0.5)
     return ViewScore(name, 12.0, 0.0, measures)
 
 
@@ -23,14 +25,18 @@ SIZES = (SizeScore(64, 48, 20.5, 1.01, 0.1), SizeScore(32, 24, 21.5, None, 0.09)
 REPORT = Report((score("a", 1.0), score("b", 1.5, None)), Cost(16, 113_152), Cost(None, 5_000), {"fit": 2.0}, sizes=SIZES)
 MEASURES = {
     "over_white": {"psnr", "ssim", "flip"},
+    "over": {"white", "black", "grass", "sky", "mean"},
     "rgba": {"rmse", "psnr", "iou"},
     "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
+    "colour": {"delta_e", "chroma", "brightness", "target", "render", "target_inside", "render_inside"},
 }
 
 
 def test_means_are_plain_and_leave_out_what_is_undefined() -> None:
     mean = REPORT.mean
     assert mean.over_white.psnr == 25 and mean.rgba.psnr == pytest.approx(27.5) and mean.thesis_scale.psnr == 115  # dB averaged as dB
+    assert mean.over.mean.psnr == pytest.approx(26.875) and mean.over.mean.flip == pytest.approx(0.25)  # of 20, 21, 22, 23 and 30 ... 34.5
+    assert mean.over.mean.psnr == pytest.approx(sum(view.measures.over.mean.psnr for view in REPORT.views) / 2)
     assert mean.sharpness == 1 and mean.brightness == 0.5
     assert replace(REPORT, views=(score("b", 1, None),)).mean.sharpness is None
 
@@ -70,6 +76,7 @@ def test_schema() -> None:
     assert list(content["rings"][0]) == ["elevation_degrees", "views", *MEASURES, "sharpness", "brightness"]
     for part in (content, *content["views"], *content["rings"]):
         assert {group: set(part[group]) for group in MEASURES} == MEASURES
+        assert part["over_white"] == part["over"]["white"] and all(set(each) == {"psnr", "ssim", "flip"} for each in part["over"].values())
     for cost in ("vertices", "bytes"):
         assert set(content[cost]) == {"model", "original", "ratio"}
     assert content["views"][1]["sharpness"] is None
@@ -84,6 +91,28 @@ def test_round_trip(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["metrics.json"]
 
 
+def test_a_file_of_an_earlier_version_is_refused_but_its_seconds_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.json"
+    content = REPORT.to_json()
+    for part in (content, *content["views"], *content["rings"]):
+        del part["over"], part["colour"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"earlier version of bbfit wrote it, with scores over white only.*; write it again"):
+        Report.load(path)
+    assert stage_seconds(path) == {"fit": 2.0}
+    path.write_text('{"seconds": {"fit": "long"}}')
+    with pytest.raises(InputError, match="metrics"):
+        stage_seconds(path)
+
+
+def test_sums_of_colors_have_four_numbers(tmp_path: Path) -> None:
+    content = REPORT.to_json()
+    content["views"][0]["colour"]["render"] = [1.0, 2.0, 3.0]
+    (tmp_path / "metrics.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="a sum of colors"):
+        Report.load(tmp_path / "metrics.json")
+
+
 @pytest.mark.parametrize("content", ['{"views": []}', "[1, 2]", '{"views": [{"name": "a"}]}', "{"])
 def test_damaged_file(tmp_path: Path, content: str) -> None:
     path = tmp_path / "metrics.json"
@@ -92,3 +121,12 @@ def test_damaged_file(tmp_path: Path, content: str) -> None:
         Report.load(path)
     with pytest.raises(MissingFileError, match="does not exist"):
         Report.load(tmp_path / "other.json")
+
+
+def test_figures_of_any_sums_of_colors_are_finite() -> None:
+    """Also of those in a file that someone edited."""
+    values = (0.0, -1.0, 5e-324, 1e-9, 0.5, 1e300)
+    for first, second, alpha in itertools.product(values, repeat=3):
+        colour = Colour(*[(first, second, first, alpha), (second, first, second, 1.0)] * 2)
+        swapped = Colour(colour.render, colour.target, colour.render_inside, colour.target_inside)
+        json.dumps([colour.to_json(), swapped.to_json()], allow_nan=False)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+import math
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from billboard_scene import crossing_billboards, write_views
+from skimage.color import rgb2lab
 
 from bbfit.checks import InputError
 from bbfit.evaluation import metrics
+from bbfit.evaluation.backgrounds import BACKGROUNDS
+from bbfit.evaluation.measures import Over, OverBackground, mean_measures
 from bbfit.evaluation.scoring import OriginalTree, evaluate, held_out, measure, view_angles
 from bbfit.exporting.model import shipped_model
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
@@ -71,6 +75,90 @@ def test_both_empty() -> None:
     assert measures.over_white.ssim == measures.rgba.iou == 1
     assert measures.over_white.flip == measures.rgba.rmse == 0
     assert measures.sharpness is None and measures.brightness is None
+    assert measures.over.mean == measures.over.sky == OverBackground(120, 1, 0)
+    assert measures.colour.delta_e is measures.colour.chroma is measures.colour.brightness is None
+
+
+def constant(color: tuple[float, float, float], alpha: float = 1.0, side: int = 16) -> torch.Tensor:
+    """One premultiplied color of straight RGB and an alpha everywhere, [side, side, 4]."""
+    return torch.tensor([*(alpha * value for value in color), alpha], dtype=torch.float64).expand(side, side, 4)
+
+
+def test_scores_are_over_each_background_and_their_mean(views: ViewDataset) -> None:
+    target = views.test.targets([1], torch.float64)[0]
+    image = target * torch.tensor([0.6, 0.7, 0.8, 0.9], dtype=torch.float64)
+    over = measure(target, image).over
+    assert list(BACKGROUNDS) == ["white", "black", "grass", "sky"] == [entry.name for entry in fields(Over)]
+    for name, color in BACKGROUNDS.items():
+        alphas = target[..., 3:].numpy(), image[..., 3:].numpy()
+        pair = [picture[..., :3].numpy() + (1 - alpha) * np.array(color) for picture, alpha in zip((target, image), alphas, strict=True)]
+        found = getattr(over, name)
+        assert found == OverBackground(metrics.psnr(*pair), metrics.ssim(*pair), metrics.flip(*pair))
+    for each in ("psnr", "ssim", "flip"):
+        assert getattr(over.mean, each) == pytest.approx(np.mean([getattr(getattr(over, name), each) for name in BACKGROUNDS]), rel=1e-12)
+    assert len({getattr(over, name).psnr for name in BACKGROUNDS}) == 4
+
+
+def test_a_haze_in_the_color_of_a_background_is_seen_over_the_others() -> None:
+    """Half-opaque white over nothing: invisible over white, a difference of a half over black."""
+    over = measure(constant((0, 0, 0), 0), constant((1, 1, 1), 0.5)).over
+    assert over.white.psnr == 120 and over.white.flip == 0
+    assert over.black.psnr == pytest.approx(-20 * math.log10(0.5))
+    assert over.grass.psnr == pytest.approx(-10 * math.log10(np.mean([(0.5 * (1 - value)) ** 2 for value in (0.25, 0.35, 0.12)])))
+    assert over.mean.psnr < 40 and over.mean.flip > 0.2
+
+
+def test_half_transparent_leaves_keep_their_color_and_gray_ones_do_not() -> None:
+    """The target's leaves are half transparent. The same color at any alpha is perfect; gray of the same alpha has no chroma."""
+    green = (0.2, 0.5, 0.1)
+    target = constant(green, 0.5)
+    solid = measure(target, constant(green, 1.0)).colour
+    assert (solid.delta_e, solid.chroma, solid.brightness) == pytest.approx((0, 1, 1), abs=1e-12)
+    gray = measure(target, constant((0.4, 0.4, 0.4), 0.5)).colour
+    wanted = rgb2lab(np.array([green, (0.4, 0.4, 0.4)]))
+    assert gray.delta_e == pytest.approx(float(np.linalg.norm(wanted[1] - wanted[0])), rel=1e-9) and gray.delta_e > 40
+    assert gray.chroma == pytest.approx(0, abs=1e-3) and gray.brightness == pytest.approx(1.2 / 0.8)
+    assert measure(constant((0.4, 0.4, 0.4)), target).colour.chroma is None, "a gray target has no chroma to compare with"
+
+
+def test_holes_are_dark_for_the_old_brightness_only() -> None:
+    target = constant((0.2, 0.5, 0.1))
+    holed = target.clone()
+    holed[:, ::4] = 0
+    measures = measure(target, holed)
+    assert measures.brightness == pytest.approx(0.75) and measures.colour.brightness == pytest.approx(1)
+    assert measures.colour.delta_e == pytest.approx(0, abs=1e-12)
+    dim = measure(target, holed * torch.tensor([0.5, 0.5, 0.5, 1]))
+    assert dim.brightness == pytest.approx(0.375) and dim.colour.brightness == pytest.approx(0.5)
+
+
+def test_brightness_is_that_inside_the_targets_silhouette() -> None:
+    """What the render draws elsewhere counts for its mean color, but not for its brightness."""
+    target = torch.zeros(16, 16, 4, dtype=torch.float64)
+    target[:8] = constant((0.2, 0.5, 0.1))[:8]
+    image = target.clone()
+    image[8:] = constant((1, 1, 1))[8:]
+    colour = measure(target, image).colour
+    assert colour.brightness == pytest.approx(1) and colour.delta_e is not None and colour.delta_e > 20
+    assert colour.render == pytest.approx((128 * 1.2, 128 * 1.5, 128 * 1.1, 256)) and colour.render_inside == colour.target_inside
+
+
+def test_colors_of_several_views_are_pooled() -> None:
+    """One view is too red and another too green, by areas of 1 to 3: their sums are the target's, the means of their figures are not."""
+    gray, red, green = (0.4, 0.4, 0.2), (0.7, 0.4, 0.2), (0.3, 0.4, 0.2)
+    small, large = torch.zeros(16, 16, 4).double(), torch.zeros(16, 16, 4).double()
+    small[:4], large[:12] = 1, 1
+    pairs = [(shape * constant(gray), shape * constant(color)) for shape, color in ((small, red), (large, green))]
+    each = [measure(*pair) for pair in pairs]
+    pooled = mean_measures(each).colour
+    assert (pooled.delta_e, pooled.chroma, pooled.brightness) == pytest.approx((0, 1, 1), abs=1e-9)
+    assert min(one.colour.delta_e or 0 for one in each) > 5
+    assert pooled.target == pytest.approx((256 * 0.4, 256 * 0.4, 256 * 0.2, 256))
+    empty = torch.zeros(16, 16, 4)
+    for pair in ((empty, pairs[0][1]), (pairs[0][0], empty)):
+        nothing = measure(*pair).colour
+        assert nothing.delta_e is nothing.chroma is nothing.brightness is None
+    assert mean_measures([measure(*pairs[0]), measure(empty, empty)]).colour == each[0].colour, "a view without a tree changes nothing"
 
 
 def test_measures_are_taken_from_the_right_pictures() -> None:

@@ -13,6 +13,7 @@ from billboard_scene import crossing_billboards, write_views
 from torch import Tensor
 
 from bbfit.checks import InputError
+from bbfit.evaluation.backgrounds import BACKGROUNDS
 from bbfit.evaluation.sizes import score_sizes, shrunk
 from bbfit.geometry.camera import Camera
 from bbfit.images import over_color
@@ -90,11 +91,14 @@ def test_measures_are_those_of_known_differences(views: ViewSet) -> None:
     """Nothing at all, and white of alpha 1/4 everywhere, at half the size."""
     targets = torch.stack([averaged(views, index, 49, 35) for index in range(4)])
     nothing = score_sizes(lambda camera: plain(camera, 0.0), views, 1)[1]
-    errors = (over_color(targets) - 1).square().mean((1, 2, 3))
+    colors = [torch.tensor(color).double() for color in BACKGROUNDS.values()]
+    errors = torch.stack([(over_color(targets, color) - color).square().mean((1, 2, 3)) for color in colors])
     assert nothing.coverage == 0 and nothing.alpha == pytest.approx(float(targets[..., 3].square().mean().sqrt()))
     assert nothing.psnr == pytest.approx(float((-10 * errors.log10()).mean()))
     haze = score_sizes(lambda camera: plain(camera, 0.25), views, 1)[1]
-    assert haze.psnr == pytest.approx(nothing.psnr) and haze.coverage == pytest.approx(float(0.25 / targets[..., 3].mean()))
+    hazes = torch.stack([(over_color(targets, color) - 0.25 - 0.75 * color).square().mean((1, 2, 3)) for color in colors])
+    assert haze.psnr == pytest.approx(float((-10 * hazes.log10()).mean()))
+    assert haze.coverage == pytest.approx(float(0.25 / targets[..., 3].mean()))
     assert haze.alpha == pytest.approx(float((targets[..., 3] - 0.25).square().mean().sqrt()))
     assert score_sizes(lambda camera: plain(camera, 7.0), views, 0)[0].coverage == pytest.approx(4 * haze.coverage)
 

@@ -26,7 +26,8 @@ from bbfit.blender.config import ViewsConfig
 from bbfit.blender.request import RenderedTree, ViewsRequest
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError
-from bbfit.evaluation.report import Cost, Measures, OverWhite, Report, Rgba, SizeScore, ThesisScale, ViewScore
+from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
+from bbfit.evaluation.report import Cost, Report, SizeScore, ViewScore
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
@@ -434,7 +435,9 @@ def _read_species(folder: Path) -> None:
 
 @functools.cache
 def _report() -> dict[str, Any]:
-    measures = Measures(OverWhite(30.0, 0.9, 0.1), Rgba(0.1, 20.0, 0.9), ThesisScale(0.1, 0.9, 90.0, 10.0), 0.9, None)
+    over = OverBackground(30.0, 0.9, 0.1)
+    colour = Colour((1.0, 2.0, 0.5, 4.0), (1.0, 1.5, 0.5, 4.0), (0.5, 1.0, 0.2, 2.0), (0.4, 0.9, 0.2, 2.0))
+    measures = Measures(Over(over, over, over, over), Rgba(0.1, 20.0, 0.9), ThesisScale(0.1, 0.9, 90.0, 10.0), colour, 0.9, None)
     scores = tuple(ViewScore(name, 90.0, 0.0, measures) for name in ("0001", "0002"))
     report = Report(scores, Cost(8, 1000), Cost(1000, 10_000), {"fit": 1.0}, small_cloud().alpha, 1.5, (SizeScore(8, 8, 30.0, None, 0.1),))
     return report.to_json()
@@ -449,7 +452,7 @@ _CHOICE = {
 _STAGES = {"source": "tree.glb", "config": {"grow": None, "export": {}}, "seeds": {}}
 _STAGES |= {"stages": {"fit": {"inputs": "0" * 64, "outputs": {"cloud.safetensors": "0" * 64, "../secret.png": "1"}, "seconds": 1.5}}}
 _OUTCOME = {
-    "outcome": {"facts": {"report": {"over_white": {"psnr": 30.0}}}, "reason": None, "where": "here", "seconds": 1.0, "trace": None}
+    "outcome": {"facts": {"report": {"over": {"mean": {"psnr": 30.0}}}}, "reason": None, "where": "here", "seconds": 1.0, "trace": None}
 }
 _LOD = {
     "config": {"screen_height": 1080, "screen_width": 1920, "screen_fov_degrees": 40.0},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from scenes import camera_on_z, facing_cloud, ring_of, scenes, tracked
 from bbfit.checks import InputError
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.operators.drawing.compositing import STEEPEST, opacity, thresholds
+from bbfit.operators.drawing.compositing import STEEPEST, layer_weights, opacity, thresholds
 from bbfit.operators.drawing.fused import render_fused
 from bbfit.operators.drawing.reference import render_reference
 
@@ -20,8 +21,11 @@ MODES = {
     "hard": AlphaMode("mask", 0.4),
     "ramp": AlphaMode("mask", 0.5, 3.0),
     "steep": AlphaMode("mask", 0.3, 11.0),
+    "antialiased": AlphaMode("mask", 0.4, antialiased=True),
+    "antialiased ramp": AlphaMode("mask", 0.5, 3.0, antialiased=True),
     "hash": AlphaMode("hash"),
 }
+DIFFERENTIABLE = [name for name in MODES if name != "hash"]
 
 
 @pytest.mark.parametrize("mode", MODES.values(), ids=MODES.keys())
@@ -38,7 +42,7 @@ def test_both_renderers_draw_the_same(mode: AlphaMode) -> None:
     assert flipped <= 2e-4 * pixels  # measured: at most 4e-5, in the modes with a step
 
 
-@pytest.mark.parametrize("mode", [MODES["hard"], MODES["ramp"], MODES["steep"]], ids=["hard", "ramp", "steep"])
+@pytest.mark.parametrize("mode", [MODES[name] for name in DIFFERENTIABLE], ids=DIFFERENTIABLE)
 def test_both_renderers_have_the_same_gradients(mode: AlphaMode) -> None:
     for billboards in (1, 3, 6):
         cloud, camera = ring_of(40, billboards)
@@ -102,6 +106,35 @@ def test_the_ramp_ends_at_nothing_and_opaque_and_has_its_slope() -> None:
         beyond = (alpha.detach() - mode.cutoff).abs() - 0.5 / steepness
         assert torch.allclose(slope[beyond < -1e-9], torch.tensor(steepness).double()) and not slope[beyond > 1e-9].any()
     assert opacity(alpha, AlphaMode()) is alpha
+
+
+def test_an_antialiased_edge_covers_the_share_of_the_pixel_that_is_inside() -> None:
+    """An upright edge, where alpha changes by the same amount from pixel to pixel: opacity is the share of the pixel on the opaque side."""
+    for place in torch.linspace(3.0, 5.0, 17, dtype=torch.float64):  # of the contour of the cutoff, in pixels
+        alpha = (0.35 + 0.1 * (torch.arange(8, dtype=torch.float64) - place)).expand(8, 8)
+        shown = opacity(alpha, AlphaMode("mask", 0.35, antialiased=True))
+        inside = (torch.arange(8, dtype=torch.float64) + 0.5 - place).clamp(0, 1).where(alpha[0] > 0, 0)
+        assert torch.allclose(shown, inside.expand(8, 8), atol=1e-12)
+
+
+def test_layers_of_an_antialiased_mask_cover_the_same_samples_first() -> None:
+    """Front to back 0.25, 0.75, 0.5 and 1: the second shows half, the third nothing, the last the rest, in any order of the list."""
+    depths, alphas = [1.0, 2.0, 3.0, 4.0], [0.25, 0.75, 0.5, 1.0]
+    for order in itertools.permutations(range(4)):
+        planes = [[torch.full((1, 1, 2, 2), values[i]) for i in order] for values in (alphas, depths)]
+        weights = layer_weights(*planes, nested=True)
+        assert [float(weights[order.index(i)][0, 0, 0, 0]) for i in range(4)] == [0.25, 0.5, 0, 0.25]
+
+
+def test_an_antialiased_mask_is_what_four_samples_a_pixel_show() -> None:
+    """Alpha to coverage estimates the mean of many samples from one; the edges of a mask with one sample are several times farther off."""
+    texels = torch.nn.functional.interpolate(torch.rand(1, 4, 9, 9, generator=torch.Generator().manual_seed(5)), (72, 72), mode="bicubic")
+    cloud = facing_cloud([3.0], [(72, 72)], (1.0, 1.0)).to(torch.float32).with_texels(texels.clamp(0, 1)[0].permute(1, 2, 0).reshape(-1, 4))
+    camera = camera_on_z(64, 64, fov=30)
+    pictures = {name: render_fused(replace(cloud, alpha=AlphaMode("mask", antialiased=name == "one")), camera) for name in ("one", "hard")}
+    many = render_fused(replace(cloud, alpha=AlphaMode("mask")), camera.resized(512, 512)).view(64, 8, 64, 8, 4).mean((1, 3))
+    errors = {name: float((picture - many).square().mean().sqrt()) for name, picture in pictures.items()}
+    assert errors["one"] < 0.35 * errors["hard"], errors
 
 
 def test_the_mode_stays_with_the_cloud(known_cloud: BillboardCloud, tmp_path: object) -> None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from bbfit.checks import InputError
+from bbfit.evaluation.measures import Over, OverBackground
 from bbfit.evaluation.report import SizeScore, ViewScore
 from bbfit.evaluation.scoring import measure
 from bbfit.geometry.cloud import BillboardCloud
@@ -24,10 +25,8 @@ def scores(*values: tuple[float, float, float], azimuths: tuple[float, ...] | No
     measures = measure(flat, flat)
     angles = azimuths or tuple(360 * index / len(values) for index in range(len(values)))
     return [
-        ViewScore(
-            f"{index:04d}", angle, elevation, replace(measures, over_white=replace(measures.over_white, psnr=psnr, ssim=ssim, flip=flip))
-        )
-        for index, ((psnr, ssim, flip), angle) in enumerate(zip(values, angles, strict=True))
+        ViewScore(f"{index:04d}", angle, elevation, replace(measures, over=Over(*[OverBackground(*each)] * 4)))
+        for index, (each, angle) in enumerate(zip(values, angles, strict=True))
     ]
 
 

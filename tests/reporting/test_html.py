@@ -19,6 +19,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page
 
 from bbfit.blender.config import ViewsConfig
+from bbfit.evaluation.backgrounds import BACKGROUNDS
 from bbfit.evaluation.metrics import psnr
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
@@ -136,7 +137,7 @@ def test_the_page_loads_without_complaint_and_shows_what_is_there(visit: Visit, 
         assert headings == ["From every side", "The model", "Numbers", "The billboards", "From a distance", "The fit", "Options"]
         assert page.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
         key = page.evaluate("document.querySelector('.key').textContent")
-        mean = result.report.mean.over_white
+        mean = result.report.mean.over.mean
         for figure in (f"{mean.psnr:.2f} dB", f"{mean.ssim:.3f}", f"{mean.flip:.3f}", "8", f"{result.report.bytes.model:,}"):
             assert figure in key
         assert page.locator("#billboards figure").count() == 2
@@ -171,8 +172,9 @@ def test_the_slider_shows_other_views(visit: Visit, result: RunResult) -> None:
         shown = []
         for number, view in enumerate(views):
             page.evaluate("n => { const s = document.getElementById('view'); s.value = n; s.dispatchEvent(new Event('input')); }", number)
-            white = view.measures.over_white
-            assert f"azimuth {view.azimuth_degrees:.0f}°" in caption(page) and f"PSNR {white.psnr:.2f} dB" in caption(page)
+            psnr = view.measures.over.mean.psnr, view.measures.over_white.psnr
+            assert f"azimuth {view.azimuth_degrees:.0f}°" in caption(page)
+            assert "PSNR {:.2f} dB ({:.2f} over white)".format(*psnr) in caption(page)
             shown.append(tuple(pictures(page)))
         assert len({part for parts in shown for part in parts}) == 3 * len(views)
         page.focus("#view")
@@ -204,6 +206,32 @@ def test_pictures_are_the_views_and_the_renders(visit: Visit, result: RunResult)
         assert Image.open(io.BytesIO(base64.b64decode(uris[2].split(",")[1]))).size == (48, 40)
 
 
+def test_held_out_views_are_over_the_chosen_background(visit: Visit) -> None:
+    """Chosen by arrow keys. The textures keep their checkerboard, and a new page begins with white again."""
+
+    def act(page: Page) -> None:
+        names = page.evaluate("[...document.querySelectorAll('input[name=over]')].map(input => input.value)")
+        assert names == [*BACKGROUNDS, "checkerboard"]
+        target, other = page.locator(".strip .picture").first, page.locator(".worst .picture").first
+        texture = page.locator("#billboards .picture").first
+        paper = texture.evaluate("element => getComputedStyle(element).background")
+        page.focus("input[name=over]:checked")
+        seen = list[bytes]()
+        for name, color in BACKGROUNDS.items():
+            assert page.evaluate("document.activeElement.value") == name
+            for picture in (target, other):  # their corners are transparent
+                pixel = np.asarray(Image.open(io.BytesIO(picture.screenshot())).convert("RGB"))[5, -5]
+                assert np.abs(pixel - 255 * np.array(color)).max() <= 1
+            seen.append(target.screenshot())
+            page.keyboard.press("ArrowRight")
+        assert "repeating-conic-gradient" in target.evaluate("element => getComputedStyle(element).backgroundImage")
+        assert len({*seen, target.screenshot()}) == 5
+        assert texture.evaluate("element => getComputedStyle(element).background") == paper
+
+    visit(act, width=1100)
+    assert visit(lambda page: page.evaluate("document.querySelector('input[name=over]:checked').value"), width=1100) == "white"
+
+
 def test_charts_follow_the_view_and_lead_to_it(visit: Visit, result: RunResult) -> None:
     report = result.report
 
@@ -216,7 +244,7 @@ def test_charts_follow_the_view_and_lead_to_it(visit: Visit, result: RunResult) 
         marks = page.evaluate("JSON.parse(document.getElementById('data').textContent).marks")
         for index, view in enumerate(report.views):
             page.locator(f"#azimuth-ssim-{index} use").click(force=True)
-            assert f"PSNR {view.measures.over_white.psnr:.2f} dB" in caption(page)
+            assert f"PSNR {view.measures.over.mean.psnr:.2f} dB" in caption(page)
             for name in ("psnr", "ssim", "flip"):
                 point, cursor = middle(page, f"azimuth-{name}-{index}"), middle(page, f"azimuth-cursor-{name}")
                 assert abs(point[0] - cursor[0]) < 1
@@ -243,7 +271,7 @@ def test_the_worst_views_are_marked_and_shown(visit: Visit, result: RunResult) -
             "[...document.querySelectorAll('.bad')].map(bad => bad.textContent + ' of '"
             " + bad.closest('figure').querySelector('button').dataset.view)"
         )
-        values = {name: getattr(result.report.views[index].measures.over_white, name) for name, index in worst.items()}
+        values = {name: getattr(result.report.views[index].measures.over.mean, name) for name, index in worst.items()}
         wanted = [f"{name.upper()} {value:.{2 if name == 'psnr' else 3}f} of {worst[name]}" for name, value in values.items()]
         assert sorted(marked) == sorted(wanted)
         page.locator(f".pictures[data-view='{worst['ssim']}']").click()

@@ -8,14 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from billboard_scene import crossing_billboards, write_views
 
 from bbfit.budget.choice import Choice, Trial
 from bbfit.checks import InputError
+from bbfit.evaluation.backgrounds import over_background
 from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig, Placement, Sides
-from bbfit.images import over_color, to_bytes
+from bbfit.images import to_bytes
 from bbfit.reporting.plots import Cost, comparison_picture, loss_plot, pareto_plot, running_mean, spread_views
 
 
@@ -33,15 +35,15 @@ def find(sheet: np.ndarray, picture: np.ndarray) -> tuple[int, int] | None:
 
 @pytest.mark.parametrize("width", [40, 300])
 def test_comparison_holds_the_pictures_unchanged(tmp_path: Path, width: int) -> None:
-    """Targets in one column, results in the next, each view a row; both pixel for pixel, for pictures narrower and wider than writing."""
+    """Targets in one column, results in the next, each view a row over another background; all pixel for pixel, at any width."""
     cloud = crossing_billboards()
     views = write_views(tmp_path, cloud, width=width).test
     worse = cloud.with_texels(cloud.texels**2)
     comparison_picture(shipped_model(worse), views, tmp_path / "out.png", count=3, title="two crossing")
     sheet = read(tmp_path / "out.png")
     places = []
-    for index in spread_views(np.array([[0, 0], [90, 0], [180, 0], [270, 0]]), 3):
-        pair = [to_bytes(over_color(picture)) for picture in held_out(shipped_model(worse).draw, views, index)]
+    for index, name in zip(spread_views(np.array([[0, 0], [90, 0], [180, 0], [270, 0]]), 3), ("white", "grass", "sky"), strict=True):
+        pair = [to_bytes(torch.from_numpy(one)) for one in over_background(*held_out(shipped_model(worse).draw, views, index), name)]
         places.append([find(sheet, picture) for picture in pair])
     assert all(place is not None for row in places for place in row)
     array = np.array(places)  # [view, target or result, row or column]

@@ -21,7 +21,9 @@ from bbfit.reporting.tables import sweep_table
 
 def report(psnr: float, vertices: int, original: int | None = 1000) -> dict[str, Any]:
     return {
-        "over_white": {"psnr": psnr, "ssim": psnr / 100, "flip": 1 / psnr},
+        "over_white": {"psnr": psnr - 1, "ssim": psnr / 200, "flip": 2 / psnr},
+        "over": {"mean": {"psnr": psnr, "ssim": psnr / 100, "flip": 1 / psnr}},
+        "colour": {"delta_e": 3.0, "chroma": 0.75, "brightness": 0.9},
         "rgba": {"rmse": 0.1, "psnr": psnr + 1, "iou": 0.5},
         "thesis_scale": {"rmse": 1 / psnr, "ssim": 0.99, "psnr": psnr + 72, "sre": 3.0},
         "sharpness": 0.5,
@@ -61,6 +63,7 @@ def test_csv_has_a_row_a_run_with_the_theses_figures() -> None:
     assert (first["tree"], first["variant"], first["loss"], first["billboards"]) == ("acer", "base", "l2", "2")
     assert (float(first["psnr"]), float(first["thesis_psnr"]), int(first["vertices"])) == (12.0, 84.0, 8)
     assert (float(first["published_psnr"]), float(first["published_sre"])) == (90.117, 11.776)
+    assert [float(first[name]) for name in ("white_psnr", "color_delta_e", "color_chroma", "color_brightness")] == [11, 3, 0.75, 0.9]
     assert (first["brightness"], first["fit_seconds"], first["status"], first["reason"]) == ("", "1.5", "done", "")
     assert (last["status"], last["reason"], last["psnr"], last["vertices"]) == ("failed", "no memory", "", "")
     assert table[6]["tree"] == "oak" and table[6]["published_psnr"] == "", "the thesis has no oak"

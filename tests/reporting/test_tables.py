@@ -5,17 +5,26 @@ from __future__ import annotations
 import pytest
 from rich.console import Console
 
-from bbfit.evaluation.report import Cost, Measures, OverWhite, Report, Rgba, ThesisScale, ViewScore
+from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
+from bbfit.evaluation.report import Cost, Report, SizeScore, ViewScore
 from bbfit.reporting.tables import report_table
 
+OTHER = OverBackground(17.234, 0.7125, 0.2061)
+COLOUR = Colour((40, 50, 20, 100), (20, 25, 10, 50), (40, 50, 20, 100), (16, 20, 8, 50))
 MEASURES = Measures(
-    OverWhite(21.234, 0.8125, 0.1061), Rgba(0.0712, 23.456, 0.7345), ThesisScale(2.24e-5, 0.9999966, 92.605, 17.28), 0.9, None
+    Over(OverBackground(21.234, 0.8125, 0.1061), OTHER, OTHER, OTHER),
+    Rgba(0.0712, 23.456, 0.7345),
+    ThesisScale(2.24e-5, 0.9999966, 92.605, 17.28),
+    COLOUR,
+    0.9,
+    None,
 )
 REPORT = Report(
     (ViewScore("0000", 0, 0, MEASURES), ViewScore("0001", 90, 0, MEASURES)),
     Cost(32, 10_525_153),
     Cost(123_456, None),
     {"views": 1234.56, "fit": 60, "export": 0.4, "evaluate": 15.04},
+    sizes=(SizeScore(1024, 1024, 19.87, 1.012, 0.1),),
 )
 
 
@@ -26,7 +35,8 @@ def test_every_figure_is_there_and_nothing_is_cut(width: int) -> None:
         console.print(report_table(REPORT, "willow"))
     text = capture.get()
     for figure in (
-        "willow: mean of 2", "21.23", "23.46", "92.605", "0.0712", "2.24e-05", "0.8125", "0.9999966", "17.280", "0.1061", "0.7345",
+        "willow: mean of 2", "18.23", "0.7375", "0.1811", "0.00", "1.000", "0.800", "19.87", "1.012",
+        "21.23", "23.46", "92.605", "0.0712", "2.24e-05", "0.8125", "0.9999966", "17.280", "0.1061", "0.7345",
         "0.900", "10,525,153", "0.000304 %", "123,456", "views 1,234.6", "evaluate 15.0",
     ):  # fmt: skip
         assert figure in text, figure
@@ -34,7 +44,7 @@ def test_every_figure_is_there_and_nothing_is_cut(width: int) -> None:
     assert max(map(len, text.splitlines())) <= width
     rows = {line.split("  ")[0].strip(): line for line in text.splitlines()}
     assert "↑" in rows["PSNR, dB"] and "↓" in rows["FLIP"] and "→ 1" in rows["sharpness"]
-    assert rows["brightness"].rstrip().endswith("-") and "None" not in text
+    assert rows["... with holes"].rstrip().endswith("-") and "None" not in text
 
 
 def test_the_thesis_scale_may_be_left_out() -> None:

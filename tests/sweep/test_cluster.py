@@ -103,7 +103,7 @@ def test_a_sweep_on_a_cluster_is_the_sweep_on_one_machine(cluster: Cluster, tmp_
     here = run_sweep(tmp_path / "here", SweepConfig(workers=1, **config), short, views=[tmp_path / "oak"])
     for one, other in zip(there.rows, here.rows, strict=True):
         assert one.folder == other.folder and one.facts and other.facts
-        assert one.facts["report"]["over_white"] == other.facts["report"]["over_white"]
+        assert one.facts["report"]["over"] == other.facts["report"]["over"]
         made = tmp_path / "ray" / one.folder
         assert (made / "model.glb").read_bytes() == (tmp_path / "here" / other.folder / "model.glb").read_bytes()
         assert {path.name for path in made.iterdir()} == {path.name for path in (tmp_path / "here" / other.folder).iterdir()}

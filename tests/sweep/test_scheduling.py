@@ -54,7 +54,7 @@ def times(folder: Path) -> dict[str, int]:
 
 def psnr(row: SweepRow) -> float:
     assert row.facts
-    return float(row.facts["report"]["over_white"]["psnr"])
+    return float(row.facts["report"]["over"]["mean"]["psnr"])
 
 
 def test_every_configuration_of_every_tree_is_run(done: SweepResult) -> None:
@@ -74,7 +74,7 @@ def test_a_run_of_a_sweep_is_that_run(done: SweepResult, two_trees: list[Path], 
     fit = FitConfig(preset="thesis", sides="one", bounds="viewport", loss="l2", billboards=2, steps=12)
     alone = run(two_trees[1], tmp_path / "run", RunConfig(fit=fit))
     row = next(row for row in done.rows if row.tree == "elm" and tuple(row.labels.values()) == ("base", "l2", "2"))
-    assert psnr(row) == alone.report.mean.over_white.psnr
+    assert psnr(row) == alone.report.mean.over.mean.psnr
     assert (done.folder / row.folder / "model.glb").read_bytes() == (alone.folder / "model.glb").read_bytes()
 
 

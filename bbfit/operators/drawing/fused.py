@@ -118,7 +118,7 @@ def differentiate(
         compiled, runs, arguments = _prepared(texels, projection, occupied)
         arguments.append(warp_array(nothing if image_gradient is None else image_gradient, wp.vec4))
         arguments.append(warp_array(target.view(torch.int32).squeeze(-1), wp.int32))
-        arguments += [int(loss.straight), LOSSES[loss.kind], loss.weight] if loss else [0, 0, 0.0]
+        arguments += [int(loss.straight), LOSSES[loss.kind], loss.weight, int(loss.own_colors)] if loss else [0, 0, 0.0, 0]
         outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices, wp.vec3d)]
         on = wp.device_from_torch(device)
         compiled.differentiate.module.load(on)  # or every thread would compile it
@@ -171,5 +171,6 @@ def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -
 def _test(mode: AlphaMode) -> Any:
     """An alpha mode as :func:`~bbfit.operators.drawing.sampling_kernels.opacity` expects it."""
     if mode.kind != "mask":
-        return wp.vec3(0.0 if mode.kind == "blend" else -1.0, 0.0, 0.0)
-    return wp.vec3(mode.cutoff, 0.0 if math.isinf(mode.hardness) else mode.hardness, min(mode.hardness, STEEPEST))
+        return wp.vec4(0.0 if mode.kind == "blend" else -1.0, 0.0, 0.0, 0.0)
+    hardness = 0.0 if math.isinf(mode.hardness) else mode.hardness
+    return wp.vec4(mode.cutoff, hardness, min(mode.hardness, STEEPEST), float(mode.antialiased))

@@ -18,6 +18,17 @@ derivative (t_u, t_v) in texel coordinates the rows of the homography receive
 
     dL/dm_1 = t_u p / w,    dL/dm_2 = t_v p / w,    dL/dm_3 = -(u t_u + v t_v) p / w.
 
+**Antialiased masks.** Alpha to coverage gives every layer the same samples of a pixel first, so that of a layer only what the layers in
+front leave uncovered shows. With the coverage m_k = max over j < k of a_j, its weight is max(a_k - m_k, 0) instead of T_k a_k. If a layer
+shows, the next layer that shows loses what it gains: dL/da_k = e_k - e_next, where e_next is 0 if there is none. Otherwise it is 0.
+
+**Colors of their own.** With ``own_colors``, the colors do not minimize the picture's loss but the squared difference to the view's
+straight color C, weighted by the view's alpha A and by the layer's weight w_k (which is held constant):
+
+    sum of w_k A |c_k - C|^2,    with the derivative 2 w_k (A c_k - A C) in c_k.
+
+Alpha has the gradient of the picture's loss in either case.
+
 **Schedule.** A thread processes a run of pixels in a row: a whole row on a CPU, one pixel on CUDA. Layers are sorted per pixel. The
 backward kernel blends again instead of reading stored layers.
 
@@ -36,12 +47,14 @@ import warp as wp
 
 from bbfit.operators.drawing.compositing import TIE as TIE_VALUE
 from bbfit.operators.drawing.sampling_kernels import (
+    contrast,
     empty,
     fetch,
     next_row,
     opacity,
     opacity_slope,
     prefetch,
+    ramp_rate,
     reaches,
     scatter,
     slope,
@@ -128,7 +141,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         width: int,
         orthographic: int,
         count: int,
-        test: wp.vec3,
+        test: wp.vec4,
         planes: wp.array(dtype=Plane),
         texels: wp.array(dtype=wp.vec4),
         occupied: wp.array(dtype=wp.uint8),
@@ -140,6 +153,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         firsts = ints()
         heights = ints()
         widths = ints()
+        ids = ints()
         left = wides_ints()
         top = wides_ints()
         fx = wides()
@@ -155,6 +169,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
                 plane = planes[view * count + n]
                 if reaches(plane.box, column, row, lanes):
                     hits = locate(plane, column, row, orthographic)
+                    ids[active] = n
                     firsts[active] = plane.texture[0]
                     heights[active] = plane.texture[1]
                     widths[active] = plane.texture[2]
@@ -192,10 +207,14 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
                         layer = order[i]
                         texture = wp.vec3i(firsts[layer], heights[layer], widths[layer])
                         s = fetch(texels, texture, left[layer, c], top[layer, c], fx[layer, c], fy[layer, c])
-                        alpha = opacity(s[3], test)
+                        rate = float(0.0)
+                        if test[3] != 0.0:
+                            matrix = planes[view * count + ids[layer]].to_texel
+                            rate = ramp_rate(contrast(texels, texture, matrix, column + c, row, s[3]), test)
+                        alpha = opacity(s[3], test, rate)
                         if test[0] < 0.0:
                             alpha = wp.where(s[3] >= threshold(column + c, row, firsts[layer]), 1.0, 0.0)
-                        weight = through * alpha
+                        weight = wp.where(test[3] != 0.0, wp.max(alpha + through - 1.0, 0.0), through * alpha)
                         through -= weight
                         color += wp.vec4(s[0] * weight, s[1] * weight, s[2] * weight, weight)
                     i += 1
@@ -210,7 +229,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         width: int,
         orthographic: int,
         count: int,
-        test: wp.vec3,
+        test: wp.vec4,
         planes: wp.array(dtype=Plane),
         texels: wp.array(dtype=wp.vec4),
         occupied: wp.array(dtype=wp.uint8),
@@ -219,6 +238,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         straight: int,
         pixel_loss: int,
         weight: float,
+        own_colors: int,
         loss: wp.array2d(dtype=wp.float32),
         texel_gradient: wp.array(dtype=wp.vec4),
         matrix_gradient: wp.array4d(dtype=wp.vec3d),
@@ -226,7 +246,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         """Add to ``texel_gradient`` [P] and, unless empty, to ``matrix_gradient`` [V, H, N, 3], a sum for every row of pixels.
 
         The picture's gradient is ``image_gradient`` [V, H, W], unless empty, plus ``weight`` times that of the pixel loss against
-        ``target`` [V, H, W], unless empty. The loss is added to ``loss`` [V, H].
+        ``target`` [V, H, W], unless empty. The loss is added to ``loss`` [V, H]. ``own_colors`` fits colors to the target's own.
         """
         view, row, piece = wp.tid()
         view += first_view
@@ -246,6 +266,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         greens = floats()
         blues = floats()
         alphas = floats()
+        shares = floats()
         slopes = floats()
         values = floats()
         total = float(0.0)
@@ -310,34 +331,55 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
                         layer = order[i]
                         texture = wp.vec3i(firsts[layer], heights[layer], widths[layer])
                         s = fetch(texels, texture, left[layer, c], top[layer, c], fx[layer, c], fy[layer, c])
-                        alpha = opacity(s[3], test)
-                        slopes[i] = opacity_slope(s[3], test)
-                        share = through * alpha
+                        rate = float(0.0)
+                        if test[3] != 0.0:
+                            matrix = planes[view * count + ids[layer]].to_texel
+                            rate = ramp_rate(contrast(texels, texture, matrix, column + c, row, s[3]), test)
+                        alpha = opacity(s[3], test, rate)
+                        slopes[i] = opacity_slope(s[3], test, rate)
+                        share = wp.where(test[3] != 0.0, wp.max(alpha + through - 1.0, 0.0), through * alpha)
                         through -= share
+                        shares[i] = share
                         color += wp.vec4(s[0] * share, s[1] * share, s[2] * share, share)
                         reds[i] = s[0]
                         greens[i] = s[1]
                         blues[i] = s[2]
                         alphas[i] = alpha
                         i += 1
+                    seen = wp.vec4()
                     if given_target:
-                        d = color - premultiplied(packed, straight)
-                        total, g = add_pixel_loss(d, pixel_loss, weight, total, g)
-                    if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0:
+                        seen = premultiplied(packed, straight)
+                        total, g = add_pixel_loss(color - seen, pixel_loss, weight, total, g)
+                    if own_colors != 0 or g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0:
                         behind = float(0.0)  # s_k of the docstring above
                         b = int(hit)
                         while b > 0:
                             b -= 1
                             difference = reds[b] * g[0] + greens[b] * g[1] + blues[b] * g[2] + g[3] - behind
                             values[b] = difference
-                            behind += alphas[b] * difference
+                            if test[3] == 0.0:
+                                behind += alphas[b] * difference
+                            elif shares[b] > 0.0:
+                                behind += difference
                         reaching = float(1.0)
                         f = int(0)
                         while f < hit:
                             if reaching > 0.0:
                                 own = order[f]
-                                part = reaching * alphas[f]
-                                of_sample = wp.vec4(g[0] * part, g[1] * part, g[2] * part, reaching * values[f] * slopes[f])
+                                part = shares[f]
+                                exposed = float(reaching)
+                                if test[3] != 0.0:
+                                    exposed = wp.where(part > 0.0, 1.0, 0.0)
+                                of_alpha = exposed * values[f] * slopes[f]
+                                of_sample = wp.vec4(g[0] * part, g[1] * part, g[2] * part, of_alpha)
+                                if own_colors != 0:
+                                    twice = 2.0 * weight * part
+                                    of_sample = wp.vec4(
+                                        (seen[3] * reds[f] - seen[0]) * twice,
+                                        (seen[3] * greens[f] - seen[1]) * twice,
+                                        (seen[3] * blues[f] - seen[2]) * twice,
+                                        of_alpha,
+                                    )
                                 whose = wp.vec3i(firsts[own], heights[own], widths[own])
                                 scatter(texel_gradient, whose, left[own, c], top[own, c], fx[own, c], fy[own, c], of_sample)
                                 if wanted_placement:

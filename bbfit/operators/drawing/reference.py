@@ -10,7 +10,7 @@ from torch.nn.functional import pad
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.homography import pixel_depth, signed_distance, texel_to_pixel
-from bbfit.operators.drawing.compositing import composite, opacity, thresholds
+from bbfit.operators.drawing.compositing import composite, layer_weights, opacity, thresholds
 
 # A plane is edge-on, and not drawn, if the camera's distance to it is below this share of its distance to the billboard's center.
 EDGE_ON = 1e-5
@@ -32,12 +32,37 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
     camera
         One camera or V cameras.
     """
+    if len(cloud) == 0:
+        views = len(camera.batch())
+        image = cloud.texels.new_zeros(views, camera.height, camera.width, 4) + cloud.texels.sum()  # of no texels, so that backward() works
+    else:
+        colors, alphas, depths = _layers(cloud, camera)
+        image = composite(colors, alphas, depths, nested=cloud.alpha.antialiased).permute(0, 2, 3, 1)
+    return image if camera.batched else image[0]
+
+
+def render_layers_reference(cloud: BillboardCloud, camera: Camera) -> tuple[Tensor, list[Tensor], list[Tensor]]:
+    """Draw N >= 1 billboards and return their layers too, for a loss of their own.
+
+    Returns
+    -------
+    image : Tensor
+        What :func:`render_reference` returns, for a batch of cameras, without a gradient in the colors of layers.
+    colors : list of Tensor
+        Straight colors of the layers, N of [V, 3, H, W].
+    weights : list of Tensor
+        Weights of the layers in the image, N of [V, 1, H, W].
+    """
+    colors, alphas, depths = _layers(cloud, camera)
+    weights = layer_weights(alphas, depths, nested=cloud.alpha.antialiased)
+    parts = [torch.cat([color.detach(), torch.ones_like(weight)], 1) * weight for color, weight in zip(colors, weights, strict=True)]
+    return sum(parts[1:], parts[0]).permute(0, 2, 3, 1), colors, weights
+
+
+def _layers(cloud: BillboardCloud, camera: Camera) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+    """Straight colors [V, 3, H, W], opacities and depths, both [V, 1, H, W], of each billboard in V views."""
     cameras = camera.batch().to(cloud.texels.dtype)
     views, height, width = len(cameras), cameras.height, cameras.width
-    if len(cloud) == 0:
-        image = cloud.texels.new_zeros(views, height, width, 4) + cloud.texels.sum()  # of no texels, so that backward() works
-        return image if camera.batched else image[0]
-
     visible = drawable(cloud, cameras)
     drawn, depth = _plane_depth(cloud, cameras, visible)
 
@@ -48,18 +73,17 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
     shift = torch.tensor([[1.0, 0, -1], [0, 1, -1], [0, 0, 1]], dtype=matrices.dtype, device=matrices.device)
     matrices = (matrices @ shift).transpose(0, 1)  # [N, V, 3, 3]
     sources = _facing_textures(cloud, signed_distance(cloud, cameras).detach() >= 0)
+    even = (height + height % 2, width + width % 2)  # squares of 2 x 2 pixels may reach beyond the picture
     if len({source.shape for source in sources}) == 1:  # one call for all planes: kornia works on batch entries in parallel
-        warped = list(_warp(torch.cat(sources), matrices.flatten(0, 1), height, width).split(views))
+        warped = list(_warp(torch.cat(sources), matrices.flatten(0, 1), *even).split(views))
     else:
-        warped = [_warp(source, matrix, height, width) for source, matrix in zip(sources, matrices, strict=True)]
-    colors, alphas = zip(*(layer.split((3, 1), 1) for layer in warped), strict=True)
+        warped = [_warp(source, matrix, *even) for source, matrix in zip(sources, matrices, strict=True)]
+    colors, alphas = zip(*((layer[:, :3, :height, :width], layer[:, 3:]) for layer in warped), strict=True)
     if cloud.alpha.kind == "hash":
-        opaque = _hashed(cloud, list(alphas), signed_distance(cloud, cameras) >= 0)
+        opaque = _hashed(cloud, [alpha[..., :height, :width] for alpha in alphas], signed_distance(cloud, cameras) >= 0)
     else:
-        opaque = [opacity(alpha, cloud.alpha) for alpha in alphas]
-    shown = [alpha * mask for alpha, mask in zip(opaque, drawn, strict=True)]
-    image = composite(list(colors), shown, list(depth)).permute(0, 2, 3, 1)
-    return image if camera.batched else image[0]
+        opaque = [opacity(alpha, cloud.alpha)[..., :height, :width] for alpha in alphas]
+    return list(colors), [alpha * mask for alpha, mask in zip(opaque, drawn, strict=True)], list(depth)
 
 
 def drawable(cloud: BillboardCloud, cameras: Camera) -> Tensor:

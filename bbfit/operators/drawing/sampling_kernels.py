@@ -17,11 +17,14 @@ products k_c = t_c . g,
 import warp as wp
 
 from bbfit.operators.drawing.compositing import HASH
+from bbfit.operators.drawing.compositing import LEAST_CONTRAST as LEAST_CONTRAST_VALUE
+from bbfit.operators.drawing.compositing import STEEPEST as STEEPEST_VALUE
 from bbfit.operators.launching import FLAGS
 
 BLOCK = 4
 """Consecutive texels that share one byte of occupancy and that Adam updates together."""
 BLOCK_BITS = wp.constant(2)
+LEAST_CONTRAST, STEEPEST = wp.constant(LEAST_CONTRAST_VALUE), wp.constant(STEEPEST_VALUE)
 OF_X, OF_Y, OF_TEXTURE, FIRST_ROUND, SECOND_ROUND = (wp.constant(wp.uint32(factor)) for factor in HASH)
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
@@ -130,22 +133,63 @@ def fetch(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, left: int, top: in
 
 
 @wp.func
-def opacity(alpha: float, test: wp.vec3) -> float:
+def alpha_at(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, to_texel: wp.mat33, column: int, row: int) -> float:
+    """Filtered alpha of a texture at a pixel; 0 where the pixel misses the plane."""
+    x = float(column)
+    y = float(row)
+    w = to_texel[2, 0] * x + to_texel[2, 1] * y + to_texel[2, 2]
+    u = (to_texel[0, 0] * x + to_texel[0, 1] * y + to_texel[0, 2]) / w
+    v = (to_texel[1, 0] * x + to_texel[1, 1] * y + to_texel[1, 2]) / w
+    if not (w > 0.0 and u > -1.0 and u < float(texture[2]) and v > -1.0 and v < float(texture[1])):
+        return 0.0
+    left = int(wp.floor(u))
+    top = int(wp.floor(v))
+    fx = u - float(left)
+    fy = v - float(top)
+    at = corners(texture, left, top)
+    there = present(texture, left, top)
+    weight = weights(fx, fy)
+    alpha = float(0.0)  # noqa: UP018 - declares a variable
+    for c in range(4):
+        alpha += texel(texels, at[c])[3] * there[c] * weight[c]
+    return alpha
+
+
+@wp.func
+def contrast(texels: wp.array(dtype=wp.vec4), texture: wp.vec3i, to_texel: wp.mat33, column: int, row: int, alpha: float) -> float:
+    """How far alpha changes to the other pixels of the same row and column in its square of 2 x 2 pixels: ``fwidth`` of GLSL."""
+    across = alpha_at(texels, texture, to_texel, column ^ 1, row) - alpha
+    down = alpha_at(texels, texture, to_texel, column, row ^ 1) - alpha
+    return wp.abs(across) + wp.abs(down)
+
+
+@wp.func
+def ramp_rate(contrast: float, test: wp.vec4) -> float:
+    """Slope of the ramp of an antialiased mask: one over the contrast of a pixel, at most the mask's hardness."""
+    rate = 1.0 / wp.max(contrast, LEAST_CONTRAST)
+    return wp.where(test[1] == 0.0, rate, wp.min(rate, test[1]))
+
+
+@wp.func
+def opacity(alpha: float, test: wp.vec4, rate: float) -> float:
     """Opacity of a sample (:func:`bbfit.operators.drawing.compositing.opacity`). ``test`` encodes the alpha mode: the cutoff (0: blend,
-    -1: hash), the hardness (0: a step), and the slope of the gradient."""
+    -1: hash), the hardness (0: a step), the slope of the gradient, and whether a mask is antialiased, with the ramp's slope ``rate``."""
     if test[0] == 0.0:
         return alpha
+    if test[3] != 0.0:
+        return wp.where(alpha > 0.0, wp.clamp(0.5 + (alpha - test[0]) * rate, 0.0, 1.0), 0.0)
     if test[1] == 0.0:
         return wp.where(alpha >= test[0], 1.0, 0.0)
     return wp.clamp(0.5 + (alpha - test[0]) * test[1], 0.0, 1.0)
 
 
 @wp.func
-def opacity_slope(alpha: float, test: wp.vec3) -> float:
+def opacity_slope(alpha: float, test: wp.vec4, rate: float) -> float:
     """Derivative of :func:`opacity`, or its straight-through estimate."""
     if test[0] == 0.0:
         return 1.0
-    return wp.where(wp.abs(alpha - test[0]) * test[2] <= 0.5, test[2], 0.0)
+    slope = wp.where(test[3] != 0.0, wp.min(rate, STEEPEST), test[2])
+    return wp.where(wp.abs(alpha - test[0]) * slope <= 0.5 and (alpha > 0.0 or test[3] == 0.0), slope, 0.0)
 
 
 @wp.func

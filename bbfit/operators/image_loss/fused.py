@@ -27,6 +27,9 @@ class PixelLoss:
     """Loss of a pixel (:func:`~bbfit.operators.image_loss.reference.pixel_loss_reference`)."""
     weight: float
     """Factor of the loss, summed over pixels, in the gradient."""
+    own_colors: bool = False
+    """Whether the colors of layers are compared with the target's color instead, and only alpha has the gradient of the picture
+    (:func:`~bbfit.operators.image_loss.reference.color_loss_reference`)."""
 
 
 def image_loss_fused(render: Tensor, target: Tensor, kind: Loss, ssim_weight: float, sharpness_weight: float = 0.0) -> Tensor:

@@ -47,3 +47,24 @@ def pixel_loss_reference(render: Tensor, target: Tensor, kind: Loss) -> Tensor:
     if kind == "backgrounds":
         loss = loss - difference[..., 3] * difference[..., :3].sum(-1)
     return loss
+
+
+def color_loss_reference(colors: list[Tensor], weights: list[Tensor], target: Tensor) -> Tensor:
+    """Loss of the colors of N layers against the views' own, a scalar that is differentiable in the colors alone.
+
+    It is the mean over pixels of the sum over layers of w A |c - C|^2, less a term that does not depend on c. A is the view's alpha and C
+    its straight color. Where a view is half transparent, the best color is therefore the view's color, not a mixture with the background
+    (as it is for the loss ``backgrounds``, if the layer is opaque there).
+
+    Parameters
+    ----------
+    colors
+        Straight colors of the layers, N of [V, 3, H, W].
+    weights
+        Weights w of the layers in the picture, N of [V, 1, H, W]. They are held constant.
+    target
+        Premultiplied RGBA, [V, H, W, 4].
+    """
+    premultiplied, alpha = target.permute(0, 3, 1, 2).split((3, 1), 1)
+    losses = [(w.detach() * (alpha * c.square() - 2 * premultiplied * c)).sum(1) for c, w in zip(colors, weights, strict=True)]
+    return sum(losses[1:], losses[0]).mean()

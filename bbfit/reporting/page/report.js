@@ -13,11 +13,18 @@
     images.forEach((image, part) => { image.src = view.pictures[part]; });
     const height = Math.abs(view.elevation) >= 0.5 ? `, elevation ${view.elevation.toFixed(0)}°` : "";
     document.getElementById("caption").textContent =
-      `${view.name}: azimuth ${view.azimuth.toFixed(0)}°${height}; PSNR ${view.psnr.toFixed(2)} dB, SSIM ${view.ssim.toFixed(3)}, FLIP ${view.flip.toFixed(3)}, silhouette IoU ${view.iou.toFixed(3)}`;
+      `${view.name}: azimuth ${view.azimuth.toFixed(0)}°${height}; PSNR ${view.psnr.toFixed(2)} dB (${view.over.white.toFixed(2)} over white), SSIM ${view.ssim.toFixed(3)}, FLIP ${view.flip.toFixed(3)}, silhouette IoU ${view.iou.toFixed(3)}`;
     cursors.forEach((cursor) => cursor.setAttribute("transform", `translate(${view.azimuth * marks.degree} 0)`));
     eye.setAttribute("transform", `rotate(${-view.azimuth} ${marks.x} ${marks.y})`);
     points.forEach((group, index) => group.forEach((point) => point.classList.toggle("now", index === view.index)));
   }
+
+  // The page's colors stay as they are: only what is behind the pictures of held-out views changes.
+  const backgrounds = [...document.querySelectorAll("input[name=over]")];
+  const section = document.getElementById("views");
+  backgrounds.forEach((input) => input.addEventListener("change", () => {
+    section.style.setProperty("--over", input.parentElement.querySelector(".swatch").style.background);
+  }));
 
   const step = (by) => show((Number(slider.value) + by + views.length) % views.length);
   slider.addEventListener("input", () => show(Number(slider.value)));

@@ -1,0 +1,55 @@
+"""Tables of a comparison, by rows whose numbers are known."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import pytest
+
+from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
+from bbfit.evaluation.scoring import OriginalTree
+from bbfit.reporting.comparison_tables import CompareRow, compare_csv, compare_markdown
+
+OVER = Over(*(OverBackground(20.0 + step, 0.7 + step / 100, 0.1 + step / 100) for step in range(4)))
+COLOUR = Colour((40, 50, 20, 100), (20, 25, 10, 50), (40, 50, 20, 100), (16, 20, 8, 50))
+MEASURES = Measures(OVER, Rgba(0.07, 23.5, 0.75), ThesisScale(2e-5, 0.99, 92.6, 17.3), COLOUR, 0.9, 0.4)
+ROWS = [
+    CompareRow("bbfit", "bbfit, 8 billboards", 8, 32, 1000, 2.5, MEASURES, ""),
+    CompareRow("draco", "the tree, with Draco", None, 9000, 500, 0.1, None, "not drawn"),
+]
+
+
+def test_csv_has_means_over_backgrounds_scores_over_white_and_colors() -> None:
+    drawn, other = csv.DictReader(io.StringIO(compare_csv(ROWS).decode()))
+    wanted = {
+        "psnr": 21.5,
+        "ssim": 0.715,
+        "flip": 0.115,
+        "white_psnr": 20,
+        "white_ssim": 0.7,
+        "white_flip": 0.1,
+        "rgba_psnr": 23.5,
+        "iou": 0.75,
+    }
+    wanted |= {"sharpness": 0.9, "brightness": 0.4, "color_delta_e": 0, "color_chroma": 1, "color_brightness": 0.8, "thesis_psnr": 92.6}
+    assert {name: float(drawn[name]) for name in wanted} == pytest.approx(wanted, abs=1e-12)
+    assert {other[name] for name in wanted} == {""} and other["note"] == "not drawn"
+
+
+def test_markdown_shows_them_too() -> None:
+    head, line, tree, drawn, other = (
+        [cell.strip() for cell in text.strip("| ").split("|")]
+        for text in compare_markdown(ROWS, OriginalTree(9000, 10_000)).splitlines()
+        if text.startswith("|")
+    )
+    shown = dict(zip(head, drawn, strict=True))
+    assert (shown["PSNR, dB"], shown["FLIP"], shown["PSNR over white"]) == ("21.50", "0.1150", "20.00")
+    assert (shown["color ΔE"], shown["chroma"], shown["brightness"]) == ("0.00", "1.00", "0.80")
+    assert set(line) == {"---"} and tree[:2] == ["the tree", ""] and other[0] == "the tree, with Draco"
+
+
+def test_rows_go_through_json() -> None:
+    for row in ROWS:
+        assert CompareRow.from_json(json.loads(json.dumps(row.to_json(), allow_nan=False))) == row
