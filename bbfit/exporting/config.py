@@ -14,10 +14,10 @@ Profile = Literal["three", "babylon", "godot", "unity", "unreal", "blender"]
 Encoding = Literal["png", "webp", "ktx2"]
 Textures = Literal["auto"] | Encoding
 Material = Literal["unlit", "pbr"]
-Outline = Literal["tight", "rectangle"]
+Outline = Literal["pieces", "hull", "rectangle"]
 
 # Defaults without a profile.
-_OPEN: dict[str, Any] = {"split": False, "material": "unlit", "textures": "png", "outline": "tight"}
+_OPEN: dict[str, Any] = {"split": False, "material": "unlit", "textures": "png", "outline": "pieces"}
 # Programs that rasterize sort blended geometry node by node, so they need split cards; Blender's Cycles finds the order by itself.
 _SORTS_NODES: dict[Profile, bool] = {"three": True, "babylon": True, "godot": True, "unity": True, "unreal": True, "blender": False}
 
@@ -39,11 +39,13 @@ class ExportConfig:
     This costs vertices; mask and hash ignore it.
     Default: only for a profile whose program sorts nodes."""
     outline: Outline | None = None
-    """tight: outlines of up to 8 corners a texture, in one or two pieces, so that fewer empty pixels are shaded; rectangle: 4 corners.
-    Default: tight; a run with a budget of vertices or with the preset thesis, and a comparison of vertices, draw rectangles."""
-    hull: Annotated[int, Range(4, 8)] | None = None
-    """Most corners, 4 to 8, of a convex outline of one piece, for programs that need convex polygons.
-    Default: what outline says."""
+    """What is drawn of each billboard, the fewer empty pixels the better. pieces: convex pieces around its visible parts; hull: one
+    convex polygon; rectangle: all of it.
+    Default: pieces; a run with a budget of vertices or with the preset thesis, and a comparison of vertices, draw rectangles."""
+    pieces: Count = 8
+    """With pieces: the most pieces of a billboard on average, at least 1. Cuts that save too little are left out."""
+    corners: Annotated[int, Range(4, 8)] = 8
+    """With pieces or hull: the most corners of each polygon, 4 to 8."""
     textures: Textures | None = None
     """Format of a GLB's texture beside PNG, which every program reads: webp is smaller, once --no-fallback omits the PNG;
     ktx2 stays compressed on the graphics card and includes mip levels that keep their coverage (needs the extra ktx2);
@@ -64,12 +66,10 @@ class ExportConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.hull is not None and self.outline == "rectangle":
-            fail("hull", f"{self.hull} corners are requested of rectangles", "leave out one of hull and outline")
 
     def comparable(self) -> ExportConfig:
         """The same options with rectangles unless they ask for outlines: all models have as many vertices for each billboard."""
-        return replace(self, outline="rectangle") if self.outline is None and self.hull is None else self
+        return replace(self, outline="rectangle") if self.outline is None else self
 
     def resolve(self) -> ResolvedExport:
         """Fill in the choices that depend on the profile and on the installed encoders; a :class:`ResolvedExport` returns itself.

@@ -18,7 +18,7 @@ cards."""
 ANY = 1e-9
 """The least alpha above 0. Bilinear filtering between alpha 1/255 and 0 reaches it within a millionth of a texel from the 0."""
 # Candidate directions of sides: this many around the circle, and those of the hull's longest edges.
-_AROUND, _EDGES = 72, 56
+_AROUND, _EDGES = 36, 32
 # Samples of all cards that overdraw is measured with.
 _SAMPLES = 500_000
 
@@ -71,7 +71,7 @@ def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
     in [0, 1], is the cutoff of MASK, or 0 for any alpha above 0, as BLEND shows it. The visible part is larger in
     mip levels: there the polygon may cut off up to half a texel of the level in use.
 
-    The polygon's sides touch the convex hull of the visible part. It is the smallest of all such polygons whose sides have one of about 130
+    The polygon's sides touch the convex hull of the visible part. It is the smallest of all such polygons whose sides have one of about 70
     directions and whose corners lie in the card. Areas add up corner by corner, so the search is for a shortest cycle (after Aggarwal,
     Chang and Yap 1985, "Minimum area circumscribing polygons"). More vertices never give a larger polygon.
 
@@ -81,21 +81,30 @@ def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
     """
     check_count("hull vertices", vertices, 4)
     check_range("least alpha", least, 0, 1)
-    made = []
-    for card in cards.cards:
-        polygon = texel_corners(cards, card)
-        points = _shown_points(rimmed_alpha(cards, card.rectangle), polygon, max(least, ANY))
-        hull = hull_within(points, polygon) if len(points) else points
-        if len(hull) >= 3 and area(hull) > 0:
-            smaller = enclosing(hull, polygon, vertices)
-        else:
-            shrunk = min(1.0, abs(area(polygon)) ** -0.5)
-            smaller = polygon.mean(0) + (polygon[:vertices] - polygon.mean(0)) * shrunk
-        if smaller is None or abs(area(smaller)) > (1 - 1e-9) * abs(area(polygon)):
-            made.append(card)
-        else:
-            made.append(with_texel_corners(cards, card, smaller if area(smaller) * area(polygon) > 0 else smaller[::-1]))
-    return cards.with_cards(made)
+    return cards.with_cards([trimmed(cards, card, vertices, least) for card in cards.cards])
+
+
+def trimmed(cards: Cards, card: Card, vertices: int, least: float, box: NDArray[np.float64] | None = None) -> Card:
+    """A card as :func:`with_hulls` trims it; with ``box``, the part of a rectangular card for the squares of texel centers in a box.
+
+    The box is [4, 2] in texels, along texel centers. The part may reach beyond the box by :data:`MARGIN`.
+    """
+    polygon = inside = texel_corners(cards, card)
+    region = polygon
+    if box is not None:
+        grown = box + MARGIN * np.sign(box - box.mean(0))
+        inside, region = (np.clip(corners, polygon.min(0), polygon.max(0)) for corners in (box, grown))
+    points = _shown_points(rimmed_alpha(cards, card.rectangle), inside, max(least, ANY))
+    hull = _hull_within(points, region) if len(points) else points
+    if len(hull) >= 3 and area(hull) > 0:
+        smaller = _enclosing(hull, region, vertices)
+        smaller = region if smaller is None else smaller
+    else:
+        shrunk = min(1.0, abs(area(polygon)) ** -0.5)
+        smaller = polygon.mean(0) + (polygon[:vertices] - polygon.mean(0)) * shrunk
+    if abs(area(smaller)) > (1 - 1e-9) * abs(area(polygon)):
+        return card
+    return with_texel_corners(cards, card, smaller if area(smaller) * area(polygon) > 0 else smaller[::-1])
 
 
 def with_texel_corners(cards: Cards, card: Card, polygon: NDArray[np.float64]) -> Card:
@@ -120,11 +129,8 @@ def overdraw(cards: Cards, least: float) -> float:
         counts = np.maximum(np.ceil(size * np.sqrt(_SAMPLES / len(cards.cards) / size.prod())).astype(int), 8)
         x, y = (start + (np.arange(count) + 0.5) * extent / count for start, count, extent in zip(low, counts, size, strict=True))
         points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-        inside = np.zeros(len(points), bool)
-        for part in card.parts:
-            normals, offsets = sides(polygon[part])
-            inside |= (points @ normals.T <= offsets).all(-1)
-        points = points[inside]
+        normals, offsets = sides(polygon)
+        points = points[(points @ normals.T <= offsets).all(-1)]
         reached = bilinear(rimmed_alpha(cards, card.rectangle), points) >= max(least, ANY)
         shaded += abs(area(polygon))
         shown += abs(area(polygon)) * float(reached.mean()) if len(points) else 0.0
@@ -163,7 +169,7 @@ def _shown_points(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], lea
     return np.concatenate(points)
 
 
-def hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> NDArray[np.float64]:
+def _hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> NDArray[np.float64]:
     """The convex hull of the points plus the margin, clipped to the convex polygon, counter-clockwise, [N, 2]."""
     from scipy.spatial import ConvexHull
 
@@ -176,7 +182,7 @@ def hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> ND
     return hull
 
 
-def enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices: int) -> NDArray[np.float64] | None:
+def _enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices: int) -> NDArray[np.float64] | None:
     """The smallest polygon around the hull and inside the convex polygon with at most ``vertices`` corners; None if there is none."""
     middle = hull.mean(0)
     hull, (normals, offsets) = hull - middle, sides(polygon - middle)

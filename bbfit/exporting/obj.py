@@ -17,7 +17,6 @@ _MATERIAL = "billboards"
 def obj_bytes(cards: Cards, config: ExportConfig, *, material_file: str) -> bytes:
     """An OBJ file with one polygon per card, in meters, with the up axis ``config.up`` and nine digits, which preserve float32.
 
-    A card with notches becomes triangles that share its corners, because many programs take every polygon for a convex one.
     OBJ has no back-face culling. A two-sided billboard becomes two faces of opposite winding, and a comment at the top of the file asks
     the user to turn culling on.
     """
@@ -33,9 +32,8 @@ def obj_bytes(cards: Cards, config: ExportConfig, *, material_file: str) -> byte
     lines += _rows("v", corners.astype(np.float32)) + _rows("vt", uvs) + _rows("vn", normals)
     lines += [f"usemtl {_MATERIAL}", "s off"]
     first = 1
-    for normal, card in enumerate(cards.cards, 1):
-        for part in card.parts:
-            lines.append("f " + " ".join(f"{first + vertex}/{first + vertex}/{normal}" for vertex in part.tolist()))
+    for face, card in enumerate(cards.cards, 1):
+        lines.append("f " + " ".join(f"{vertex}/{vertex}/{face}" for vertex in range(first, first + len(card.corners))))
         first += len(card.corners)
     return ("\n".join(lines) + "\n").encode(errors="surrogateescape")
 

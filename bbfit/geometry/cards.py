@@ -34,7 +34,7 @@ class Atlas:
 
 @dataclass(frozen=True)
 class Card:
-    """A flat polygon without holes that shows a texture of the atlas or a part of it."""
+    """A flat convex polygon that shows a texture of the atlas or a part of it."""
 
     corners: NDArray[np.float64]
     """K >= 3 points in meters, counter-clockwise as seen from where the normal points, [K, 3]."""
@@ -48,19 +48,12 @@ class Card:
     """Index of its texture in the atlas."""
     origin: NDArray[np.float64] | None = None
     """Point in meters by which programs sort the card if it is blended, [3]; such a card gets its own node."""
-    faces: NDArray[np.int64] | None = None
-    """Triangles of a polygon with notches, as indices of corners, with the winding of the polygon, [T, 3]; ``None`` if it is convex."""
 
     @property
     def triangles(self) -> NDArray[np.int64]:
-        """Triangles with the winding of the polygon, [K - 2, 3]; a fan if it is convex."""
+        """A fan of triangles with the winding of the polygon, [K - 2, 3]."""
         middle = np.arange(1, len(self.corners) - 1)
-        return np.stack([np.zeros_like(middle), middle, middle + 1], -1) if self.faces is None else self.faces
-
-    @property
-    def parts(self) -> list[NDArray[np.int64]]:
-        """Convex polygons that make up the card, as indices of corners, [L] each; they share edges, but no area."""
-        return [np.arange(len(self.corners))] if self.faces is None else list(self.faces)
+        return np.stack([np.zeros_like(middle), middle, middle + 1], -1)
 
 
 @dataclass(frozen=True)

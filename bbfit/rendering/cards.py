@@ -153,8 +153,7 @@ def hits(cards: Cards, sheet: Sheet, camera: Camera) -> Hits:
     # [u, v, 1] / depth for a pinhole, [u, v, 1] for parallel projection, from a pixel [x, y, 1]
     to_uv = torch.linalg.inv(to_pixel) if shown else torch.eye(3, dtype=torch.float64)
     free = torch.full((camera.height, camera.width), shown)
-    polygons = [(piece.corners[part], piece.uvs[part]) for piece in sheet.pieces for part in piece.parts]
-    parts = [_hits(*polygon, camera, to_uv, to_depth, free) for polygon in (polygons if shown else polygons[:1])]
+    parts = [_hits(piece, camera, to_uv, to_depth, free) for piece in (sheet.pieces if shown else sheet.pieces[:1])]
     x, y, u, v, scale, depth = (torch.cat(column) for column in zip(*parts, strict=True))
     uv = torch.stack([u, v], -1)
     # d(a / c) = (da - (a / c) dc) / c, in x and in y
@@ -229,15 +228,13 @@ def _faces(sheet: Sheet, camera: Camera) -> bool:
     return abs(distance) > EDGE_ON * float(towards.norm()) and (distance > 0 or not sheet.pieces[0].culled)
 
 
-def _hits(
-    corners: NDArray[np.float64], uvs: NDArray[np.float64], camera: Camera, to_uv: Tensor, to_depth: Tensor, free: Tensor
-) -> tuple[Tensor, ...]:
-    """The ``free`` pixels, bool [H, W], whose rays meet a convex polygon, which then are not free: x, y, u, v, the third homogeneous
-    coordinate and the depth, [M] each."""
+def _hits(piece: Card, camera: Camera, to_uv: Tensor, to_depth: Tensor, free: Tensor) -> tuple[Tensor, ...]:
+    """The ``free`` pixels, bool [H, W], whose rays meet a piece, which then are not free: x, y, u, v, the third homogeneous coordinate
+    and the depth, [M] each."""
     low, high = torch.zeros(2, dtype=torch.int64), torch.tensor([camera.width, camera.height])
-    points = torch.from_numpy(_homogeneous(corners)) @ camera.world_to_pixel.mT
-    if bool((points[:, 2] > 1e-9).all()):  # otherwise a part is behind the camera, and the corners bound nothing
-        at = points[:, :2] / points[:, 2:]
+    corners = torch.from_numpy(_homogeneous(piece.corners)) @ camera.world_to_pixel.mT
+    if bool((corners[:, 2] > 1e-9).all()):  # otherwise a part is behind the camera, and the corners bound nothing
+        at = corners[:, :2] / corners[:, 2:]
         low, high = (torch.minimum(edge.clamp_min(0), high.double()).long() for edge in (at.amin(0).floor(), at.amax(0).floor() + 2))
     y, x = torch.meshgrid(torch.arange(int(low[1]), int(high[1])), torch.arange(int(low[0]), int(high[0])), indexing="ij")
     x, y = x.flatten(), y.flatten()
@@ -245,7 +242,7 @@ def _hits(
     u, v = u / scale, v / scale
     depth = to_depth[0] * u + to_depth[1] * v + to_depth[2]
     met = free[y, x] & (depth > 0) & depth.isfinite()
-    for (along_u, along_v), offset in zip(*sides(uvs), strict=True):
+    for (along_u, along_v), offset in zip(*sides(piece.uvs), strict=True):
         met &= u * float(along_u) + v * float(along_v) <= float(offset) + _SLACK
     free[y[met], x[met]] = False
     return x[met], y[met], u[met], v[met], scale[met], depth[met]
