@@ -189,8 +189,10 @@ def _enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices
     along = np.roll(hull, -1, 0) - hull
     longest = np.argsort(-(along**2).sum(-1), kind="stable")[:_EDGES]
     outwards = np.stack([along[:, 1], -along[:, 0]], -1)[longest]
-    angles = np.concatenate([np.arctan2(*outwards.T[::-1]), np.arctan2(*normals.T[::-1]), np.arange(_AROUND) * (2 * np.pi / _AROUND)])
-    angles = np.sort(angles % (2 * np.pi))
+    edges, fixed = np.arctan2(*outwards.T[::-1]), np.append(np.arctan2(*normals.T[::-1]), np.arange(_AROUND) * (2 * np.pi / _AROUND))
+    # A side almost, but not quite, along one of the polygon's would leave the polygon where both touch the hull.
+    apart = abs((edges[:, None] - fixed + np.pi) % (2 * np.pi) - np.pi).min(1) > 1e-6
+    angles = np.sort(np.append(edges[apart], fixed) % (2 * np.pi))
     angles = angles[np.diff(angles, prepend=angles[-1] - 2 * np.pi) > 1e-7]
 
     normal = np.stack([np.cos(angles), np.sin(angles)], -1)

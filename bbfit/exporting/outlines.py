@@ -42,8 +42,8 @@ def with_pieces(cards: Cards, pieces: int, corners: int, least: float) -> Cards:
     around the visible texels on its two sides are smaller than the box around both. At the end each part is trimmed to a convex polygon.
 
     Pieces that meet at a cut through visible texels overlap by two margins, 1/32 texel. Sides with different corners would leave gaps
-    there, because graphics cards round corners to fractions of a pixel. A pixel that is drawn twice after an alpha test looks the same. For
-    ``blend`` it would not, so there all cuts run through transparent texels, and pieces never overlap.
+    there, because graphics cards round corners to fractions of a pixel. A pixel that is drawn twice after an alpha test looks the same. It
+    would not where programs blend, so for other modes than ``mask`` all cuts run through transparent texels, and pieces never overlap.
 
     Pieces keep the order of the cards, and their normals, winding and textures. A card with an origin or of another shape, as splitting
     makes them, stays one piece. A card with no visible part shrinks to about one texel. Raises InputError if an argument is out of range.
@@ -55,7 +55,7 @@ def with_pieces(cards: Cards, pieces: int, corners: int, least: float) -> Cards:
     scales, order = areas / [abs(area(texel_corners(cards, card))) for card in cards.cards], itertools.count()
 
     def entry(part: _Part) -> tuple[float, int, _Part, list[_Part]]:
-        saved, halves = _best_cut(part, apart=cards.alpha.kind == "blend")
+        saved, halves = _best_cut(part, apart=cards.alpha.kind != "mask")
         return -saved * float(scales[part.card]), next(order), part, halves
 
     queue = [entry(part) for index in range(len(cards.cards)) for part in _whole(cards, index, max(least, ANY))]
@@ -65,11 +65,11 @@ def with_pieces(cards: Cards, pieces: int, corners: int, least: float) -> Cards:
         for half in heapq.heappop(queue)[-1]:
             heapq.heappush(queue, entry(half))
 
-    boxes: list[list[NDArray[np.float64] | None]] = [[] for _ in cards.cards]
+    boxes: list[list[NDArray[np.float64]]] = [[] for _ in cards.cards]
     for _, _, part, _ in sorted(queue, key=lambda entry: tuple(entry[2].start)):
         boxes[part.card].append(_box(part))
     both = zip(cards.cards, boxes, strict=True)
-    return cards.with_cards([trimmed(cards, card, corners, least, box) for card, own in both for box in own or [None]])
+    return cards.with_cards([trimmed(cards, card, corners, least, box) for card, own in both for box in (own if own[1:] else [None])])
 
 
 def _area(corners: NDArray[np.float64]) -> float:
