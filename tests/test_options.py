@@ -63,7 +63,7 @@ def test_one_seed_is_that_of_all_stages(options: list[str], seeds: tuple[int, in
 @pytest.mark.parametrize(("options", "split"), [([], True), (["--split"], True), (["--no-split"], False)], ids=str)
 def test_flags_are_switches(options: list[str], split: bool, views_folder: Path, tmp_path: Path) -> None:
     """With a profile that splits if it is not told otherwise."""
-    out = ["--out", str(tmp_path), *QUICK, "--billboards", "2", "--alpha", "blend", "--profile", "three"]
+    out = ["--out", str(tmp_path), *QUICK, "--billboards", "2", "--alpha", "blend", "--profile", "three", "--outline", "rectangle"]
     assert main(["fit", str(views_folder), *out, *options]) == 0
     vertices = json.loads((tmp_path / "metrics.json").read_text())["vertices"]["model"]
     assert (vertices > 8) == split

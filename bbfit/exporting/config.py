@@ -39,8 +39,8 @@ class ExportConfig:
     This costs vertices; mask and hash ignore it.
     Default: only for a profile whose program sorts nodes."""
     outline: Outline | None = None
-    """What is drawn of each billboard, the fewer empty pixels the better. pieces: convex pieces around its visible parts; hull: one
-    convex polygon; rectangle: all of it.
+    """What is drawn of each billboard. pieces: convex pieces around its visible parts, so that few empty pixels are shaded;
+    hull: one convex polygon; rectangle: all of it.
     Default: pieces; a run with a budget of vertices or with the preset thesis, and a comparison of vertices, draw rectangles."""
     pieces: Count = 8
     """With pieces: the most pieces of a billboard on average, at least 1. Cuts that save too little are left out."""

@@ -61,7 +61,7 @@ def with_pieces(cards: Cards, pieces: int, corners: int, least: float) -> Cards:
     queue = [entry(part) for index in range(len(cards.cards)) for part in _whole(cards, index, max(least, ANY))]
     heapq.heapify(queue)
     most = len(queue) + (pieces - 1) * len(cards.cards)
-    while queue and len(queue) < most and -queue[0][0] >= _LEAST_SAVED * areas.sum():
+    while queue and len(queue) < most and -queue[0][0] > _LEAST_SAVED * areas.sum():
         for half in heapq.heappop(queue)[-1]:
             heapq.heappush(queue, entry(half))
 
