@@ -18,6 +18,7 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, check_record, fail
 from bbfit.evaluation.measures import Measures, mean_measures
 from bbfit.evaluation.scoring import held_out, score_views
+from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.files import read_json, remove_parts, write_bytes, write_json
@@ -249,19 +250,19 @@ class _Comparison:
 
     def _fitted(self, system: str, folder: Path) -> _SystemResult:
         """Run bbfit with the options of a system."""
-        return self._run(RunConfig(fit=self._fits[system][0], export=self._stages.export), folder)
+        return self._run(RunConfig(fit=self._fits[system][0], export=self._stages.export.comparable()), folder)
 
     def _budgeted(self, folder: Path) -> _SystemResult:
         """Run bbfit with a budget of as many bytes as the model of the ``bbfit`` system has."""
         fit, _ = self._fits["bbfit-bytes"]
-        return self._run(RunConfig(fit=fit, budget=BudgetConfig(bytes=self._bytes), export=self._stages.export), folder)
+        return self._run(RunConfig(fit=fit, budget=BudgetConfig(bytes=self._bytes), export=self._stages.export.comparable()), folder)
 
     def _run(self, stages: RunConfig, folder: Path) -> _SystemResult:
         def report(stage: str, done: int, total: int, note: str = "") -> None:
             self._on_progress(f"{folder.name} {stage}", done, total, note)
 
         result = run(self._folder / "views", folder / "run", replace(stages, tree=self._tree.path), on_progress=report)
-        shipped = shipped_model(result.cloud, self._stages.export)
+        shipped = shipped_model(result.cloud, self._stages.export.comparable())
         seconds = sum(result.report.seconds.get(stage, 0.0) for stage in ("budget", "fit", "export"))
         model = (folder / "run" / "model.glb").read_bytes()
         return _SystemResult(
@@ -274,7 +275,7 @@ class _Comparison:
     def _baked(self, bake: Callable[..., BillboardCloud], folder: Path) -> _SystemResult:
         started = time.perf_counter()
         cloud = bake(self._tree, config=self._bake, folder=folder / "baked", on_progress=self._on(folder, "bake"))
-        model = shipped_model(cloud)
+        model = shipped_model(cloud, ExportConfig(outline="rectangle"))
         vertices = glb_counts(model.glb)[0]
         return _SystemResult(model.glb, vertices, time.perf_counter() - started, lambda index: self._drawn(model, index), len(cloud))
 

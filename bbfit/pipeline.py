@@ -101,6 +101,12 @@ class RunConfig:
         if blender:
             check_blender(self.views)
 
+    @property
+    def exported(self) -> ExportConfig:
+        """The options of the export: rectangles for a budget of vertices and for the preset ``thesis``, unless they ask for outlines."""
+        counted = self.budget.vertices is not None or self.fit.preset == "thesis"
+        return self.export.comparable() if counted else self.export
+
     def seeded(self, seed: int) -> RunConfig:
         """The same options with one seed for growing, rendering and fitting."""
         views, fit = replace(self.views, seed=seed), replace(self.fit, seed=seed)
@@ -176,7 +182,7 @@ def _fitted(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on_s
     """The stages of a run after its views."""
     record, tree, views = prepared.record, prepared.tree, prepared.views
     folder = record.folder
-    fit_config, missed, export = config.fit, None, export_config(views, config.export)
+    fit_config, missed, export = config.fit, None, export_config(views, config.exported)
     if config.budget.given:
         record.run(budget_stage(folder, views, tree, fit_config, config.budget, export), on_progress)
         fit_config, met = read_choice(folder)
@@ -280,7 +286,7 @@ def _head(source: str, config: RunConfig, *, grown: Species | None = None, rende
         "views": asdict(config.views) if rendered else None,
         "fit": asdict(config.fit.resolve()),
         "budget": asdict(config.budget),
-        "export": asdict(config.export),
+        "export": asdict(config.exported),
     }
     seeds = ({} if grown is None else {"grow": config.grow.seed}) | {"views": config.views.seed, "fit": config.fit.seed}
     return record_head(source, _plain(resolved), seeds)

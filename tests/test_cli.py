@@ -71,8 +71,8 @@ def test_fit_writes_what_run_writes_for_the_same_views(views_folder: Path, fitte
 EXPORTS = {
     "default": ([], bbfit.ExportConfig()),
     "blended": (
-        ["--alpha", "blend", "--split", "--hull", "6", "--mip-files"],
-        bbfit.ExportConfig(alpha="blend", split=True, hull=6, mip_files=True),
+        ["--alpha", "blend", "--split", "--outline", "hull", "--corners", "6", "--mip-files"],
+        bbfit.ExportConfig(alpha="blend", split=True, outline="hull", corners=6, mip_files=True),
     ),
 }
 

@@ -63,7 +63,7 @@ def test_one_seed_is_that_of_all_stages(options: list[str], seeds: tuple[int, in
 @pytest.mark.parametrize(("options", "split"), [([], True), (["--split"], True), (["--no-split"], False)], ids=str)
 def test_flags_are_switches(options: list[str], split: bool, views_folder: Path, tmp_path: Path) -> None:
     """With a profile that splits if it is not told otherwise."""
-    out = ["--out", str(tmp_path), *QUICK, "--billboards", "2", "--alpha", "blend", "--profile", "three"]
+    out = ["--out", str(tmp_path), *QUICK, "--billboards", "2", "--alpha", "blend", "--profile", "three", "--outline", "rectangle"]
     assert main(["fit", str(views_folder), *out, *options]) == 0
     vertices = json.loads((tmp_path / "metrics.json").read_text())["vertices"]["model"]
     assert (vertices > 8) == split
@@ -82,3 +82,10 @@ def test_options_with_a_prefix_are_refused_with_their_new_name(option: str, name
     assert main(["run", "tree.glb", option, "1"]) == 2
     said = capsys.readouterr().err
     assert said.splitlines() == [f"bbfit: {option.partition('=')[0]}: options have no prefix any more; use {name}"]
+
+
+@pytest.mark.parametrize("option", [["--hull", "6"], ["--hull=6"]], ids=str)
+def test_the_old_option_of_hulls_names_the_new_ones(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "cloud.safetensors", "--out", "model.glb", *option]) == 2
+    said = capsys.readouterr().err
+    assert said.splitlines() == ["bbfit: --hull: is no option any more; use --outline hull, with --corners for fewer than 8 corners"]

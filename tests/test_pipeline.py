@@ -15,6 +15,7 @@ import trimesh
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import read_rgba
@@ -45,7 +46,7 @@ def test_everything_is_written(done: RunResult) -> None:
     assert done.skipped == ()
     metrics = json.loads((done.folder / "metrics.json").read_text())
     assert set(metrics) >= {"over_white", "over", "colour", "rgba", "thesis_scale", "vertices", "bytes", "seconds", "views"}
-    assert metrics["vertices"]["model"] == done.cloud.vertex_count == 8
+    assert metrics["vertices"]["model"] == shipped_model(done.cloud).cards.vertex_count >= done.cloud.vertex_count == 8
     assert metrics["bytes"]["model"] == (done.folder / "model.glb").stat().st_size
     assert set(metrics["seconds"]) == {"fit", "export", "evaluate"}
     assert len(metrics["views"]) == 4
@@ -171,7 +172,7 @@ def test_from_a_tree_to_a_model(tmp_path: Path) -> None:
     assert [event for event in told if event[0] == "views"] == [("views", done, 8) for done in range(9)]
     assert {"views/views.json", "views/images/0007.png"} <= {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")}
     metrics = json.loads((tmp_path / "metrics.json").read_text())
-    assert metrics["vertices"]["original"] > 10_000 and 0 < metrics["vertices"]["ratio"] < 1e-3
+    assert metrics["vertices"]["original"] > 10_000 and 0 < metrics["vertices"]["ratio"] < 1e-2
     assert metrics["bytes"]["original"] > 100_000
     assert set(metrics["seconds"]) == {"views", "fit", "export", "evaluate"} and metrics["seconds"]["views"] > 0
     # The model stands where the tree stands: on the ground, around the trunk at the origin.
@@ -191,9 +192,11 @@ def test_from_a_tree_to_a_model(tmp_path: Path) -> None:
 def test_an_obj_of_a_z_up_tree_is_z_up(views_folder: Path, tmp_path: Path) -> None:
     views = Path(shutil.copytree(views_folder, tmp_path / "views"))
     (views / "views.json").write_text(json.dumps({"tree": {"up_axis": "z", "vertices": 5000, "bytes": 90_000}}))
-    run(views, tmp_path / "out", CONFIG)
+    result = run(views, tmp_path / "out", CONFIG)
     assert "Z up" in (tmp_path / "out" / "model.obj").read_text().splitlines()[0]
-    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["vertices"] == {"model": 8, "original": 5000, "ratio": 8 / 5000}
+    vertices = json.loads((tmp_path / "out" / "metrics.json").read_text())["vertices"]
+    model = shipped_model(result.cloud).cards.vertex_count
+    assert vertices == {"model": model, "original": 5000, "ratio": model / 5000}
 
 
 def test_one_seed_is_that_of_all_stages() -> None:

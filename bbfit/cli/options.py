@@ -75,9 +75,11 @@ def _flattened(default: Any, name: str, taken: set[str]) -> Any:
     return flat(**values)
 
 
-def refuse_dotted(arguments: Sequence[str]) -> None:
-    """Refuse the prefixed options of earlier versions: raise an InputError that names the option to use instead."""
+def refuse_old(arguments: Sequence[str]) -> None:
+    """Refuse the options of earlier versions: raise an InputError that names the options to use instead."""
     for argument in arguments:
+        if argument.partition("=")[0] == "--hull":
+            fail("--hull", "is no option any more", "use --outline hull, with --corners for fewer than 8 corners")
         if (dotted := _DOTTED.match(argument)) and dotted[2] != "seed":
             option = f"--{dotted[1]}.{dotted[2]}"
             fail(option, "options have no prefix any more", f"use {_RENAMED.get(option, f'--{dotted[2]}')}")

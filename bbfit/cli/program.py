@@ -17,7 +17,7 @@ import tyro
 from bbfit.checks import InputError, in_words
 from bbfit.cli import commands, studies, viewing
 from bbfit.cli.console import OutputError, err_console, out_console, printing, take_any_text
-from bbfit.cli.options import deferred, refuse_dotted
+from bbfit.cli.options import deferred, refuse_old
 from bbfit.scratch import remove_abandoned
 
 COMMANDS: dict[str, Callable[..., Any]] = {
@@ -62,7 +62,7 @@ def _run(args: Sequence[str]) -> None:
     if list(args) == ["--version"]:
         out_console.print(f"bbfit {version('bbfit')}")
         return
-    refuse_dotted(args)
+    refuse_old(args)
     command = _parse(args)
     remove_abandoned()
     command()

@@ -108,6 +108,8 @@ class Report:
     antialiased: Measures | None = None
     """The means over the views of a mask that is drawn with alpha to coverage (:class:`~bbfit.geometry.alpha.AlphaMode`), while all other
     scores are those of its hard edges; ``None`` for other alpha modes."""
+    shaded: float | None = None
+    """Fragments that a graphics card shades over the pixels that the targets cover (:func:`bbfit.evaluation.scoring.score_shading`)."""
 
     @property
     def mean(self) -> Measures:
@@ -140,7 +142,7 @@ class Report:
             ``{"over_white": {"psnr", "ssim", "flip"}, "over": {"white", "black", "grass", "sky", "mean": {"psnr", "ssim", "flip"} each},
             "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
             "colour": {"delta_e", "chroma", "brightness", "target", "render", "target_inside", "render_inside"},
-            "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw",
+            "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw", "shaded",
             "antialiased": {the same measures} or None, "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
             "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
             "rings": [{"elevation_degrees", "views", and the same measures}],
@@ -151,6 +153,7 @@ class Report:
             "bytes": self.bytes.to_json(),
             "overdraw": self.overdraw,
             "antialiased": None if self.antialiased is None else self.antialiased.to_json(),
+            "shaded": self.shaded,
             "alpha": {"mode": self.alpha.kind, "cutoff": self.alpha.cutoff},
             "seconds": dict(self.seconds),
             "sizes": [asdict(size) for size in self.sizes],
@@ -181,8 +184,9 @@ class Report:
                 for view in content["views"]
             )
             afar = tuple(SizeScore(**size) for size in content["sizes"])
+            shaded = content["shaded"]
             antialiased = None if content["antialiased"] is None else Measures.from_json(content["antialiased"])
-            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, antialiased)
+            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, antialiased, shaded)
             if not scores:
                 raise ValueError("it has no views")
             check_record("report", report, Report)

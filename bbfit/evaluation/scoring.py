@@ -19,7 +19,9 @@ from bbfit.evaluation.sizes import HALVINGS, score_sizes
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.geometry.camera import Camera
+from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.rendering.cards import fragments
 from bbfit.views import ViewSet
 
 
@@ -105,8 +107,19 @@ def evaluate_model(
         overdraw=model.overdraw,
         sizes=sizes,
         antialiased=mean_measures([view.measures for view in scored[1]]) if len(models) > 1 else None,
+        shaded=score_shading(model.cards, views),
         seconds={"evaluate": time.perf_counter() - started},
     )
+
+
+def score_shading(cards: Cards, views: ViewSet) -> float | None:
+    """Fragments that a graphics card shades in all views over the pixels that the targets cover, by the sum of their alpha.
+
+    1 is a model without layers or empty fragments. ``None`` if the targets are empty.
+    """
+    shaded = sum(fragments(cards, views.cameras[index]) for index in range(len(views)))
+    covered = sum(float(views.targets([index], torch.float64)[0][..., 3].sum()) for index in range(len(views)))
+    return shaded / covered if covered else None
 
 
 def score_views(

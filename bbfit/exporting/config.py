@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from bbfit.checks import Count, Range, check_fields, fail
@@ -14,9 +14,10 @@ Profile = Literal["three", "babylon", "godot", "unity", "unreal", "blender"]
 Encoding = Literal["png", "webp", "ktx2"]
 Textures = Literal["auto"] | Encoding
 Material = Literal["unlit", "pbr"]
+Outline = Literal["pieces", "hull", "rectangle"]
 
 # Defaults without a profile.
-_OPEN: dict[str, Any] = {"split": False, "material": "unlit", "textures": "png"}
+_OPEN: dict[str, Any] = {"split": False, "material": "unlit", "textures": "png", "outline": "pieces"}
 # Programs that rasterize sort blended geometry node by node, so they need split cards; Blender's Cycles finds the order by itself.
 _SORTS_NODES: dict[Profile, bool] = {"three": True, "babylon": True, "godot": True, "unity": True, "unreal": True, "blender": False}
 
@@ -37,9 +38,14 @@ class ExportConfig:
     """With blend: cut billboards that cross, and give each piece a node, so that programs that sort nodes draw them in the right order.
     This costs vertices; mask and hash ignore it.
     Default: only for a profile whose program sorts nodes."""
-    hull: Annotated[int, Range(4, 8)] | None = None
-    """Most corners, 4 to 8, of a convex outline in place of each rectangle, so that fewer empty pixels are drawn.
-    Default: the rectangle."""
+    outline: Outline | None = None
+    """What is drawn of each billboard. pieces: convex pieces around its visible parts, so that few empty pixels are shaded;
+    hull: one convex polygon; rectangle: all of it.
+    Default: pieces; a run with a budget of vertices or with the preset thesis, and a comparison of vertices, draw rectangles."""
+    pieces: Count = 8
+    """With pieces: the most pieces of a billboard on average, at least 1. Cuts that save too little are left out."""
+    corners: Annotated[int, Range(4, 8)] = 8
+    """With pieces or hull: the most corners of each polygon, 4 to 8."""
     textures: Textures | None = None
     """Format of a GLB's texture beside PNG, which every program reads: webp is smaller, once --no-fallback omits the PNG;
     ktx2 stays compressed on the graphics card and includes mip levels that keep their coverage (needs the extra ktx2);
@@ -60,6 +66,10 @@ class ExportConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+    def comparable(self) -> ExportConfig:
+        """The same options with rectangles unless they ask for outlines: all models have as many vertices for each billboard."""
+        return replace(self, outline="rectangle") if self.outline is None else self
 
     def resolve(self) -> ResolvedExport:
         """Fill in the choices that depend on the profile and on the installed encoders; a :class:`ResolvedExport` returns itself.
@@ -89,6 +99,7 @@ class ResolvedExport(ExportConfig):
     """An :class:`ExportConfig` with every choice made. Where ``alpha`` or ``alpha_cutoff`` is None, that of the cloud holds."""
 
     split: bool
+    outline: Outline
     textures: Encoding
     material: Material
 

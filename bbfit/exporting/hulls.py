@@ -12,12 +12,13 @@ from bbfit.checks import check_count, check_range
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.polygons import area, kept_half, sides
 
-# Margin of a polygon around the visible part in texels, far more than the rounding of float32 and the vertex snapping of graphics cards.
-_MARGIN = 1 / 64
-# The least alpha above 0. Bilinear filtering between alpha 1/255 and 0 reaches it within a millionth of a texel from the 0.
-_ANY = 1e-9
+MARGIN = 1 / 64
+"""Margin of a polygon around the visible part in texels, far more than the rounding of float32 and the vertex snapping of graphics
+cards."""
+ANY = 1e-9
+"""The least alpha above 0. Bilinear filtering between alpha 1/255 and 0 reaches it within a millionth of a texel from the 0."""
 # Candidate directions of sides: this many around the circle, and those of the hull's longest edges.
-_AROUND, _EDGES = 72, 56
+_AROUND, _EDGES = 36, 32
 # Samples of all cards that overdraw is measured with.
 _SAMPLES = 500_000
 
@@ -70,7 +71,7 @@ def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
     in [0, 1], is the cutoff of MASK, or 0 for any alpha above 0, as BLEND shows it. The visible part is larger in
     mip levels: there the polygon may cut off up to half a texel of the level in use.
 
-    The polygon's sides touch the convex hull of the visible part. It is the smallest of all such polygons whose sides have one of about 130
+    The polygon's sides touch the convex hull of the visible part. It is the smallest of all such polygons whose sides have one of about 70
     directions and whose corners lie in the card. Areas add up corner by corner, so the search is for a shortest cycle (after Aggarwal,
     Chang and Yap 1985, "Minimum area circumscribing polygons"). More vertices never give a larger polygon.
 
@@ -80,21 +81,30 @@ def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
     """
     check_count("hull vertices", vertices, 4)
     check_range("least alpha", least, 0, 1)
-    made = []
-    for card in cards.cards:
-        polygon = texel_corners(cards, card)
-        points = _shown_points(rimmed_alpha(cards, card.rectangle), polygon, max(least, _ANY))
-        hull = _hull_within(points, polygon) if len(points) else points
-        if len(hull) >= 3 and area(hull) > 0:
-            smaller = _enclosing(hull, polygon, vertices)
-        else:
-            shrunk = min(1.0, abs(area(polygon)) ** -0.5)
-            smaller = polygon.mean(0) + (polygon[:vertices] - polygon.mean(0)) * shrunk
-        if smaller is None or abs(area(smaller)) > (1 - 1e-9) * abs(area(polygon)):
-            made.append(card)
-        else:
-            made.append(with_texel_corners(cards, card, smaller if area(smaller) * area(polygon) > 0 else smaller[::-1]))
-    return cards.with_cards(made)
+    return cards.with_cards([trimmed(cards, card, vertices, least) for card in cards.cards])
+
+
+def trimmed(cards: Cards, card: Card, vertices: int, least: float, box: NDArray[np.float64] | None = None) -> Card:
+    """A card as :func:`with_hulls` trims it; with ``box``, the part of a rectangular card for the squares of texel centers in a box.
+
+    The box is [4, 2] in texels, along texel centers. The part may reach beyond the box by :data:`MARGIN`.
+    """
+    polygon = inside = texel_corners(cards, card)
+    region = polygon
+    if box is not None:
+        grown = box + MARGIN * np.sign(box - box.mean(0))
+        inside, region = (np.clip(corners, polygon.min(0), polygon.max(0)) for corners in (box, grown))
+    points = _shown_points(rimmed_alpha(cards, card.rectangle), inside, max(least, ANY))
+    hull = _hull_within(points, region) if len(points) else points
+    if len(hull) >= 3 and area(hull) > 0:
+        smaller = _enclosing(hull, region, vertices)
+        smaller = region if smaller is None else smaller
+    else:
+        shrunk = min(1.0, abs(area(polygon)) ** -0.5)
+        smaller = polygon.mean(0) + (polygon[:vertices] - polygon.mean(0)) * shrunk
+    if abs(area(smaller)) > (1 - 1e-9) * abs(area(polygon)):
+        return card
+    return with_texel_corners(cards, card, smaller if area(smaller) * area(polygon) > 0 else smaller[::-1])
 
 
 def with_texel_corners(cards: Cards, card: Card, polygon: NDArray[np.float64]) -> Card:
@@ -121,7 +131,7 @@ def overdraw(cards: Cards, least: float) -> float:
         points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
         normals, offsets = sides(polygon)
         points = points[(points @ normals.T <= offsets).all(-1)]
-        reached = bilinear(rimmed_alpha(cards, card.rectangle), points) >= max(least, _ANY)
+        reached = bilinear(rimmed_alpha(cards, card.rectangle), points) >= max(least, ANY)
         shaded += abs(area(polygon))
         shown += abs(area(polygon)) * float(reached.mean()) if len(points) else 0.0
     return 1 - shown / shaded
@@ -165,7 +175,7 @@ def _hull_within(points: NDArray[np.float64], polygon: NDArray[np.float64]) -> N
 
     if np.linalg.eigvalsh(np.cov(points.T, bias=True))[0] > 1e-3:  # points on one line have no hull of their own
         points = points[ConvexHull(points).vertices]
-    hull = (points[:, None] + _MARGIN * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])).reshape(-1, 2)
+    hull = (points[:, None] + MARGIN * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])).reshape(-1, 2)
     hull = hull[ConvexHull(hull).vertices]
     for normal, offset in zip(*sides(polygon), strict=True):
         hull = kept_half(hull, hull @ normal - offset)
@@ -179,8 +189,10 @@ def _enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices
     along = np.roll(hull, -1, 0) - hull
     longest = np.argsort(-(along**2).sum(-1), kind="stable")[:_EDGES]
     outwards = np.stack([along[:, 1], -along[:, 0]], -1)[longest]
-    angles = np.concatenate([np.arctan2(*outwards.T[::-1]), np.arctan2(*normals.T[::-1]), np.arange(_AROUND) * (2 * np.pi / _AROUND)])
-    angles = np.sort(angles % (2 * np.pi))
+    edges, fixed = np.arctan2(*outwards.T[::-1]), np.append(np.arctan2(*normals.T[::-1]), np.arange(_AROUND) * (2 * np.pi / _AROUND))
+    # A side almost, but not quite, along one of the polygon's would leave the polygon where both touch the hull.
+    apart = abs((edges[:, None] - fixed + np.pi) % (2 * np.pi) - np.pi).min(1) > 1e-6
+    angles = np.sort(np.append(edges[apart], fixed) % (2 * np.pi))
     angles = angles[np.diff(angles, prepend=angles[-1] - 2 * np.pi) > 1e-7]
 
     normal = np.stack([np.cos(angles), np.sin(angles)], -1)

@@ -14,6 +14,7 @@ from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import overdraw, with_hulls
 from bbfit.exporting.mip_matching import reduced, with_mips
 from bbfit.exporting.obj import mtl_bytes, obj_bytes
+from bbfit.exporting.outlines import with_pieces
 from bbfit.exporting.splitting import split
 from bbfit.files import write_bytes
 from bbfit.geometry.alpha import AlphaMode
@@ -47,9 +48,11 @@ class ShippedModel:
         cards = cloud_cards(self.cloud, self.config.padding << self.halvings)
         if self.config.split and cards.alpha.kind == "blend":
             cards = split(cards)
-        if self.config.hull is not None:
-            cards = with_hulls(cards, self.config.hull, cards.visible_alpha)
         cards = reduced(cards, self.halvings)
+        if self.config.outline == "hull":
+            cards = with_hulls(cards, self.config.corners, cards.outlined_alpha)
+        elif self.config.outline == "pieces":
+            cards = with_pieces(cards, self.config.pieces, self.config.corners, cards.outlined_alpha)
         return with_mips(cards) if self.config.has_mips else cards
 
     @cached_property

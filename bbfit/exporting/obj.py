@@ -29,7 +29,7 @@ def obj_bytes(cards: Cards, config: ExportConfig, *, material_file: str) -> byte
     if any(card.culled for card in cards.cards):
         lines.append("# has separate front and back faces: turn on back-face culling")
     lines += [f"mtllib {material_file}", "o billboards"]
-    lines += _rows("v", corners) + _rows("vt", uvs) + _rows("vn", normals)
+    lines += _rows("v", corners.astype(np.float32)) + _rows("vt", uvs) + _rows("vn", normals)
     lines += [f"usemtl {_MATERIAL}", "s off"]
     first = 1
     for face, card in enumerate(cards.cards, 1):

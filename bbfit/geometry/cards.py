@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 
 from bbfit.geometry.alpha import AlphaMode
 
+MASK_RIM = 0.5
+"""Share of a mask's cutoff from which outlines contain alpha. Programs that draw smooth edges (alpha to coverage) show half a pixel
+outside the cutoff's contour, where the ramp ``(alpha - cutoff) / fwidth(alpha) + 0.5`` is above 0; at 1 outlines end at the contour."""
+
 
 @dataclass(frozen=True)
 class Atlas:
@@ -75,6 +79,11 @@ class Cards:
     def visible_alpha(self) -> float:
         """The least alpha that is visible: the cutoff of mask, and 0 for the other modes, which show any alpha above 0."""
         return self.alpha.cutoff if self.alpha.kind == "mask" else 0.0
+
+    @property
+    def outlined_alpha(self) -> float:
+        """The least alpha that outlines contain: all that is visible, and for mask also the rim of smooth edges (:data:`MASK_RIM`)."""
+        return self.visible_alpha * MASK_RIM
 
     def with_cards(self, cards: list[Card]) -> Cards:
         """Other cards with the same textures."""

@@ -164,6 +164,15 @@ def hits(cards: Cards, sheet: Sheet, camera: Camera) -> Hits:
     return Hits(x, y, uv, (torch.maximum(*rates) / scale.abs()).log2(), depth, to_uv)
 
 
+def fragments(cards: Cards, camera: Camera) -> int:
+    """How many fragments a graphics card shades for a single camera: the pixel centers inside the polygons of all layers.
+
+    Parts behind the camera and culled sides do not count. Early depth tests, which may save some, are not assumed: an alpha test prevents
+    them. The further pixels of 2 x 2 blocks that only serve derivatives are left out.
+    """
+    return sum(len(hits(cards, sheet, camera).x) for sheet in sheets_of(cards))
+
+
 def filtered(levels: MipChain, uv: Tensor, detail: Tensor) -> Tensor:
     """Trilinear samples in [0, 255] at points [M, 2] by level of detail [M]: float32 [M, C]."""
     detail = detail.clamp(0, len(levels.starts) - 1)

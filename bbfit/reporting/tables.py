@@ -89,6 +89,8 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
         table.add_row(name, _DOWN, _count(cost.model), "", _count(cost.original), _percent(cost))
     if report.overdraw is not None:
         table.add_row("empty area drawn", _DOWN, f"{100 * report.overdraw:.3g} %", "", "", "")
+    if report.shaded is not None:
+        table.add_row("shaded / covered pixels", _DOWN, f"{report.shaded:.2f}", "", "", "")
     if report.seconds:
         table.caption = "seconds: " + "  ·  ".join(f"{stage} {seconds:,.1f}" for stage, seconds in report.seconds.items())
         table.caption_justify = "left"

@@ -46,7 +46,9 @@ def test_the_file_has_the_tree_and_the_clouds(built: LodResult) -> None:
     assert names == [level.name for level in built.levels] == [f"oak_LOD{number}" for number in range(3)]
     assert [level.planes for level in built.levels] == [None, 4, 2]
     assert (built.levels[0].vertices, built.levels[0].triangles) == glb_counts(TREE.read_bytes())
-    assert [level.vertices for level in built.levels[1:]] == [16, 8] and [level.triangles for level in built.levels[1:]] == [8, 4]
+    for level in built.levels[1:]:  # on average up to 8 pieces of 3 to 8 corners a billboard
+        assert level.planes is not None and 3 * level.planes <= level.vertices <= 8 * 8 * level.planes
+        assert level.planes <= level.triangles <= 8 * 6 * level.planes
     together = sum(level.vertices for level in built.levels), sum(level.triangles for level in built.levels)
     assert glb_counts(built.path.read_bytes()) == together
     extras = tree["nodes"][root]["extras"]

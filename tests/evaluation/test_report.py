@@ -65,6 +65,7 @@ def test_schema() -> None:
         "vertices",
         "bytes",
         "overdraw",
+        "shaded",
         "alpha",
         "seconds",
         "sizes",

@@ -98,7 +98,7 @@ def test_split_nodes_stand_at_their_origins_and_their_bounds_are_centerd_there(c
 
 def test_only_blend_is_split_and_only_where_nodes_are_sorted(crossed: BillboardCloud) -> None:
     def pieces(alpha: str, **options: Any) -> int:
-        return len(shipped_model(crossed, ExportConfig(alpha=alpha, **options)).cards.cards)  # type: ignore[arg-type]
+        return len(shipped_model(crossed, ExportConfig(alpha=alpha, outline="hull", **options)).cards.cards)  # type: ignore[arg-type]
 
     assert pieces("mask", split=True) == pieces("hash", split=True) == pieces("blend") == pieces("blend", profile="blender") == 2
     assert pieces("blend", profile="blender", split=True) == pieces("blend", profile="three") > 2
@@ -107,11 +107,11 @@ def test_only_blend_is_split_and_only_where_nodes_are_sorted(crossed: BillboardC
 
 def test_a_hull_saves_area_and_keeps_to_its_corners(crossed: BillboardCloud, tmp_path: Path) -> None:
     for corners in (4, 6, 8):
-        cards = shipped_model(crossed, ExportConfig(alpha="mask", hull=corners)).cards.cards
+        cards = shipped_model(crossed, ExportConfig(alpha="mask", outline="hull", corners=corners)).cards.cards
         assert all(len(card.corners) <= corners for card in cards)
-    (path,) = export(crossed, tmp_path / "model.glb", ExportConfig(alpha="mask", hull=8))
+    (path,) = export(crossed, tmp_path / "model.glb", ExportConfig(alpha="mask", outline="hull"))
     assert not messages(path)
-    obj, *_ = export(crossed, tmp_path / "model.obj", ExportConfig(alpha="mask", hull=8))
+    obj, *_ = export(crossed, tmp_path / "model.obj", ExportConfig(alpha="mask", outline="hull"))
     faces = [line for line in obj.read_text().splitlines() if line.startswith("f ")]
     assert len(faces) == 2 and all(len(face.split()) - 1 == len(card.corners) for face, card in zip(faces, cards, strict=True))
 
@@ -167,8 +167,10 @@ def test_a_glb_taken_apart_and_joined_is_the_same(crossed: BillboardCloud, tmp_p
         {"alpha_cutoff": 0.0},
         {"alpha_cutoff": 1},
         {"alpha_cutoff": "half"},
-        {"hull": 3},
-        {"hull": 9},
+        {"corners": 3},
+        {"corners": 9},
+        {"pieces": 0},
+        {"outline": "round"},
         {"textures": "jpeg"},
         {"material": "toon"},
         {"split": 2},

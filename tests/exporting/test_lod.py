@@ -18,11 +18,15 @@ from test_formats import tree_of
 
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
-from bbfit.exporting.model import export
+from bbfit.exporting.model import export, shipped_model
 from bbfit.geometry.cloud import BillboardCloud
 
 BLANK = LodLevel("", 1, 0, 0, 0, 0.1, 1.0, 1.0, 20.0, 50.0, 10.0, 0.0)
-CONFIGS = (ExportConfig(alpha="blend", split=True), ExportConfig(textures="webp", fallback=False), ExportConfig(alpha="hash", hull=6))
+CONFIGS = (
+    ExportConfig(alpha="blend", split=True),
+    ExportConfig(textures="webp", fallback=False),
+    ExportConfig(alpha="hash", outline="hull", corners=6),
+)
 
 
 @pytest.fixture(scope="module")
@@ -134,8 +138,10 @@ def test_one_level_needs_no_extension(crossed: BillboardCloud, tmp_path: Path) -
 
 
 def test_vertices_and_triangles_are_counted_node_by_node(crossed: BillboardCloud, tree: bytes, tmp_path: Path) -> None:
-    (path,) = export(crossed, tmp_path / "model.glb", ExportConfig(alpha="mask"))
+    (path,) = export(crossed, tmp_path / "model.glb", ExportConfig(alpha="mask", outline="rectangle"))
     assert glb_counts(path.read_bytes()) == (8, 4)
+    cut = shipped_model(crossed, ExportConfig(alpha="mask"))
+    assert glb_counts(cut.glb) == (cut.cards.vertex_count, sum(len(card.triangles) for card in cut.cards.cards))
     vertices, triangles = glb_counts(tree)
     assert triangles == 12 + 80 and vertices == len(trimesh.load(io.BytesIO(tree), file_type="glb", force="mesh", process=False).vertices)
 

@@ -359,7 +359,7 @@ def contrast(one: list[float], other: list[float]) -> float:
 
 @pytest.mark.parametrize(
     "export",
-    [ExportConfig(alpha="blend"), ExportConfig(alpha="hash", textures="ktx2", fallback=False), ExportConfig(material="pbr", hull=6)],
+    [ExportConfig(alpha="blend"), ExportConfig(alpha="hash", textures="ktx2", fallback=False), ExportConfig(material="pbr", corners=6)],
 )
 def test_every_kind_of_export_has_a_page(visit: Visit, views_folder: Path, tmp_path: Path, export: ExportConfig) -> None:
     config = RunConfig(fit=FitConfig(billboards=2, placement="even", sides="two", steps=8), export=export)
