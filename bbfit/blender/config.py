@@ -26,8 +26,7 @@ class ViewsConfig:
     """How a tree is rendered."""
 
     count: Annotated[int, Range(2)] = 90
-    """Number of pictures, divided among the rings of cameras by their circumferences; a random quarter of each ring is held out for the
-    score."""
+    """Number of pictures; steep rings of cameras get fewer of them, and a random quarter of each ring is held out for the score."""
     size: Annotated[int, Range(11, 16384)] = 384
     """Width and height of a picture in pixels."""
     elevations: tuple[_Elevation, ...] | None = None

@@ -133,9 +133,8 @@ class FitConfig:
     It is summed over channels and averaged over pixels; for backgrounds it is the expectation.
     Preset: backgrounds; thesis: l2."""
     colors: Colors | None = None
-    """What colors are fitted to. views: the color of the views, whatever alpha is there, so that leaves keep their color before any
-    background. joint: the loss, together with alpha. matched: the same, after which one factor per channel makes the mean color that of the
-    views, as it does after a fit to the views.
+    """What colors are fitted to: to the color of the views, whatever alpha is (views), or to the loss, together with alpha (joint, matched).
+    With views and matched, one factor per channel makes the mean color that of the views in the end.
     Preset: views (mask, hash) or matched (blend); thesis: joint."""
     antialiased: bool | None = None
     """Fit a mask for programs that smooth its edges by alpha to coverage. Preset: yes; thesis: no. Other alpha modes ignore it."""

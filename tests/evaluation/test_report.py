@@ -66,6 +66,7 @@ def test_schema() -> None:
         "bytes",
         "overdraw",
         "shaded",
+        "antialiased",
         "alpha",
         "seconds",
         "sizes",

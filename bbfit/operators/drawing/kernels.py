@@ -60,7 +60,7 @@ from bbfit.operators.drawing.sampling_kernels import (
     slope,
     threshold,
 )
-from bbfit.operators.image_loss.kernels import add_pixel_loss, premultiplied
+from bbfit.operators.image_loss.kernels import add_pixel_loss, color_slope, premultiplied
 from bbfit.operators.launching import FLAGS
 
 TIE = wp.constant(TIE_VALUE)
@@ -373,13 +373,8 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
                                 of_alpha = exposed * values[f] * slopes[f]
                                 of_sample = wp.vec4(g[0] * part, g[1] * part, g[2] * part, of_alpha)
                                 if own_colors != 0:
-                                    twice = 2.0 * weight * part
-                                    of_sample = wp.vec4(
-                                        (seen[3] * reds[f] - seen[0]) * twice,
-                                        (seen[3] * greens[f] - seen[1]) * twice,
-                                        (seen[3] * blues[f] - seen[2]) * twice,
-                                        of_alpha,
-                                    )
+                                    own_loss = color_slope(wp.vec3(reds[f], greens[f], blues[f]), seen) * (weight * part)
+                                    of_sample = wp.vec4(own_loss[0], own_loss[1], own_loss[2], of_alpha)
                                 whose = wp.vec3i(firsts[own], heights[own], widths[own])
                                 scatter(texel_gradient, whose, left[own, c], top[own, c], fx[own, c], fy[own, c], of_sample)
                                 if wanted_placement:

@@ -62,6 +62,12 @@ def add_pixel_loss(d: wp.vec4, loss: int, weight: float, total: float, g: wp.vec
     return total, g
 
 
+@wp.func
+def color_slope(color: wp.vec3, seen: wp.vec4) -> wp.vec3:
+    """Derivative of A |c - C|^2 in a layer's straight color c, for a view's premultiplied pixel (A C, A)."""
+    return (color * seen[3] - wp.vec3(seen[0], seen[1], seen[2])) * 2.0
+
+
 @wp.kernel
 def unpack(first: int, run: int, packed: wp.array(dtype=wp.int32), straight: int, image: Pixels):
     """Write 8-bit RGBA [P] as premultiplied floats; launched over runs of pixels, from run ``first`` on."""
