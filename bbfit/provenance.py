@@ -24,7 +24,7 @@ VERSIONS: Mapping[str, int] = {
     "budget": 5,
     "fit": 10,
     "export": 3,
-    "evaluate": 8,
+    "evaluate": 9,
     "report": 2,
     "lod": 2,
     "compare": 2,

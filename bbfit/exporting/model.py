@@ -43,8 +43,12 @@ class ShippedModel:
 
     @cached_property
     def cards(self) -> Cards:
-        """The polygons, split and trimmed as the options request, and the mip levels if the files bring any."""
-        cards = cloud_cards(self.cloud, self.config.padding << self.halvings)
+        """The polygons, split and trimmed as the options request, and the mip levels if the files bring any.
+
+        They are those of the files, so they do not depend on whether a program smooths the edges of masks.
+        """
+        cloud = replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=False))
+        cards = cloud_cards(cloud, self.config.padding << self.halvings)
         if self.config.split and cards.alpha.kind == "blend":
             cards = split(cards)
         if self.config.hull is not None:
@@ -69,7 +73,7 @@ class ShippedModel:
         faster and draws them. Trimmed outlines cut off nothing visible.
         """
         if self.config.has_mips or self.halvings:
-            return draw_cards(self.cards, camera)
+            return draw_cards(replace(self.cards, alpha=self.cloud.alpha), camera)
         return render(self.cloud, camera.to(self.cloud.texels.device))
 
     def antialiased(self) -> ShippedModel:
