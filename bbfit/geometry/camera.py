@@ -88,7 +88,7 @@ class Camera:
         return Camera(self.world_to_camera, intrinsics, width, height, self.orthographic)
 
     def turned(self, degrees: float, axis: Tensor) -> Camera:
-        """The same cameras turned around a vertical axis through a point, [3], counter-clockwise seen from above: to greater azimuths."""
+        """The same cameras turned around the vertical axis through a point, [3], counter-clockwise seen from above: to greater azimuths."""
         angle = math.radians(degrees)
         back = torch.eye(4, dtype=self.world_to_camera.dtype, device=self.world_to_camera.device)  # turns the world instead
         back[0, 0] = back[2, 2] = math.cos(angle)
