@@ -78,7 +78,9 @@ class ShippedModel:
 
     def antialiased(self) -> ShippedModel:
         """The same model as a program draws it that smooths the edges of masks by alpha to coverage."""
-        return replace(self, cloud=replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=True)))
+        model = replace(self, cloud=replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=True)))
+        vars(model)["cards"] = self.cards  # of the same files, so that they are not computed twice
+        return model
 
     def save(self, path: str | Path) -> list[Path]:
         """Write the files as :func:`export` does, with the same results and errors."""
