@@ -23,6 +23,9 @@ from bbfit.inputs import LARGEST, InputLimits, reading
 
 _LIMITS = InputLimits()
 TRAIN_FILE, TEST_FILE, SINGLE_FILE = "transforms_train.json", "transforms_test.json", "transforms.json"
+TURNED_FILE = "transforms_turned.json"
+"""File beside the transforms with the cameras of second pictures of some held-out views, each turned by one degree around the tree. An
+entry ``turned_from`` names the ``file_path`` of its view in the file of test views."""
 REQUEST_FILE = "views.json"
 """File beside the transforms in which ``bbfit views`` records its options and facts about the tree."""
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "ORTHOGRAPHIC")
@@ -73,7 +76,33 @@ def write_transforms(folder: Path, camera: Camera, image_paths: list[str], train
     The layout does not know orthographic cameras. Theirs have ``camera_model = "ORTHOGRAPHIC"`` and ``orthographic_extent_x`` in meters, as
     well as intrinsics in pixels per meter.
     """
-    matrices = camera_to_nerf(camera.world_to_camera.double())
+    header = _camera_header(camera)
+    frames = _entries(camera, image_paths)
+    for name, indices in ((TRAIN_FILE, train), (TEST_FILE, test)):
+        write_json(folder / name, header | {"frames": [frames[index] for index in indices]})
+
+
+def write_turned(folder: Path, camera: Camera, image_paths: list[str], views: list[str]) -> None:
+    """Write :data:`TURNED_FILE` for a batch of cameras, their pictures and the pictures of the views that they are turned from.
+
+    Paths are as in :func:`write_transforms`.
+    """
+    frames = [entry | {"turned_from": _reference(view)} for entry, view in zip(_entries(camera, image_paths), views, strict=True)]
+    write_json(folder / TURNED_FILE, _camera_header(camera) | {"frames": frames})
+
+
+def _reference(image_path: str) -> str:
+    return "./" + image_path.removesuffix(".png")
+
+
+def _entries(camera: Camera, image_paths: list[str]) -> list[dict[str, Any]]:
+    """The entry of each camera of a batch in a transforms file."""
+    matrices = camera_to_nerf(camera.world_to_camera.double()).tolist()
+    return [{"file_path": _reference(path), "transform_matrix": matrix} for path, matrix in zip(image_paths, matrices, strict=True)]
+
+
+def _camera_header(camera: Camera) -> dict[str, Any]:
+    """The entries of a transforms file that hold for all cameras of a batch."""
     k = camera.intrinsics[0].double()
     header: dict[str, Any] = {
         "w": camera.width,
@@ -87,9 +116,7 @@ def write_transforms(folder: Path, camera: Camera, image_paths: list[str], train
         header |= {"camera_model": "ORTHOGRAPHIC", "orthographic_extent_x": camera.width / header["fl_x"]}
     else:
         header |= {"camera_model": "OPENCV", "camera_angle_x": 2 * math.atan(0.5 * camera.width / header["fl_x"])}
-    for name, indices in ((TRAIN_FILE, train), (TEST_FILE, test)):
-        frames = [{"file_path": "./" + image_paths[i].removesuffix(".png"), "transform_matrix": matrices[i].tolist()} for i in indices]
-        write_json(folder / name, header | {"frames": frames})
+    return header
 
 
 @dataclass(frozen=True)
@@ -122,6 +149,24 @@ def read_frames(folder: Path, limits: InputLimits = _LIMITS) -> tuple[list[Frame
     raise MissingFileError(f"views: {folder} has no {TRAIN_FILE} or {SINGLE_FILE}; give a folder that bbfit views wrote")
 
 
+def read_turned(folder: Path, test: Sequence[Frame], limits: InputLimits = _LIMITS) -> list[tuple[int, Frame]]:
+    """The frames of :data:`TURNED_FILE`, each with the index of its view among the test frames. None if there is no such file.
+
+    Raises ``InputError`` if the file is damaged or a frame is turned from no test view, and the errors of :func:`read_frames`.
+    """
+    path = folder / TURNED_FILE
+    if not path.is_file():
+        return []
+    indices = {frame.header["file_path"]: index for index, frame in enumerate(test)}
+    pairs = []
+    for number, frame in enumerate(_read_file(path, limits)[0]):
+        view = frame.header.get("turned_from")
+        if not isinstance(view, str) or view not in indices:
+            fail("views", f"frame {number} of {path} is turned from no held-out view", f"render the views anew, or remove {path.name}")
+        pairs.append((indices[view], frame))
+    return pairs
+
+
 def _read_file(path: Path, limits: InputLimits) -> tuple[list[Frame], set[str]]:
     """The frames of a transforms file, and the pictures that it holds out."""
     content = read_json("views", path)
@@ -140,7 +185,7 @@ def _read_file(path: Path, limits: InputLimits) -> tuple[list[Frame], set[str]]:
             if reference not in known:
                 ending = "" if Path(reference).suffix.lower() in _PICTURES else ".png"
                 known[reference] = limits.referenced("views", path, reference + ending, path.parent)
-            own = {key: entry[key] for key in ("file_path", *_HEADER) if key in entry}
+            own = {key: entry[key] for key in ("file_path", "turned_from", *_HEADER) if key in entry}
             frames.append(Frame(known[reference], matrix, header | own))
         held_out = content.get("test_filenames")
         return frames, {name for name in held_out if isinstance(name, str)} if isinstance(held_out, list) else set()

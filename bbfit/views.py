@@ -20,7 +20,7 @@ from bbfit.checks import InputTypeError, MissingFileError, check_folder, check_s
 from bbfit.geometry.camera import Camera
 from bbfit.images import picture_header, premultiply, read_rgba, to_bytes
 from bbfit.inputs import InputLimits
-from bbfit.layout import REQUEST_FILE, Frame, cameras_of, read_frames, split_views
+from bbfit.layout import REQUEST_FILE, Frame, cameras_of, read_frames, read_turned, split_views
 
 _LIMITS = InputLimits()
 CACHE_BYTES = 3 << 29
@@ -125,6 +125,16 @@ class ViewSet:
 
 
 @dataclass(frozen=True)
+class TurnedViews:
+    """Pairs of pictures from neighboring cameras: V held-out views, and as many from cameras that are turned by one degree."""
+
+    views: ViewSet
+    """Views from the test split."""
+    turned: ViewSet
+    """The second picture of each, in the same order."""
+
+
+@dataclass(frozen=True)
 class ViewDataset:
     """Training and test views of one tree.
 
@@ -139,6 +149,9 @@ class ViewDataset:
     """Held-out views, for the final score only."""
     request: ViewsRequest | None = None
     """The request that ``bbfit views`` recorded in ``views.json``; ``None`` for views from elsewhere."""
+    turned: TurnedViews | None = None
+    """Some of the held-out views with a second picture of each (``ViewsConfig.turned``), for the score of shimmer; ``None`` for views
+    without."""
 
     @staticmethod
     def load(folder: str | Path, *, seed: int = 0, cache_bytes: int = CACHE_BYTES, limits: InputLimits = _LIMITS) -> ViewDataset:
@@ -170,7 +183,8 @@ class ViewDataset:
             train, test = [train[i] for i in train_indices], [train[i] for i in test_indices]
         if not train or not test:
             fail("views", f"{folder} has {len(train)} training and {len(test or [])} test views", "at least one of each is needed")
-        width, height = _common_size([*train, *test], limits)
+        pairs = read_turned(folder, test, limits)
+        width, height = _common_size([*train, *test, *(frame for _, frame in pairs)], limits)
         _check_size("views", f"pictures in {folder}", width, height)
 
         request = ViewsRequest.load(folder / REQUEST_FILE) if (folder / REQUEST_FILE).is_file() else None
@@ -186,7 +200,8 @@ class ViewDataset:
         def view_set(frames: list[Frame]) -> ViewSet:
             return ViewSet(tuple(frame.image for frame in frames), cameras_of(frames, width, height), read)
 
-        return ViewDataset(folder, view_set(train), view_set(test), request)
+        turned = TurnedViews(view_set([test[index] for index, _ in pairs]), view_set([frame for _, frame in pairs])) if pairs else None
+        return ViewDataset(folder, view_set(train), view_set(test), request, turned)
 
     @staticmethod
     def from_arrays(images: NDArray[Any] | Tensor, cameras: Camera, *, test: Sequence[int] | None = None, seed: int = 0) -> ViewDataset:
@@ -227,10 +242,12 @@ class ViewDataset:
         """Decode every picture once. Raises the errors of :meth:`ViewSet.check`. Of the held-out pictures, all may be empty."""
         self.train.check()
         self.test.check(may_be_empty=True)
+        if self.turned is not None:
+            self.turned.turned.check(may_be_empty=True)
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 over both splits' fingerprints."""
+        """SHA-256 over both splits' fingerprints; the second pictures of ``turned`` do not count."""
         return sha256((self.train.fingerprint + self.test.fingerprint).encode()).hexdigest()
 
 

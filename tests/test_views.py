@@ -20,6 +20,7 @@ from bbfit.fitting.loop import fit
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, write_png
+from bbfit.layout import TURNED_FILE, write_turned
 from bbfit.operators.drawing.reference import render_reference
 from bbfit.views import ViewDataset
 
@@ -96,6 +97,50 @@ def test_nerfstudio_split_is_kept(folder: Path) -> None:
     (folder / "transforms.json").write_text(json.dumps(train | names | {"frames": train["frames"] + test["frames"]}))
     views = ViewDataset.load(folder)
     assert [f"./images/{name}" for name in views.test.names] == names["test_filenames"] and len(views.train) == 14
+
+
+@pytest.fixture
+def turned(folder: Path) -> Path:
+    """The folder with second pictures of the test views 2 and 0, in this order."""
+    test = ViewDataset.load(folder).test
+    cameras = test.cameras[[2, 0]].turned(1, torch.tensor([0.1, 0.0, 0.2]))
+    paths = [f"images/turned_{test.names[index]}.png" for index in (2, 0)]
+    for path, index in zip(paths, (1, 3), strict=True):
+        shutil.copy(test.paths[index], folder / path)
+    write_turned(folder, cameras, paths, [f"images/{test.names[index]}.png" for index in (2, 0)])
+    return folder
+
+
+def test_turned_views_go_with_their_views(turned: Path, views_folder: Path) -> None:
+    views, plain = ViewDataset.load(turned), ViewDataset.load(views_folder)
+    assert views.turned is not None and plain.turned is None
+    pairs, test = views.turned, views.test
+    assert pairs.views.names == [test.names[2], test.names[0]]
+    assert pairs.turned.names == [f"turned_{name}" for name in pairs.views.names]
+    assert torch.equal(pairs.views.cameras.world_to_camera, test.cameras.world_to_camera[[2, 0]])
+    expected = test.cameras[[2, 0]].turned(1, torch.tensor([0.1, 0.0, 0.2]))
+    torch.testing.assert_close(pairs.turned.cameras.world_to_camera, expected.world_to_camera, rtol=0, atol=1e-12)
+    torch.testing.assert_close(pairs.turned.cameras.intrinsics, expected.intrinsics, rtol=0, atol=1e-9)
+    assert all(torch.equal(pairs.turned.image(number), test.image(index)) for number, index in enumerate((1, 3)))
+    assert views.fingerprint == plain.fingerprint  # so fits stay current
+    views.check()
+
+
+@pytest.mark.parametrize("of", ["./images/0000_none", None, 3, ["a"]])
+def test_turned_from_no_held_out_view_is_refused(turned: Path, of: object) -> None:
+    edit(turned, lambda content: content["frames"][1].update(turned_from=of), ("turned",))
+    with pytest.raises(InputError, match=rf"frame 1 of .*{TURNED_FILE} is turned from no held-out view; render the views anew"):
+        ViewDataset.load(turned)
+
+
+def test_damaged_turned_pictures_are_named(turned: Path) -> None:
+    path = next((turned / "images").glob("turned_*"))
+    write_png(path, np.zeros((40, 30, 4), np.uint8))
+    with pytest.raises(InputError, match=f"{path.name} is 30x40"):
+        ViewDataset.load(turned)
+    path.unlink()
+    with pytest.raises(MissingFileError, match=path.name):
+        ViewDataset.load(turned)
 
 
 def test_pictures_in_memory_stay_within_the_bound(views_folder: Path) -> None:

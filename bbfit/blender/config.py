@@ -29,6 +29,9 @@ class ViewsConfig:
     """Number of pictures; steep rings of cameras get fewer of them, and a random quarter of each ring is held out for the score."""
     size: Annotated[int, Range(11, 16384)] = 384
     """Width and height of a picture in pixels."""
+    turned: Annotated[int, Range(0)] = 6
+    """Number of held-out views, spread evenly, of which there is a second picture from a camera turned by one degree around the tree;
+    they show how much the tree itself changes, which the score of shimmer needs. 0 for none."""
     elevations: tuple[_Elevation, ...] | None = None
     """Elevation of each ring of cameras: its angle above the horizon, in degrees.
     Default: a dome, 0 20 40 60 80; for the preset thesis, one ring at eye level, 0."""

@@ -28,7 +28,7 @@ PICTURES_FILE = "pictures.json"
 FILTER_REACH = 2.0
 """How far, in pixels, the filter of Cycles spreads a surface beyond its outline. The Blackman-Harris filter reaches 1.5 pixels."""
 # The options of views that explicit cameras replace.
-_UNUSED = ("count", "size", "elevations", "fov_degrees", "orthographic", "axis")
+_UNUSED = ("count", "size", "elevations", "fov_degrees", "orthographic", "axis", "turned")
 # The largest difference in pixels between a camera's intrinsics and those that Blender can represent.
 _INTRINSICS_TOLERANCE = 1e-6
 

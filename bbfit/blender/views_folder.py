@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from bbfit.blender.request import ViewsRequest
 from bbfit.checks import fail
 from bbfit.files import remove_parts
 from bbfit.geometry.camera import Camera
-from bbfit.layout import REQUEST_FILE, SINGLE_FILE, TEST_FILE, TRAIN_FILE, split_rings, write_transforms
+from bbfit.layout import REQUEST_FILE, SINGLE_FILE, TEST_FILE, TRAIN_FILE, TURNED_FILE, split_rings, write_transforms, write_turned
 from bbfit.outputs import Written, claimed_folder, output_folder
 from bbfit.tree_files.tree_file import TreeFile
 
@@ -26,6 +26,8 @@ __all__ = ["BlenderError", "render_views"]
 
 # A tree is invisible from the side from which it is less wide than this.
 _LEAST_PIXELS = 1e-4
+# Angle between a view and its second picture, in degrees.
+_TURN = 1.0
 
 
 def render_views(
@@ -39,7 +41,9 @@ def render_views(
 
     Writes ``images/0000.png`` and so on (straight-alpha RGBA), ``transforms_train.json``, ``transforms_test.json`` and ``views.json``
     (the request and the measurements of the tree, with ``"complete": true`` once all views are rendered). The transforms are written
-    last, so an unfinished folder has none. Every picture contains every vertex. A second call with the same tree and options renders only
+    last, so an unfinished folder has none. Every picture contains every vertex. Of ``config.turned`` held-out views there is a second
+    picture, ``images/turned_0003.png`` for view 3, from a camera turned by one degree around the tree, with the same seed;
+    ``transforms_turned.json`` lists them. A second call with the same tree and options renders only
     missing and damaged views. Workers and device may differ.
 
     Parameters
@@ -50,7 +54,7 @@ def render_views(
     out
         The folder for the views. It is created if it does not exist.
     on_progress
-        Called with the number of finished views and the total number, at the start and after each view.
+        Called with the number of finished pictures and the total number, at the start and after each picture.
 
     Returns
     -------
@@ -78,14 +82,20 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
     earlier = _earlier(out, request)  # again, because another process may just have written it
     images = out / "images"
     paths = [images / f"{index:04}.png" for index in range(config.count)]
+    train, test = split_rings(config.orbit.ring_counts, config.seed)
+    turned = _spread(test, config.turned)
+    turned_paths = [path.with_stem(f"turned_{path.stem}") for path in paths]
     missing = [index for index, path in enumerate(paths) if not is_intact(path, config.size)]
-    if earlier and earlier.complete and not missing and (out / TRAIN_FILE).is_file() and (out / TEST_FILE).is_file():
-        report(config.count, config.count)
+    missing_turned = [index for index in turned if not is_intact(turned_paths[index], config.size)]
+    transforms = [TRAIN_FILE, TEST_FILE, *([TURNED_FILE] if turned else [])]
+    total, left = config.count + len(turned), len(missing) + len(missing_turned)
+    if earlier and earlier.complete and not left and all((out / name).is_file() for name in transforms):
+        report(total, total)
         return
 
     started, spent = time.monotonic(), earlier.seconds if earlier else 0.0
     require_bpy()
-    with BlenderPool(worker_settings(tree, config, config.size, len(missing))) as pool:
+    with BlenderPool(worker_settings(tree, config, config.size, left)) as pool:
         measured = pool.load()
         points = to_y_up(measured["payload"])
         camera, target, distance = _cameras(points, config)
@@ -98,7 +108,8 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
         )
         output_folder("out", images)
         remove_parts(images)
-        written, files = Written(out), [REQUEST_FILE, TRAIN_FILE, TEST_FILE, *(f"images/{paths[index].name}" for index in missing)]
+        pictures = [*(paths[index] for index in missing), *(turned_paths[index] for index in missing_turned)]
+        written, files = Written(out), [REQUEST_FILE, *transforms, *(f"images/{path.name}" for path in pictures)]
         if earlier:
             written.adopt("views", written.digests([name for name in files if (out / name).is_file()]))
         written.begin("views", files, [*tree.files, *([config.hdri] if config.hdri else [])])
@@ -109,16 +120,26 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
 
         def on_done(done: int) -> None:
             save()
-            report(done, config.count)
+            report(done, total)
 
-        finished = config.count - len(missing)
+        finished = total - left
         on_done(finished)
         clips = [clip_distances(points, camera.position[0])] * config.count
-        pool.render(frames(camera, paths, missing, clips, config.seed), config.render_workers, finished, on_done)
-    train, test = split_rings(config.orbit.ring_counts, config.seed)
-    write_transforms(out, camera, [f"images/{path.name}" for path in paths], train, test)
+        neighbors = camera.turned(_TURN, target)
+        requests = frames(camera, paths, missing, clips, config.seed) + frames(neighbors, turned_paths, missing_turned, clips, config.seed)
+        pool.render(requests, config.render_workers, finished, on_done)
+    names, turned_names = ([f"images/{path.name}" for path in each] for each in (paths, turned_paths))
+    if turned:
+        write_turned(out, neighbors[turned], [turned_names[index] for index in turned], [names[index] for index in turned])
+    write_transforms(out, camera, names, train, test)
     save(complete=True)
-    written.finish("views", written.digests([REQUEST_FILE, TRAIN_FILE, TEST_FILE, "images/*.png"]))
+    written.finish("views", written.digests([REQUEST_FILE, *transforms, "images/*.png"]))
+
+
+def _spread(indices: Sequence[int], count: int) -> list[int]:
+    """At most ``count`` of the indices, evenly spread over them."""
+    count = min(count, len(indices))
+    return [indices[(2 * number + 1) * len(indices) // (2 * count)] for number in range(count)]
 
 
 def _earlier(out: Path, request: ViewsRequest) -> ViewsRequest | None:

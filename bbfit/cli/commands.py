@@ -218,7 +218,14 @@ def evaluate_command(
     use = claimed_folder if out == earlier else used_folder  # no other process may be at work in the run's folder
     with use("out", out.parent) as folder, single_files("evaluate", folder, [out.name], inputs):
         with progress() as on_progress:
-            report = evaluate(billboards, dataset.test, export=export, original=original, on_progress=partial(on_progress, "evaluate"))
+            report = evaluate(
+                billboards,
+                dataset.test,
+                export=export,
+                original=original,
+                turned=dataset.turned,
+                on_progress=partial(on_progress, "evaluate"),
+            )
         report = replace(report, seconds={**seconds, **report.seconds})
         report.save(out)
     out_console.print(report_table(report, thesis=False))

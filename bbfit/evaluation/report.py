@@ -69,6 +69,23 @@ class SizeScore:
 
 
 @dataclass(frozen=True)
+class ShimmerScore:
+    """How much the exported model changes when the camera turns by a degree, in pictures of one size (:mod:`bbfit.evaluation.shimmer`)."""
+
+    width: int
+    """Width of the pictures in pixels."""
+    height: int
+    """Height of the pictures in pixels."""
+    tree: float
+    """The tree's own mean absolute change, over pixels, channels, pairs of views and
+    :data:`bbfit.evaluation.backgrounds.BACKGROUNDS`, in [0, 1]."""
+    ratio: float | None
+    """The model's change over the tree's: above 1 flickers more than the tree; ``None`` if the tree does not change."""
+    antialiased: float | None = None
+    """The same ratio of a mask that is drawn with alpha to coverage; ``None`` for other alpha modes."""
+
+
+@dataclass(frozen=True)
 class Cost:
     """A cost of the model and of the original tree; ``None`` where it is unknown."""
 
@@ -110,6 +127,8 @@ class Report:
     scores are those of its hard edges; ``None`` for other alpha modes."""
     shaded: float | None = None
     """Fragments that a graphics card shades over the pixels that the targets cover (:func:`bbfit.evaluation.scoring.score_shading`)."""
+    shimmer: tuple[ShimmerScore, ...] = ()
+    """The change between neighboring views in smaller and smaller pictures, the largest first; empty if the views have no neighbors."""
 
     @property
     def mean(self) -> Measures:
@@ -145,6 +164,7 @@ class Report:
             "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw", "shaded",
             "antialiased": {the same measures} or None, "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
             "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
+            "shimmer": [{"width", "height", "tree", "ratio", "antialiased"}],
             "rings": [{"elevation_degrees", "views", and the same measures}],
             "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures}]}``
         """
@@ -157,6 +177,7 @@ class Report:
             "alpha": {"mode": self.alpha.kind, "cutoff": self.alpha.cutoff},
             "seconds": dict(self.seconds),
             "sizes": [asdict(size) for size in self.sizes],
+            "shimmer": [asdict(size) for size in self.shimmer],
             "rings": [ring.to_json() for ring in self.rings],
             "views": [view.to_json() for view in self.views],
         }
@@ -186,7 +207,10 @@ class Report:
             afar = tuple(SizeScore(**size) for size in content["sizes"])
             shaded = content["shaded"]
             antialiased = None if content["antialiased"] is None else Measures.from_json(content["antialiased"])
-            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, antialiased, shaded)
+            shimmer = tuple(ShimmerScore(**size) for size in content["shimmer"])
+            report = Report(
+                scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, antialiased, shaded, shimmer
+            )
             if not scores:
                 raise ValueError("it has no views")
             check_record("report", report, Report)

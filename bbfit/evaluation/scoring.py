@@ -15,6 +15,7 @@ from bbfit.evaluation import metrics, thesis_scale
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale, mean_measures
 from bbfit.evaluation.report import Cost, Report, ViewScore
+from bbfit.evaluation.shimmer import score_shimmer
 from bbfit.evaluation.sizes import HALVINGS, score_sizes
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import ShippedModel, shipped_model
@@ -22,7 +23,7 @@ from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.cards import fragments
-from bbfit.views import ViewSet
+from bbfit.views import TurnedViews, ViewSet
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ def evaluate(
     *,
     export: ExportConfig | None = None,
     original: OriginalTree | None = None,
+    turned: TurnedViews | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Report:
     """Measure a billboard cloud, as it is exported, against views that it was not fitted to.
@@ -62,6 +64,8 @@ def evaluate(
         How the model is exported. By default as ``bbfit export`` does without options, in the alpha mode that the cloud was fitted for.
     original : OriginalTree
         The size of the original tree. Without it the report has no ratios.
+    turned : TurnedViews
+        Pairs of neighboring views, ``ViewDataset.turned``. Without them the report has no shimmer.
     on_progress : callable
         Called with the number of finished pictures or picture sizes and their total.
 
@@ -75,7 +79,7 @@ def evaluate(
     InputError
         if there are no views or they are too small, if the cloud is empty, or if it draws numbers that are not finite.
     """
-    return evaluate_model(shipped_model(cloud, export), views, original=original, on_progress=on_progress)
+    return evaluate_model(shipped_model(cloud, export), views, original=original, turned=turned, on_progress=on_progress)
 
 
 def evaluate_model(
@@ -83,12 +87,13 @@ def evaluate_model(
     views: ViewSet,
     *,
     original: OriginalTree | None = None,
+    turned: TurnedViews | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Report:
     """Do what :func:`evaluate` does for a model whose polygons or file may already be computed."""
     started, original, on_progress = time.perf_counter(), original or OriginalTree(), on_progress or (lambda done, total: None)
     models = [model] if model.cloud.alpha.kind != "mask" else [model, model.antialiased()]
-    total, scored = len(models) * len(views) + HALVINGS + 1, list[tuple[ViewScore, ...]]()
+    total, scored = len(models) * len(views) + HALVINGS + 1 + (turned is not None), list[tuple[ViewScore, ...]]()
     for each in models:
         before = len(scored) * len(views)
         scored.append(
@@ -99,6 +104,8 @@ def evaluate_model(
             )
         )
     sizes = score_sizes(model.draw, views, on_size=lambda done, _: on_progress(len(models) * len(views) + done, total))
+    shimmer = () if turned is None else score_shimmer(model.draw, turned, models[1].draw if len(models) > 1 else None)
+    on_progress(total, total)
     return Report(
         views=scored[0],
         vertices=Cost(model.cards.vertex_count, original.vertices),
@@ -108,6 +115,7 @@ def evaluate_model(
         sizes=sizes,
         antialiased=mean_measures([view.measures for view in scored[1]]) if len(models) > 1 else None,
         shaded=score_shading(model.cards, views),
+        shimmer=shimmer,
         seconds={"evaluate": time.perf_counter() - started},
     )
 

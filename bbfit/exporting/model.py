@@ -44,8 +44,12 @@ class ShippedModel:
 
     @cached_property
     def cards(self) -> Cards:
-        """The polygons, split and trimmed as the options request, and the mip levels if the files bring any."""
-        cards = cloud_cards(self.cloud, self.config.padding << self.halvings)
+        """The polygons, split and trimmed as the options request, and the mip levels if the files bring any.
+
+        They are those of the files, so they do not depend on whether a program smooths the edges of masks.
+        """
+        cloud = replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=False))
+        cards = cloud_cards(cloud, self.config.padding << self.halvings)
         if self.config.split and cards.alpha.kind == "blend":
             cards = split(cards)
         cards = reduced(cards, self.halvings)
@@ -72,12 +76,14 @@ class ShippedModel:
         faster and draws them. Trimmed outlines cut off nothing visible.
         """
         if self.config.has_mips or self.halvings:
-            return draw_cards(self.cards, camera)
+            return draw_cards(replace(self.cards, alpha=self.cloud.alpha), camera)
         return render(self.cloud, camera.to(self.cloud.texels.device))
 
     def antialiased(self) -> ShippedModel:
         """The same model as a program draws it that smooths the edges of masks by alpha to coverage."""
-        return replace(self, cloud=replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=True)))
+        model = replace(self, cloud=replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=True)))
+        vars(model)["cards"] = self.cards  # of the same files, so that they are not computed twice
+        return model
 
     def save(self, path: str | Path) -> list[Path]:
         """Write the files as :func:`export` does, with the same results and errors."""

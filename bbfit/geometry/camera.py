@@ -87,6 +87,16 @@ class Camera:
         intrinsics[..., :2, 2] += (scale - 1) / 2  # pixel centers lie at whole numbers, so the corner is at -1/2
         return Camera(self.world_to_camera, intrinsics, width, height, self.orthographic)
 
+    def turned(self, degrees: float, axis: Tensor) -> Camera:
+        """The same cameras turned around the vertical axis through a point, [3], counter-clockwise seen from above: to greater azimuths."""
+        angle = math.radians(degrees)
+        back = torch.eye(4, dtype=self.world_to_camera.dtype, device=self.world_to_camera.device)  # turns the world instead
+        back[0, 0] = back[2, 2] = math.cos(angle)
+        back[0, 2], back[2, 0] = -math.sin(angle), math.sin(angle)
+        axis = axis.to(back)
+        back[:3, 3] = axis - back[:3, :3] @ axis
+        return Camera(self.world_to_camera @ back, self.intrinsics, self.width, self.height, self.orthographic)
+
     @property
     def camera_to_world(self) -> Tensor:
         """Rigid transform from camera axes to the world, same shape as ``world_to_camera``."""

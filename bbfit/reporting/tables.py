@@ -83,6 +83,14 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
         for size in report.sizes:
             table.add_row(f"{size.width} x {size.height} pixels", f"{_UP} {_ONE}", f"{size.psnr:.2f}", "", _share(size.coverage), "")
 
+    if report.shimmer:
+        table.add_section()
+        smooth_title = "" if report.shimmer[0].antialiased is None else "alpha to\ncoverage"
+        table.add_row("shimmer, over the tree's", "", "", "", "ratio", smooth_title, style="bold")
+        for one in report.shimmer:
+            smooth_ratio = "" if one.antialiased is None else _share(one.antialiased)
+            table.add_row(f"{one.width} x {one.height} pixels", _ONE, "", "", _share(one.ratio), smooth_ratio)
+
     table.add_section()
     table.add_row("cost", "", "model", "", "original", Text("ratio", style="not dim"), style="bold")
     for name, cost in (("vertices", report.vertices), ("file, bytes", report.bytes)):

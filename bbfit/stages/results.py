@@ -50,12 +50,14 @@ def evaluate_stage(folder: Path, model: ShippedModel, views: ViewDataset, tree: 
     """
 
     def work(on_progress: OnProgress) -> None:
-        report = evaluate_model(model, views.test, original=original_tree(views, tree), on_progress=partial(on_progress, "evaluate"))
+        original, progress = original_tree(views, tree), partial(on_progress, "evaluate")
+        report = evaluate_model(model, views.test, original=original, turned=views.turned, on_progress=progress)
         replace(report, seconds={**seconds, **report.seconds}).save(folder / "metrics.json")
         comparison_picture(model, views.test, folder / "comparison.png")
 
     results = [digest_file(folder / name) for name in ("cloud.safetensors", "model.glb")]
-    inputs = (results, model.cloud.alpha, views.fingerprint, None if tree is None else tree.digest)
+    turned = None if views.turned is None else (views.turned.views.fingerprint, views.turned.turned.fingerprint)
+    inputs = (results, model.cloud.alpha, views.fingerprint, turned, None if tree is None else tree.digest)
     return Stage("evaluate", inputs, EVALUATE_OUTPUTS, work)
 
 

@@ -42,7 +42,7 @@ def on_progress(done, total):
     print(done, flush=True)
     if done == int(hold):
         sys.stdin.readline()
-config = ViewsConfig(count=4, size=int(size), samples=int(samples), denoise=False, render_workers=int(workers))
+config = ViewsConfig(count=4, size=int(size), samples=int(samples), denoise=False, elevations=(0.0,), turned=0, render_workers=int(workers))
 render_views(tree, out, config, on_progress=on_progress)
 """
 

@@ -24,7 +24,7 @@ from bbfit.trees.tree_writer import write_tree
 from bbfit.views import ViewDataset
 
 TREE = Path(__file__).resolve().parents[2] / "data" / "tree.glb"
-FAST = {"count": 8, "size": 32, "samples": 4, "denoise": False}
+FAST = {"count": 8, "size": 32, "samples": 4, "denoise": False, "turned": 0}
 FIT = FitConfig(billboards=2, candidates=1, refinement_rounds=0, steps=4)
 
 

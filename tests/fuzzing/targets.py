@@ -11,7 +11,7 @@ import struct
 import tempfile
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from bbfit.blender.request import RenderedTree, ViewsRequest
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
-from bbfit.evaluation.report import Cost, Report, SizeScore, ViewScore
+from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeScore, ViewScore
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
@@ -37,7 +37,7 @@ from bbfit.geometry.orbit import Orbit
 from bbfit.glb import gltf_parts
 from bbfit.images import encode_png, picture_header, read_rgba, to_bytes, unpremultiply
 from bbfit.inputs import InputLimits
-from bbfit.layout import REQUEST_FILE, TEST_FILE, TRAIN_FILE, split_views, write_transforms
+from bbfit.layout import REQUEST_FILE, TEST_FILE, TRAIN_FILE, TURNED_FILE, split_views, write_transforms, write_turned
 from bbfit.operators.drawing.reference import render_reference
 from bbfit.stages.billboards import read_choice
 from bbfit.stages.stage import Record
@@ -100,19 +100,21 @@ def _camera() -> Camera:
 
 @functools.cache
 def views_files() -> Files:
-    """A folder of five views."""
+    """A folder of five views, and a second picture of one of them."""
     camera, cloud = _camera(), small_cloud()
     names = [f"images/{index:04}.png" for index in range(len(camera))]
     pictures = [encode_png(to_bytes(unpremultiply(render_reference(cloud, camera[index])))) for index in range(len(camera))]
     with tempfile.TemporaryDirectory() as folder:
-        write_transforms(Path(folder), camera, names, *split_views(len(camera), 0))
-        texts = {name: (Path(folder) / name).read_bytes() for name in (TRAIN_FILE, TEST_FILE)}
+        train, test = split_views(len(camera), 0)
+        write_transforms(Path(folder), camera, names, train, test)
+        write_turned(Path(folder), camera[test[:1]], [names[train[0]]], [names[test[0]]])
+        texts = {name: (Path(folder) / name).read_bytes() for name in (TRAIN_FILE, TEST_FILE, TURNED_FILE)}
     return dict(zip(names, pictures, strict=True)) | texts
 
 
 def _read_views(folder: Path) -> None:
     views = ViewDataset.load(folder)
-    views.train.check()
+    views.check()
     assert len(views.fingerprint) == 64
 
 
@@ -122,11 +124,11 @@ def _fit_views(folder: Path) -> None:
 
 def _transforms(draw: st.DrawFn) -> Files:
     files = dict(views_files())
-    name = draw(st.sampled_from([TRAIN_FILE, TEST_FILE]))
+    name = draw(st.sampled_from([TRAIN_FILE, TEST_FILE, TURNED_FILE]))
     files[name] = dumped(draw(documents(json.loads(files[name]))))
     if draw(st.integers(0, 9)) == 0:
         files["transforms.json"] = files.pop(TRAIN_FILE)
-        del files[TEST_FILE]
+        del files[TEST_FILE], files[TURNED_FILE]
     return files
 
 
@@ -440,6 +442,7 @@ def _report() -> dict[str, Any]:
     measures = Measures(Over(over, over, over, over), Rgba(0.1, 20.0, 0.9), ThesisScale(0.1, 0.9, 90.0, 10.0), colour, 0.9, None)
     scores = tuple(ViewScore(name, 90.0, 0.0, measures) for name in ("0001", "0002"))
     report = Report(scores, Cost(8, 1000), Cost(1000, 10_000), {"fit": 1.0}, small_cloud().alpha, 1.5, (SizeScore(8, 8, 30.0, None, 0.1),))
+    report = replace(report, shimmer=(ShimmerScore(8, 8, 0.1, 1.2, None),))
     return report.to_json()
 
 

@@ -169,6 +169,23 @@ def test_convergence_point_of_an_orbit_is_its_target(elevations: tuple[float, ..
     assert torch.allclose(convergence_point(camera), target, atol=1e-9)
 
 
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("degrees", [1.0, -30.0, 90.0])
+def test_a_turned_camera_sees_what_it_saw_of_a_turned_world(degrees: float, orthographic: bool) -> None:
+    """Also from straight above. Its azimuth grows, and its distance from the axis and its height stay."""
+    axis, points = torch.tensor([0.4, 1.0, -0.3]).double(), torch.randn(40, 3, generator=torch.Generator().manual_seed(0)).double()
+    fov = None if orthographic else 40.0
+    camera = Orbit(9, (0.0, 40.0, 90.0)).frame(points.numpy(), target=axis, width=30, height=20, fov_x_degrees=fov)
+    turned, angle = camera.turned(degrees, axis), math.radians(degrees)
+    turn = [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+    rotation = torch.tensor(turn, dtype=torch.float64)
+    torch.testing.assert_close(turned.project((points - axis) @ rotation.mT + axis), camera.project(points), rtol=0, atol=1e-9)
+    torch.testing.assert_close(turned.position - axis, (camera.position - axis) @ rotation.mT, rtol=0, atol=1e-9)
+    assert (turned.orthographic, turned.width, turned.height) == (orthographic, 30, 20)
+    (x, _, z), (new_x, _, new_z) = (one.position[1] - axis for one in (camera, turned))
+    assert (math.atan2(new_x, new_z) - math.atan2(x, z) - angle + math.pi) % (2 * math.pi) == pytest.approx(math.pi)
+
+
 def test_convergence_point_needs_two_directions() -> None:
     camera = Camera(torch.eye(4).repeat(3, 1, 1), torch.eye(3).repeat(3, 1, 1), 8, 8)
     with pytest.raises(InputError, match="around the tree"):
