@@ -9,6 +9,7 @@ from typing import Any
 
 from bbfit.checks import check_file, check_record
 from bbfit.evaluation.measures import Measures, mean_measures
+from bbfit.evaluation.trunk import TrunkScore
 from bbfit.files import read_json, write_json
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.inputs import reading
@@ -108,6 +109,8 @@ class Report:
     antialiased: Measures | None = None
     """The means over the views of a mask that is drawn with alpha to coverage (:class:`~bbfit.geometry.alpha.AlphaMode`), while all other
     scores are those of its hard edges; ``None`` for other alpha modes."""
+    trunk: TrunkScore | None = None
+    """The trunk below the crown, or ``None`` if no view from near the horizon shows one."""
 
     @property
     def mean(self) -> Measures:
@@ -141,7 +144,9 @@ class Report:
             "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
             "colour": {"delta_e", "chroma", "brightness", "target", "render", "target_inside", "render_inside"},
             "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw",
-            "antialiased": {the same measures} or None, "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
+            "antialiased": {the same measures} or None,
+            "trunk": {"iou", "worst_iou", "delta_e", "worst_view", "views": [{"name", "iou", "delta_e"}]} or None,
+            "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
             "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
             "rings": [{"elevation_degrees", "views", and the same measures}],
             "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures}]}``
@@ -151,6 +156,7 @@ class Report:
             "bytes": self.bytes.to_json(),
             "overdraw": self.overdraw,
             "antialiased": None if self.antialiased is None else self.antialiased.to_json(),
+            "trunk": None if self.trunk is None else self.trunk.to_json(),
             "alpha": {"mode": self.alpha.kind, "cutoff": self.alpha.cutoff},
             "seconds": dict(self.seconds),
             "sizes": [asdict(size) for size in self.sizes],
@@ -182,7 +188,8 @@ class Report:
             )
             afar = tuple(SizeScore(**size) for size in content["sizes"])
             antialiased = None if content["antialiased"] is None else Measures.from_json(content["antialiased"])
-            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, antialiased)
+            trunk = None if content["trunk"] is None else TrunkScore.from_json(content["trunk"])
+            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, antialiased, trunk)
             if not scores:
                 raise ValueError("it has no views")
             check_record("report", report, Report)
