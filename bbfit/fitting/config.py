@@ -21,7 +21,7 @@ _Binarization = Annotated[float, Range(0, 10)]
 _Density = Annotated[float, Range(0, 16, open_low=True)]
 _Rate = Annotated[float, Range(0, 10, open_low=True)]
 _Bits = Annotated[int, Range(1, 8)]
-_Rounds = Annotated[int, Range(0)]
+_Number = Annotated[int, Range(0)]
 _Sharpness = Annotated[float, Range(0, 1000)]
 _Unit = Annotated[float, Range(0, 1)]
 _Decay = Annotated[float, Range(0, 0.9999)]
@@ -108,12 +108,15 @@ class FitConfig:
     Preset: clusters; thesis: even."""
     orientation: Orientation = "any"
     """Orientation of clustered billboards: upright, in any direction (free), or whichever of the two fits better (any)."""
+    trunk_billboards: _Number = 0
+    """Number of billboards, out of all, that cross in the trunk below the crown; for clusters, and trees with such a trunk.
+    They make the trunk of a few billboards more whole. Of sixteen or more, the others show it as well."""
     restarts: Count | None = None
     """Independent searches for a placement; the best result is kept. Default: two for eight to eleven billboards, else one."""
     candidates: Count | None = None
     """Clusterings that a search compares; more take longer and may find a better placement.
     Default: 12, or 4 for twelve billboards or more, of which any clustering is about as good as any other."""
-    refinement_rounds: _Rounds | None = None
+    refinement_rounds: _Number | None = None
     """Rounds that refine the best placement by moving, splitting and merging billboards.
     Default: three fewer than there are billboards, at least one and at most six; none for twelve billboards or more."""
     placement_learning_rate: _Unit | None = None
@@ -253,5 +256,8 @@ class ResolvedFit(FitConfig):
         textures = (self.billboards or self.most_billboards) * (1 if self.sides == "one" else 2)
         if self.max_texels is not None and self.max_texels < textures:
             fail("max_texels", f"{self.max_texels} are too few for {textures} textures", "allow more")
+        fewest = self.billboards or self.least_billboards
+        if self.placement == "clusters" and self.trunk_billboards >= fewest:
+            fail("trunk_billboards", f"{self.trunk_billboards} of {fewest} billboards leave none for the crown", "allow fewer")
         if self.sides == "pair" and self.placement == "clusters":
             fail("sides", "pairs need an even placement around an axis", "add --placement even, or choose one or two")

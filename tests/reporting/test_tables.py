@@ -7,6 +7,7 @@ from rich.console import Console
 
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.report import Cost, Report, SizeScore, ViewScore
+from bbfit.evaluation.trunk import TrunkScore, TrunkView
 from bbfit.reporting.tables import report_table
 
 OTHER = OverBackground(17.234, 0.7125, 0.2061)
@@ -25,6 +26,7 @@ REPORT = Report(
     Cost(123_456, None),
     {"views": 1234.56, "fit": 60, "export": 0.4, "evaluate": 15.04},
     sizes=(SizeScore(1024, 1024, 19.87, 1.012, 0.1),),
+    trunk=TrunkScore((TrunkView("0000", 0.9312, 2.5), TrunkView("0001", 0.8512, 1.5))),
 )
 
 
@@ -35,7 +37,7 @@ def test_every_figure_is_there_and_nothing_is_cut(width: int) -> None:
         console.print(report_table(REPORT, "willow"))
     text = capture.get()
     for figure in (
-        "willow: mean of 2", "18.23", "0.7375", "0.1811", "0.00", "1.000", "0.800", "19.87", "1.012",
+        "willow: mean of 2", "18.23", "0.7375", "0.1811", "0.00", "1.000", "0.800", "19.87", "1.012", "0.8912, 0.8512",
         "21.23", "23.46", "92.605", "0.0712", "2.24e-05", "0.8125", "0.9999966", "17.280", "0.1061", "0.7345",
         "0.900", "10,525,153", "0.000304 %", "123,456", "views 1,234.6", "evaluate 15.0",
     ):  # fmt: skip
