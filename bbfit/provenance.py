@@ -22,7 +22,7 @@ VERSIONS: Mapping[str, int] = {
     "convert": 1,
     "views": 2,
     "budget": 5,
-    "fit": 10,
+    "fit": 11,
     "export": 3,
     "evaluate": 9,
     "report": 3,

@@ -31,6 +31,8 @@ EVEN = 8
 """Number of evenly placed billboards of the default preset."""
 # From so many billboards on, searches are short: different clusterings lead to nearly equal results.
 _MANY = 12
+# Billboards of the trunk's own when there are many. One of three crossed planes shows at least cos(30 degrees) = 87 % of the trunk's width.
+_TRUNK = 3
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "default": {
@@ -108,9 +110,9 @@ class FitConfig:
     Preset: clusters; thesis: even."""
     orientation: Orientation = "any"
     """Orientation of clustered billboards: upright, in any direction (free), or whichever of the two fits better (any)."""
-    trunk_billboards: _Number = 0
+    trunk_billboards: _Number | None = None
     """Number of billboards, out of all, that cross in the trunk below the crown; for clusters, and trees with such a trunk.
-    They make the trunk of a few billboards more whole. Of sixteen or more, the others show it as well."""
+    Default: 3 for twelve billboards or more, else none."""
     restarts: Count | None = None
     """Independent searches for a placement; the best result is kept. Default: two for eight to eleven billboards, else one."""
     candidates: Count | None = None
@@ -209,12 +211,13 @@ class FitConfig:
 
 
 def _effort(count: int | None) -> dict[str, Any]:
-    """The defaults that depend on the number of billboards: how long to search for a placement of them."""
+    """The defaults that depend on the number of billboards: how long to search for a placement, and how many show the trunk."""
     if count is None:
         return {}
     if count >= _MANY:
-        return {"restarts": 1, "candidates": 4, "refinement_rounds": 0}
-    return {"restarts": min(2, max(1, count // 4)), "candidates": 12, "refinement_rounds": min(6, max(1, count - 3))}
+        return {"restarts": 1, "candidates": 4, "refinement_rounds": 0, "trunk_billboards": _TRUNK}
+    rounds = min(6, max(1, count - 3))
+    return {"restarts": min(2, max(1, count // 4)), "candidates": 12, "refinement_rounds": rounds, "trunk_billboards": 0}
 
 
 class ResolvedFit(FitConfig):
@@ -257,7 +260,7 @@ class ResolvedFit(FitConfig):
         if self.max_texels is not None and self.max_texels < textures:
             fail("max_texels", f"{self.max_texels} are too few for {textures} textures", "allow more")
         fewest = self.billboards or self.least_billboards
-        if self.placement == "clusters" and self.trunk_billboards >= fewest:
+        if self.placement == "clusters" and (self.trunk_billboards or 0) >= fewest:
             fail("trunk_billboards", f"{self.trunk_billboards} of {fewest} billboards leave none for the crown", "allow fewer")
         if self.sides == "pair" and self.placement == "clusters":
             fail("sides", "pairs need an even placement around an axis", "add --placement even, or choose one or two")

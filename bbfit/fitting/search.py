@@ -77,7 +77,7 @@ def find_placement(
     ``on_progress`` is called after every step with the work done and the total work, in steps of one candidate. The result is float32 on
     the CPU and has fitted textures, with the texel density of pictures of about :data:`SIDE` pixels.
     """
-    on_progress, own = on_progress or (lambda done, total: None), config.trunk_billboards
+    on_progress, own = on_progress or (lambda done, total: None), config.trunk_billboards or 0
     trunk = trunk_points(points, views) if own else points.new_zeros(0)
     if len(trunk) == 0:
         return _Search(views, points, config, on_progress, effort).best()

@@ -122,8 +122,11 @@ def test_the_trunk_has_billboards_of_its_own_within_the_number_of_billboards() -
     assert len(find_placement(tree_views(hidden=True), points, asked, effort=brief)) == 5  # without a trunk, all are the crown's
 
 
-def test_the_trunk_has_no_billboards_of_its_own_unless_asked_and_never_all_of_them() -> None:
-    assert FitConfig().resolve().trunk_billboards == FitConfig(preset="thesis").resolve().trunk_billboards == 0
+def test_many_billboards_have_some_for_the_trunk_and_few_have_none_and_never_all() -> None:
+    assert [FitConfig(billboards=count).resolve().trunk_billboards for count in (4, 8, 11, 12, 32)] == [0, 0, 0, 3, 3]
+    assert FitConfig().resolve().counted(16).trunk_billboards == 3
+    assert FitConfig(trunk_billboards=0).resolve().counted(16).trunk_billboards == 0
+    assert FitConfig(preset="thesis").resolve().trunk_billboards == 0
     with pytest.raises(InputError, match="trunk_billboards: 3 of 3 billboards leave none for the crown"):
         FitConfig(billboards=3, trunk_billboards=3).resolve()
     with pytest.raises(InputError, match="trunk_billboards: 16 of 16 billboards"):
