@@ -223,7 +223,7 @@ def _effort(count: int | None) -> dict[str, Any]:
 class ResolvedFit(FitConfig):
     """A :class:`FitConfig` in which only ``max_texels`` may be ``None``, and, until the fit has chosen it, the number of billboards.
 
-    The length of the search depends on that number, and is then ``None`` too.
+    The length of the search and the number of the trunk's billboards depend on that number, and are then ``None`` too.
 
     Raises InputError if a value is missing, or values contradict each other.
     """
