@@ -22,10 +22,10 @@ VERSIONS: Mapping[str, int] = {
     "convert": 1,
     "views": 2,
     "budget": 5,
-    "fit": 10,
+    "fit": 11,
     "export": 4,
     "evaluate": 9,
-    "report": 2,
+    "report": 3,
     "lod": 2,
     "compare": 2,
 }

@@ -9,6 +9,7 @@ from typing import Any
 
 from bbfit.checks import check_file, check_record
 from bbfit.evaluation.measures import Measures, mean_measures
+from bbfit.evaluation.trunk import TrunkScore
 from bbfit.files import read_json, write_json
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.inputs import reading
@@ -129,6 +130,8 @@ class Report:
     """Fragments that a graphics card shades over the pixels that the targets cover (:func:`bbfit.evaluation.scoring.score_shading`)."""
     shimmer: tuple[ShimmerScore, ...] = ()
     """The change between neighboring views in smaller and smaller pictures, the largest first; empty if the views have no neighbors."""
+    trunk: TrunkScore | None = None
+    """The trunk below the crown, or ``None`` if no view from near the horizon shows one."""
 
     @property
     def mean(self) -> Measures:
@@ -162,7 +165,9 @@ class Report:
             "rgba": {"rmse", "psnr", "iou"}, "thesis_scale": {"rmse", "ssim", "psnr", "sre"},
             "colour": {"delta_e", "chroma", "brightness", "target", "render", "target_inside", "render_inside"},
             "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw", "shaded",
-            "antialiased": {the same measures} or None, "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
+            "antialiased": {the same measures} or None,
+            "trunk": {"iou", "worst_iou", "delta_e", "worst_view", "views": [{"name", "iou", "delta_e"}]} or None,
+            "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
             "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
             "shimmer": [{"width", "height", "tree", "ratio", "antialiased"}],
             "rings": [{"elevation_degrees", "views", and the same measures}],
@@ -174,6 +179,7 @@ class Report:
             "overdraw": self.overdraw,
             "shaded": self.shaded,
             "antialiased": None if self.antialiased is None else self.antialiased.to_json(),
+            "trunk": None if self.trunk is None else self.trunk.to_json(),
             "alpha": {"mode": self.alpha.kind, "cutoff": self.alpha.cutoff},
             "seconds": dict(self.seconds),
             "sizes": [asdict(size) for size in self.sizes],
@@ -207,9 +213,10 @@ class Report:
             afar = tuple(SizeScore(**size) for size in content["sizes"])
             shaded = content["shaded"]
             antialiased = None if content["antialiased"] is None else Measures.from_json(content["antialiased"])
+            trunk = None if content["trunk"] is None else TrunkScore.from_json(content["trunk"])
             shimmer = tuple(ShimmerScore(**size) for size in content["shimmer"])
             report = Report(
-                scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, antialiased, shaded, shimmer
+                scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, antialiased, shaded, shimmer, trunk
             )
             if not scores:
                 raise ValueError("it has no views")

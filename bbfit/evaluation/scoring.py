@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rg
 from bbfit.evaluation.report import Cost, Report, ViewScore
 from bbfit.evaluation.shimmer import score_shimmer
 from bbfit.evaluation.sizes import HALVINGS, score_sizes
+from bbfit.evaluation.trunk import TrunkView, measure_trunk, trunk_score
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.geometry.camera import Camera
@@ -94,11 +96,19 @@ def evaluate_model(
     started, original, on_progress = time.perf_counter(), original or OriginalTree(), on_progress or (lambda done, total: None)
     models = [model] if model.cloud.alpha.kind != "mask" else [model, model.antialiased()]
     total, scored = len(models) * len(views) + HALVINGS + 1 + (turned is not None), list[tuple[ViewScore, ...]]()
+    trunks, names, elevations = list[TrunkView | None](), views.names, view_angles(views.cameras)[:, 1].tolist()
+
+    def drawn(each: ShippedModel, index: int) -> Tensor:
+        target, image = held_out(each.draw, views, index)
+        if each is model:
+            trunks.append(measure_trunk(names[index], elevations[index], target, image))
+        return image
+
     for each in models:
         before = len(scored) * len(views)
         scored.append(
             score_views(
-                lambda index, draw=each.draw: held_out(draw, views, index)[1],  # type: ignore[misc]
+                partial(drawn, each),
                 views,
                 on_view=lambda done, _, before=before: on_progress(before + done, total),  # type: ignore[misc]
             )
@@ -116,6 +126,7 @@ def evaluate_model(
         antialiased=mean_measures([view.measures for view in scored[1]]) if len(models) > 1 else None,
         shaded=score_shading(model.cards, views),
         shimmer=shimmer,
+        trunk=trunk_score(trunks),
         seconds={"evaluate": time.perf_counter() - started},
     )
 

@@ -21,7 +21,7 @@ _Binarization = Annotated[float, Range(0, 10)]
 _Density = Annotated[float, Range(0, 16, open_low=True)]
 _Rate = Annotated[float, Range(0, 10, open_low=True)]
 _Bits = Annotated[int, Range(1, 8)]
-_Rounds = Annotated[int, Range(0)]
+_Number = Annotated[int, Range(0)]
 _Sharpness = Annotated[float, Range(0, 1000)]
 _Unit = Annotated[float, Range(0, 1)]
 _Decay = Annotated[float, Range(0, 0.9999)]
@@ -31,6 +31,8 @@ EVEN = 8
 """Number of evenly placed billboards of the default preset."""
 # From so many billboards on, searches are short: different clusterings lead to nearly equal results.
 _MANY = 12
+# Billboards of the trunk's own when there are many. One of three crossed planes shows at least cos(30 degrees) = 87 % of the trunk's width.
+_TRUNK = 3
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "default": {
@@ -79,7 +81,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
 # Values of the default preset that depend on the alpha mode. A cutoff leaves no half-transparent texels that could smooth an edge, and
 # stochastic alpha is the noisier the more of them there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
-    "mask": {"colors": "views", "antialiased": True, "texel_density": 0.85, "sharpness_weight": 8.0, "binarization_weight": 0.02},
+    "mask": {"colors": "views", "antialiased": True, "texel_density": 0.8, "sharpness_weight": 8.0, "binarization_weight": 0.02},
     "blend": {"colors": "matched", "antialiased": False, "texel_density": 1.0, "sharpness_weight": 14.0, "binarization_weight": 0.004},
     "hash": {"colors": "views", "antialiased": False, "texel_density": 1.0, "sharpness_weight": 14.0, "binarization_weight": 0.03},
 }
@@ -108,12 +110,15 @@ class FitConfig:
     Preset: clusters; thesis: even."""
     orientation: Orientation = "any"
     """Orientation of clustered billboards: upright, in any direction (free), or whichever of the two fits better (any)."""
+    trunk_billboards: _Number | None = None
+    """Number of billboards, out of all, that cross in the trunk below the crown; for clusters, and trees with such a trunk.
+    Default: 3 for twelve billboards or more, else none."""
     restarts: Count | None = None
     """Independent searches for a placement; the best result is kept. Default: two for eight to eleven billboards, else one."""
     candidates: Count | None = None
     """Clusterings that a search compares; more take longer and may find a better placement.
     Default: 12, or 4 for twelve billboards or more, of which any clustering is about as good as any other."""
-    refinement_rounds: _Rounds | None = None
+    refinement_rounds: _Number | None = None
     """Rounds that refine the best placement by moving, splitting and merging billboards.
     Default: three fewer than there are billboards, at least one and at most six; none for twelve billboards or more."""
     placement_learning_rate: _Unit | None = None
@@ -127,13 +132,13 @@ class FitConfig:
     Preset: silhouette; thesis: viewport."""
     texel_density: _Density | None = None
     """Texels per pixel of a view along each side, for a billboard that faces the camera at the tree's axis.
-    Preset: 0.85 (mask) or 1; thesis: 1."""
+    Preset: 0.8 (mask) or 1; thesis: 1."""
     loss: Loss | None = None
     """Loss to minimize: absolute (l1) or squared (l2) differences of premultiplied RGBA, or squared ones over random backgrounds.
     It is summed over channels and averaged over pixels; for backgrounds it is the expectation.
     Preset: backgrounds; thesis: l2."""
     colors: Colors | None = None
-    """What colors are fitted to: to the color of the views, whatever alpha is (views), or to the loss, together with alpha (joint, matched).
+    """What colors are fitted to: the color of the views, whatever alpha is (views), or the loss, together with alpha (joint, matched).
     With views and matched, one factor per channel makes the mean color that of the views in the end.
     Preset: views (mask, hash) or matched (blend); thesis: joint."""
     antialiased: bool | None = None
@@ -205,18 +210,19 @@ class FitConfig:
 
 
 def _effort(count: int | None) -> dict[str, Any]:
-    """The defaults that depend on the number of billboards: how long to search for a placement of them."""
+    """The defaults that depend on the number of billboards: how long to search for a placement, and how many show the trunk."""
     if count is None:
         return {}
     if count >= _MANY:
-        return {"restarts": 1, "candidates": 4, "refinement_rounds": 0}
-    return {"restarts": min(2, max(1, count // 4)), "candidates": 12, "refinement_rounds": min(6, max(1, count - 3))}
+        return {"restarts": 1, "candidates": 4, "refinement_rounds": 0, "trunk_billboards": _TRUNK}
+    rounds = min(6, max(1, count - 3))
+    return {"restarts": min(2, max(1, count // 4)), "candidates": 12, "refinement_rounds": rounds, "trunk_billboards": 0}
 
 
 class ResolvedFit(FitConfig):
     """A :class:`FitConfig` in which only ``max_texels`` may be ``None``, and, until the fit has chosen it, the number of billboards.
 
-    The length of the search depends on that number, and is then ``None`` too.
+    The length of the search and the number of the trunk's billboards depend on that number, and are then ``None`` too.
 
     Raises InputError if a value is missing, or values contradict each other.
     """
@@ -252,5 +258,8 @@ class ResolvedFit(FitConfig):
         textures = (self.billboards or self.most_billboards) * (1 if self.sides == "one" else 2)
         if self.max_texels is not None and self.max_texels < textures:
             fail("max_texels", f"{self.max_texels} are too few for {textures} textures", "allow more")
+        fewest = self.billboards or self.least_billboards
+        if self.placement == "clusters" and (self.trunk_billboards or 0) >= fewest:
+            fail("trunk_billboards", f"{self.trunk_billboards} of {fewest} billboards leave none for the crown", "allow fewer")
         if self.sides == "pair" and self.placement == "clusters":
             fail("sides", "pairs need an even placement around an axis", "add --placement even, or choose one or two")

@@ -11,6 +11,7 @@ from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments,
 from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.fitting.points import pixels_of, point_colors
+from bbfit.fitting.trunk import crossed_planes
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 
@@ -48,6 +49,12 @@ class Moves:
         generator = torch.Generator().manual_seed((self._config.seed << 16) + index)
         planes = cluster_planes(self._points, count, self.projection, upright=self._upright(index), generator=generator)
         return self._textured(torch.arange(len(self._points)), planes)
+
+    def crossed(self, members: Tensor, count: int) -> BillboardCloud:
+        """``count`` upright billboards that cross in the middle of the points at the indices ``members``, each around all of them."""
+        planes = crossed_planes(self._points[members], count)
+        each = (self._on_plane(members, *plane) for plane in zip(planes.normals, planes.offsets, strict=True))
+        return BillboardCloud.joined(list(each))
 
     def extended(self, cloud: BillboardCloud, losses: Losses) -> list[BillboardCloud]:
         """Add one billboard to a cloud in :data:`ADDITIONS` ways: split a billboard, or place one where the loss is large."""

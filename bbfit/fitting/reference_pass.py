@@ -14,8 +14,13 @@ from bbfit.fitting.movement import Movement
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.adam.reference import AdamReference
-from bbfit.operators.drawing.reference import render_layers_reference, render_reference
-from bbfit.operators.image_loss.reference import color_loss_reference, image_loss_reference
+from bbfit.operators.drawing.reference import joined_layers, render_layers_reference, render_reference
+from bbfit.operators.image_loss.reference import (
+    color_loss_reference,
+    image_loss_reference,
+    pixel_loss_reference,
+    structure_loss_reference,
+)
 
 
 class ReferencePass:
@@ -37,12 +42,15 @@ class ReferencePass:
         cameras, target = self._targets.cameras[list(chosen)].to(device), self._targets.pictures(chosen).to(device)
         loss = torch.zeros((), device=device)
         for group in cloud.parts(self._groups):
-            if config.colors == "views":
-                image, colors, weights = render_layers_reference(group, cameras)
-                color_loss_reference(colors, weights, target).backward(retain_graph=True)  # its value is not part of the loss
+            if config.colors == "views":  # the loss of a pixel is for alpha alone, and colors have a loss that is not part of the total
+                colors, weights = render_layers_reference(group, cameras)
+                still, image = joined_layers([color.detach() for color in colors], weights), joined_layers(colors, weights)
+                loss = loss + pixel_loss_reference(still, target, config.loss).mean()
+                loss = loss + structure_loss_reference(image, target, config.ssim_weight, config.sharpness_weight)
+                color_loss_reference(colors, weights, target).backward(retain_graph=True)
             else:
                 image = render_reference(group, cameras)
-            loss = loss + image_loss_reference(image, target, config.loss, config.ssim_weight, config.sharpness_weight)
+                loss = loss + image_loss_reference(image, target, config.loss, config.ssim_weight, config.sharpness_weight)
         loss.backward()
         assert texels.grad is not None
         state.gradient.add_(texels.grad)

@@ -17,6 +17,7 @@ from bbfit.fitting.levels import Targets
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.moves import ADDITIONS, REFINEMENTS, Moves
 from bbfit.fitting.steps import Stepper
+from bbfit.fitting.trunk import trunk_points
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.image_loss.reference import pixel_loss_reference
 from bbfit.rendering.dispatch import render
@@ -70,10 +71,19 @@ def find_placement(
     ``refinement_rounds`` rounds then refine the cloud with the least loss (:meth:`~bbfit.fitting.moves.Moves.refined`). A round keeps the
     best change only if it lowers the loss.
 
+    ``trunk_billboards`` of the billboards are not searched for. They cross in the trunk below the crown
+    (:func:`~bbfit.fitting.trunk.trunk_points`), unless the tree has none, and their textures show the points there.
+
     ``on_progress`` is called after every step with the work done and the total work, in steps of one candidate. The result is float32 on
     the CPU and has fitted textures, with the texel density of pictures of about :data:`SIDE` pixels.
     """
-    return _Search(views, points, config, on_progress or (lambda done, total: None), effort).best()
+    on_progress, own = on_progress or (lambda done, total: None), config.trunk_billboards or 0
+    trunk = trunk_points(points, views) if own else points.new_zeros(0)
+    if len(trunk) == 0:
+        return _Search(views, points, config, on_progress, effort).best()
+    assert config.billboards is not None  # see counted()
+    search = _Search(views, points, replace(config, billboards=config.billboards - own), on_progress, effort)
+    return BillboardCloud.joined([search.best(), search.moves.crossed(trunk, own)])
 
 
 def choose_count(views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None] | None = None) -> int:
@@ -111,7 +121,7 @@ class _Search:
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))
         self._radius, self._generator = tree_radius(views), torch.Generator().manual_seed(config.seed)
-        self._moves = Moves(points, self._targets.cameras, self._pictures, config, self._radius, self._generator)
+        self.moves = Moves(points, self._targets.cameras, self._pictures, config, self._radius, self._generator)
         assert config.billboards and config.candidates and config.restarts and config.refinement_rounds is not None  # see counted()
         self._restarts, self._candidates, self._rounds = config.restarts, config.candidates, config.refinement_rounds
         self._added = min(config.billboards // _BILLBOARDS_PER_ADDITION, effort.most_additions)
@@ -127,20 +137,20 @@ class _Search:
         """See :func:`find_placement`."""
         best = min((self.searched(number) for number in range(self._restarts)), key=itemgetter(1))
         for number in range(self._rounds):
-            best = min(best, self._best_of([best[0], *self._moves.refined(best[0], number, self._losses)]), key=itemgetter(1))
+            best = min(best, self._best_of([best[0], *self.moves.refined(best[0], number, self._losses)]), key=itemgetter(1))
         return best[0]
 
     def searched(self, number: int) -> tuple[BillboardCloud, float]:
         """Run search ``number``. Return its cloud and the loss."""
         with ThreadPoolExecutor(torch.get_num_threads()) as pool:
             starts = range(number * self._candidates, (number + 1) * self._candidates)
-            clouds = list(pool.map(lambda start: self._moves.clustered(start, self._clusters), starts))
+            clouds = list(pool.map(lambda start: self.moves.clustered(start, self._clusters), starts))
         clouds, losses = self._fitted(clouds, self._effort.steps, _RATE)
         survivors = sorted(range(len(clouds)), key=losses.__getitem__)[: self._survivors]
         clouds, losses = self._fitted([clouds[index] for index in survivors], self._effort.more_steps, _LATER_RATE)
         best = sorted(zip(clouds, losses, strict=True), key=itemgetter(1))[: self._chains]
         for _ in range(self._added):
-            best = sorted((self._best_of(self._moves.extended(cloud, self._losses)) for cloud, _ in best), key=itemgetter(1))
+            best = sorted((self._best_of(self.moves.extended(cloud, self._losses)) for cloud, _ in best), key=itemgetter(1))
             best = best[: max(1, len(best) // 2)]
         return best[0]
 

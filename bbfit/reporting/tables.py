@@ -62,6 +62,10 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
     table.add_row("color brightness", _ONE, "", "", _share(color.brightness), "")
     table.add_row("... with holes", _ONE, "", "", _share(mean.brightness), "")
 
+    if report.trunk is not None:
+        trunk = report.trunk
+        table.add_row("trunk's IoU, worst view", _UP, "", "", f"{trunk.iou:.4f}, {trunk.worst.iou:.4f}", "")
+
     if report.antialiased is not None:
         table.add_section()
         table.add_row("with alpha to coverage", "", "", "", "", "", style="bold")

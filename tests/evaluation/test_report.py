@@ -12,6 +12,7 @@ import pytest
 from bbfit.checks import InputError, MissingFileError
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeScore, ViewScore, stage_seconds
+from bbfit.evaluation.trunk import TrunkScore, TrunkView
 
 
 def score(name: str, scale: float, sharpness: float | None = 1.0) -> ViewScore:
@@ -23,7 +24,10 @@ def score(name: str, scale: float, sharpness: float | None = 1.0) -> ViewScore:
 
 SIZES = (SizeScore(64, 48, 20.5, 1.01, 0.1), SizeScore(32, 24, 21.5, None, 0.09))
 SHIMMER = (ShimmerScore(64, 48, 0.02, 1.25, 0.9), ShimmerScore(32, 24, 0.0, None, None))
-REPORT = Report((score("a", 1.0), score("b", 1.5, None)), Cost(16, 113_152), Cost(None, 5_000), {"fit": 2.0}, sizes=SIZES, shimmer=SHIMMER)
+TRUNK = TrunkScore((TrunkView("a", 0.9, 2.0), TrunkView("b", 0.5, None)))
+REPORT = Report(
+    (score("a", 1.0), score("b", 1.5, None)), Cost(16, 113_152), Cost(None, 5_000), {"fit": 2.0}, sizes=SIZES, shimmer=SHIMMER, trunk=TRUNK
+)
 MEASURES = {
     "over_white": {"psnr", "ssim", "flip"},
     "over": {"white", "black", "grass", "sky", "mean"},
@@ -68,6 +72,7 @@ def test_schema() -> None:
         "overdraw",
         "shaded",
         "antialiased",
+        "trunk",
         "alpha",
         "seconds",
         "sizes",
@@ -85,6 +90,8 @@ def test_schema() -> None:
     assert content["views"][1]["sharpness"] is None
     assert content["sizes"][0] == {"width": 64, "height": 48, "psnr": 20.5, "coverage": 1.01, "alpha": 0.1}
     assert content["shimmer"][0] == {"width": 64, "height": 48, "tree": 0.02, "ratio": 1.25, "antialiased": 0.9}
+    assert content["trunk"]["worst_iou"] == 0.5 and content["trunk"]["worst_view"] == "b" and content["trunk"]["iou"] == 0.7
+    assert replace(REPORT, trunk=None).to_json()["trunk"] is None
     assert json.loads(json.dumps(content, allow_nan=False)) == content
 
 

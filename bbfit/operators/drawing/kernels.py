@@ -27,7 +27,7 @@ straight color C, weighted by the view's alpha A and by the layer's weight w_k (
 
     sum of w_k A |c_k - C|^2,    with the derivative 2 w_k (A c_k - A C) in c_k.
 
-Alpha has the gradient of the picture's loss in either case.
+Colors have this gradient in place of that of the pixel loss, and that of ``image_gradient`` besides. Alpha has all gradients in any case.
 
 **Schedule.** A thread processes a run of pixels in a row: a whole row on a CPU, one pixel on CUDA. Layers are sorted per pixel. The
 backward kernel blends again instead of reading stored layers.
@@ -347,6 +347,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
                         alphas[i] = alpha
                         i += 1
                     seen = wp.vec4()
+                    of_image = wp.vec4(g[0], g[1], g[2], 0.0)
                     if given_target:
                         seen = premultiplied(packed, straight)
                         total, g = add_pixel_loss(color - seen, pixel_loss, weight, total, g)
@@ -374,7 +375,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
                                 of_sample = wp.vec4(g[0] * part, g[1] * part, g[2] * part, of_alpha)
                                 if own_colors != 0:
                                     own_loss = color_slope(wp.vec3(reds[f], greens[f], blues[f]), seen) * (weight * part)
-                                    of_sample = wp.vec4(own_loss[0], own_loss[1], own_loss[2], of_alpha)
+                                    of_sample = of_image * part + wp.vec4(own_loss[0], own_loss[1], own_loss[2], of_alpha)
                                 whose = wp.vec3i(firsts[own], heights[own], widths[own])
                                 scatter(texel_gradient, whose, left[own, c], top[own, c], fx[own, c], fy[own, c], of_sample)
                                 if wanted_placement:

@@ -41,22 +41,24 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
     return image if camera.batched else image[0]
 
 
-def render_layers_reference(cloud: BillboardCloud, camera: Camera) -> tuple[Tensor, list[Tensor], list[Tensor]]:
-    """Draw N >= 1 billboards and return their layers too, for a loss of their own.
+def render_layers_reference(cloud: BillboardCloud, camera: Camera) -> tuple[list[Tensor], list[Tensor]]:
+    """Draw the layers of N >= 1 billboards, which :func:`joined_layers` joins to the picture of :func:`render_reference`.
 
     Returns
     -------
-    image : Tensor
-        What :func:`render_reference` returns, for a batch of cameras, without a gradient in the colors of layers.
     colors : list of Tensor
         Straight colors of the layers, N of [V, 3, H, W].
     weights : list of Tensor
         Weights of the layers in the image, N of [V, 1, H, W].
     """
     colors, alphas, depths = _layers(cloud, camera)
-    weights = layer_weights(alphas, depths, nested=cloud.alpha.antialiased)
-    parts = [torch.cat([color.detach(), torch.ones_like(weight)], 1) * weight for color, weight in zip(colors, weights, strict=True)]
-    return sum(parts[1:], parts[0]).permute(0, 2, 3, 1), colors, weights
+    return colors, layer_weights(alphas, depths, nested=cloud.alpha.antialiased)
+
+
+def joined_layers(colors: list[Tensor], weights: list[Tensor]) -> Tensor:
+    """The picture of layers with straight colors [V, 3, H, W] and weights [V, 1, H, W]: premultiplied RGBA, [V, H, W, 4]."""
+    parts = [torch.cat([color, torch.ones_like(weight)], 1) * weight for color, weight in zip(colors, weights, strict=True)]
+    return sum(parts[1:], parts[0]).permute(0, 2, 3, 1)
 
 
 def _layers(cloud: BillboardCloud, camera: Camera) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:

@@ -22,7 +22,12 @@ def image_loss_reference(render: Tensor, target: Tensor, kind: Loss, ssim_weight
         Factors of 1 - SSIM (:func:`~bbfit.operators.ssim.reference.ssim_reference`) and of
         :func:`~bbfit.operators.sharpness.reference.sharpness_reference`, which are added.
     """
-    loss = pixel_loss_reference(render, target, kind).mean()
+    return pixel_loss_reference(render, target, kind).mean() + structure_loss_reference(render, target, ssim_weight, sharpness_weight)
+
+
+def structure_loss_reference(render: Tensor, target: Tensor, ssim_weight: float, sharpness_weight: float) -> Tensor:
+    """The terms of :func:`image_loss_reference` for structure and sharpness, a scalar; arguments as there."""
+    loss = render.new_zeros(())
     if ssim_weight:
         loss = loss + ssim_weight * (1 - ssim_reference(render, target))
     if sharpness_weight:
