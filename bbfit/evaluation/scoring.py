@@ -15,7 +15,7 @@ from bbfit.checks import check_count, check_shape, fail
 from bbfit.evaluation import metrics, thesis_scale
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale, mean_measures
-from bbfit.evaluation.report import Cost, Report, ViewScore
+from bbfit.evaluation.report import Cost, Report, ShimmerScore, ViewScore
 from bbfit.evaluation.shimmer import score_shimmer
 from bbfit.evaluation.sizes import HALVINGS, score_sizes
 from bbfit.evaluation.trunk import TrunkView, measure_trunk, trunk_score
@@ -114,8 +114,10 @@ def evaluate_model(
             )
         )
     sizes = score_sizes(model.draw, views, on_size=lambda done, _: on_progress(len(models) * len(views) + done, total))
-    shimmer = () if turned is None else score_shimmer(model.draw, turned, models[1].draw if len(models) > 1 else None)
-    on_progress(total, total)
+    shimmer: tuple[ShimmerScore, ...] = ()
+    if turned is not None:
+        shimmer = score_shimmer(model.draw, turned, models[1].draw if len(models) > 1 else None)
+        on_progress(total, total)
     return Report(
         views=scored[0],
         vertices=Cost(model.cards.vertex_count, original.vertices),

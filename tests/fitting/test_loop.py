@@ -158,7 +158,10 @@ def test_a_killed_fit_goes_on_to_the_same_result(views: ViewDataset, tmp_path: P
 
 
 def test_a_snapshot_is_a_copy_of_the_cloud_at_its_level(views: ViewDataset) -> None:
-    config, seen = quick(alpha="blend", billboards=2, placement="even", placement_learning_rate=0, steps=8), []
+    config = quick(
+        alpha="blend", billboards=2, placement="even", placement_learning_rate=0, steps=8, colors="joint", color_bits=8, alpha_bits=8
+    )
+    seen: list[BillboardCloud] = []
     result = fit(views, config, on_step=lambda step: seen.append(step.snapshot()))
     sizes = [tuple(cloud.texture_sizes[0].tolist()) for cloud in seen]
     assert sizes == sorted(sizes) and len(set(sizes)) == len(resolution_levels(config.resolve(), views.train.cameras)) > 1
@@ -280,15 +283,27 @@ def test_at_less_than_full_resolution_sharpness_and_crispness_have_no_weight(pre
     assert config.resolve().coarse() == coarse.resolve() and FitConfig(preset=preset).coarse().resolve().sharpness_weight == 0.0
 
 
-@pytest.mark.parametrize(("billboards", "restarts"), [(1, 1), (3, 1), (4, 1), (7, 1), (8, 2), (9, 2), (40, 2), (None, 2)])
-def test_eight_billboards_have_two_searches_and_no_number_has_more(billboards: int | None, restarts: int) -> None:
+@pytest.mark.parametrize(("billboards", "restarts"), [(1, 1), (3, 1), (4, 1), (7, 1), (8, 2), (11, 2), (12, 1), (40, 1)])
+def test_eight_billboards_have_two_searches_and_no_number_has_more(billboards: int, restarts: int) -> None:
     """Unless their number is asked for."""
     assert FitConfig(billboards=billboards).restarts is None and FitConfig(billboards=billboards).resolve().restarts == restarts
     assert FitConfig(billboards=billboards, restarts=5).resolve().restarts == 5
+    assert FitConfig().resolve().counted(billboards) == FitConfig(billboards=billboards).resolve()
 
 
-@pytest.mark.parametrize(("billboards", "refinement_rounds"), [(1, 1), (4, 1), (5, 2), (8, 5), (9, 6), (40, 6), (None, 5)])
-def test_more_billboards_are_revised_more_often(billboards: int | None, refinement_rounds: int) -> None:
+def test_a_number_that_the_fit_chooses_is_left_open() -> None:
+    open_config = FitConfig(refinement_rounds=3).resolve()
+    assert open_config.billboards is open_config.restarts is open_config.candidates is None and open_config.refinement_rounds == 3
+    counted = open_config.counted(24)
+    assert (counted.billboards, counted.restarts, counted.candidates, counted.refinement_rounds) == (24, 1, 4, 3)
+    assert counted.counted(8) == counted
+    assert FitConfig(placement="even").resolve().billboards == 8
+    with pytest.raises(InputError, match="least_billboards"):
+        FitConfig(least_billboards=40).resolve()
+
+
+@pytest.mark.parametrize(("billboards", "refinement_rounds"), [(1, 1), (4, 1), (5, 2), (8, 5), (9, 6), (11, 6), (12, 0), (40, 0)])
+def test_more_billboards_are_revised_more_often(billboards: int, refinement_rounds: int) -> None:
     assert (
         FitConfig(billboards=billboards).refinement_rounds is None
         and FitConfig(billboards=billboards).resolve().refinement_rounds == refinement_rounds
@@ -303,16 +318,16 @@ def test_unknown_device_is_refused(views: ViewDataset) -> None:
 
 @pytest.mark.parametrize("cutoff", [0.3, 0.5])
 def test_a_fit_for_mask_is_better_cut_off_than_one_for_blend(data_views: ViewDataset, cutoff: float) -> None:
-    """And covers as much of views that it was not fitted to as the tree does; it is drawn with the texels that 8 bits hold."""
+    """Over white, with hard edges, and it covers as much of other views as the tree does; it is drawn with texels that 8 bits hold."""
     config = FitConfig(billboards=3, placement="even", placement_learning_rate=0, alpha_cutoff=cutoff, steps=100)
     masked, blended = (fit(data_views, dataclasses.replace(config, alpha=alpha)).cloud for alpha in ("mask", "blend"))
     assert masked.alpha == AlphaMode("mask", cutoff) and blended.alpha == AlphaMode("blend", cutoff)
     cut = dataclasses.replace(blended, alpha=masked.alpha)
     test = data_views.test
     gain = over_white(masked, test) - over_white(cut, test)
-    assert gain > 0.5  # measured: 0.57 and 0.58 dB
+    assert gain > 0.25  # measured: 0.30 and 0.32 dB
     covered = render_reference(masked, test.cameras)[..., 3].mean() / test.targets(range(len(test)))[..., 3].mean()
-    assert abs(float(covered) - 1) < 0.04  # measured: 0.015 and 0.017
+    assert abs(float(covered) - 1) < 0.04  # measured: 0.008 and 0.018
     assert torch.equal((masked.texels * 255).round() / 255, masked.texels)
 
 
