@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from bbfit.checks import Count, Range, Seed, check_fields, fail
-from bbfit.geometry.orbit import Orbit
 from bbfit.provenance import EXECUTION
+
+if TYPE_CHECKING:
+    from bbfit.geometry.orbit import Orbit
 
 Device = Literal["cpu", "cuda", "optix", "hip", "oneapi", "metal"]
 Axis = Literal["auto", "origin", "center"]
@@ -78,4 +80,6 @@ class ViewsConfig:
     @property
     def orbit(self) -> Orbit:
         """Directions of the cameras."""
+        from bbfit.geometry.orbit import Orbit  # torch takes a while to start
+
         return Orbit(self.count, self.rings)
