@@ -21,6 +21,8 @@ DOME = (0.0, 20.0, 40.0, 60.0, 80.0)
 """Elevations of the rings of a dome in degrees."""
 RING = (0.0,)
 """Elevation of the ring of the thesis (section 4.1)."""
+# With fewer views, rings of a dome would have one or two.
+_LEAST_DOME = 20
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class ViewsConfig:
     they show how much the tree itself changes, which the score of shimmer needs. 0 for none."""
     elevations: tuple[_Elevation, ...] | None = None
     """Elevation of each ring of cameras: its angle above the horizon, in degrees.
-    Default: a dome, 0 20 40 60 80; for the preset thesis, one ring at eye level, 0."""
+    Default: a dome, 0 20 40 60 80; for fewer than 20 views and for the preset thesis, one ring at eye level, 0."""
     fov_degrees: Annotated[float, Range(1, 170)] = 40.0
     """Field of view in degrees; the cameras move back until the whole tree is in the picture."""
     orthographic: bool = False
@@ -75,7 +77,9 @@ class ViewsConfig:
     @property
     def rings(self) -> tuple[float, ...]:
         """Elevation of each ring, with the default filled in."""
-        return DOME if self.elevations is None else tuple(self.elevations)
+        if self.elevations is not None:
+            return tuple(self.elevations)
+        return DOME if self.count >= _LEAST_DOME else RING
 
     @property
     def orbit(self) -> Orbit:
