@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bbfit.exporting.packing import packed
 from bbfit.geometry.cards import Atlas
-from bbfit.images import bleed_color
+from bbfit.images import PALETTE, bleed_color, distinct
 
 # Side of the blocks in which graphics cards compress textures, in texels.
 BLOCK = 4
@@ -22,7 +22,8 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
     Each texture gets a cell that is at least ``padding`` >= 1 texels larger on every side, which the fade to transparent at a billboard's
     rim needs. Cells are aligned to blocks of n x n texels, where n is the largest power of two up to ``padding`` (at least 4), so no texel
     of a mip level up to log2(n) mixes two textures. Alpha is 0 outside the textures; transparent texels have the color of a neighbor
-    (:func:`fill_cell`).
+    (:func:`fill_cell`). If that makes more than 256 colors of fewer visible ones, the transparent texels' colors are rounded, so that the
+    atlas fits into the palette of a PNG.
     """
     sizes = np.array([texture.shape[1::-1] for texture in textures], dtype=np.int64)
     unit = max(BLOCK, 1 << (padding.bit_length() - 1))
@@ -34,6 +35,7 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
     for texture, place, cell in zip(textures, places * unit, cells * unit, strict=True):
         (x, y), (w, h) = place.tolist(), cell.tolist()
         image[y : y + h, x : x + w] = fill_cell(texture, padding, w, h)
+    image[image[..., 3] == 0, :3] = _within_palette(image)
     return Atlas(image, places * unit + padding, sizes)
 
 
@@ -55,6 +57,18 @@ def fill_cell(texture: NDArray[np.uint8], padding: int, width: int, height: int)
     inner = cell[padding : padding + h, padding : padding + w, :3]
     cell[padding - 1 : padding + h + 1, padding - 1 : padding + w + 1, :3] = np.pad(inner, ((1, 1), (1, 1), (0, 0)), "edge")
     return cell
+
+
+def _within_palette(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The colors of the transparent texels of a picture, [T, 3], rounded to as many bits as a palette leaves to them."""
+    colors = image[image[..., 3] == 0][:, :3]
+    free = PALETTE - len(distinct(image[image[..., 3] > 0]))
+    for bits in range(8, 0, -1) if free >= 8 else ():  # the fewest bits leave eight colors
+        step = 1 << (8 - bits)
+        fewer = np.minimum(colors // step * step + step // 2, 255).astype(np.uint8)
+        if len(distinct(np.pad(fewer, ((0, 0), (0, 1))))) <= free:
+            return fewer
+    return colors
 
 
 def _mean_color(textures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:

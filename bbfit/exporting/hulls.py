@@ -84,15 +84,17 @@ def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
     return cards.with_cards([trimmed(cards, card, vertices, least) for card in cards.cards])
 
 
-def trimmed(cards: Cards, card: Card, vertices: int, least: float, box: NDArray[np.float64] | None = None) -> Card:
+def trimmed(
+    cards: Cards, card: Card, vertices: int, least: float, box: NDArray[np.float64] | None = None, beyond: float = MARGIN
+) -> Card:
     """A card as :func:`with_hulls` trims it; with ``box``, the part of a rectangular card for the squares of texel centers in a box.
 
-    The box is [4, 2] in texels, along texel centers. The part may reach beyond the box by :data:`MARGIN`.
+    The box is [4, 2] in texels, along texel centers. The part may reach ``beyond`` the box by so many texels.
     """
     polygon = inside = texel_corners(cards, card)
     region = polygon
     if box is not None:
-        grown = box + MARGIN * np.sign(box - box.mean(0))
+        grown = box + beyond * np.sign(box - box.mean(0))
         inside, region = (np.clip(corners, polygon.min(0), polygon.max(0)) for corners in (box, grown))
     points = _shown_points(rimmed_alpha(cards, card.rectangle), inside, max(least, ANY))
     hull = _hull_within(points, region) if len(points) else points

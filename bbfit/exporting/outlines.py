@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.checks import check_count, check_range
-from bbfit.exporting.hulls import ANY, rimmed_alpha, shown_cells, texel_corners, trimmed
+from bbfit.exporting.hulls import ANY, MARGIN, rimmed_alpha, shown_cells, texel_corners, trimmed
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.polygons import area
 
@@ -41,9 +41,10 @@ def with_pieces(cards: Cards, pieces: int, corners: int, least: float) -> Cards:
     Cuts along rows and columns of texel centers divide the textures. Each cut is the one that saves most area in all cards: the boxes
     around the visible texels on its two sides are smaller than the box around both. At the end each part is trimmed to a convex polygon.
 
-    Pieces that meet at a cut through visible texels overlap by two margins, 1/32 texel. Sides with different corners would leave gaps
-    there, because graphics cards round corners to fractions of a pixel. A pixel that is drawn twice after an alpha test looks the same. It
-    would not where programs blend, so for other modes than ``mask`` all cuts run through transparent texels, and pieces never overlap.
+    Pieces of a ``mask`` that meet at a cut through visible texels overlap by two margins, 1/32 texel. Sides with different corners would
+    leave gaps there, because graphics cards round corners to fractions of a pixel, and a pixel that is drawn twice after an alpha test
+    looks the same. It would not where programs blend, so for other modes pieces end exactly at the cut. A corner is then off by up to 1/512
+    pixel, and so a pixel of every few hundred along a cut may be drawn twice or not at all.
 
     Pieces keep the order of the cards, and their normals, winding and textures. A card with an origin or of another shape, as splitting
     makes them, stays one piece. A card with no visible part shrinks to about one texel. Raises InputError if an argument is out of range.
@@ -55,7 +56,7 @@ def with_pieces(cards: Cards, pieces: int, corners: int, least: float) -> Cards:
     scales, order = areas / [abs(area(texel_corners(cards, card))) for card in cards.cards], itertools.count()
 
     def entry(part: _Part) -> tuple[float, int, _Part, list[_Part]]:
-        saved, halves = _best_cut(part, apart=cards.alpha.kind != "mask")
+        saved, halves = _best_cut(part)
         return -saved * float(scales[part.card]), next(order), part, halves
 
     queue = [entry(part) for index in range(len(cards.cards)) for part in _whole(cards, index, max(least, ANY))]
@@ -68,8 +69,8 @@ def with_pieces(cards: Cards, pieces: int, corners: int, least: float) -> Cards:
     boxes: list[list[NDArray[np.float64]]] = [[] for _ in cards.cards]
     for _, _, part, _ in sorted(queue, key=lambda entry: tuple(entry[2].start)):
         boxes[part.card].append(_box(part))
-    both = zip(cards.cards, boxes, strict=True)
-    return cards.with_cards([trimmed(cards, card, corners, least, box) for card, own in both for box in (own if own[1:] else [None])])
+    both, margin = zip(cards.cards, boxes, strict=True), MARGIN if cards.alpha.kind == "mask" else 0.0
+    return cards.with_cards([trimmed(cards, card, corners, least, box, margin) for card, own in both for box in (own if own[1:] else [None])])
 
 
 def _area(corners: NDArray[np.float64]) -> float:
@@ -94,15 +95,12 @@ def _cropped(part: _Part) -> _Part:
     return replace(part, start=part.start + low, shown=part.shown[low[0] : high[0], low[1] : high[1]])
 
 
-def _best_cut(part: _Part, *, apart: bool) -> tuple[float, list[_Part]]:
-    """The area in square texels that the best cut of a part saves, and its halves; no halves if no cut saves area.
-
-    With ``apart`` there is an empty row or column between the halves.
-    """
+def _best_cut(part: _Part) -> tuple[float, list[_Part]]:
+    """The area in square texels that the best cut of a part saves, and its halves; no halves if no cut saves area."""
     best, halves = 0.0, list[_Part]()
     for axis, shown in enumerate((part.shown, part.shown.T)):
         (deep, before), (rest, after) = _boxes(shown), (values[::-1] for values in _boxes(shown[::-1]))
-        saved = np.where(deep[:-1] + rest[1:] + apart <= len(shown), shown.size - before[:-1] - after[1:], 0)
+        saved = np.where(deep[:-1] + rest[1:] <= len(shown), shown.size - before[:-1] - after[1:], 0)
         if saved.max(initial=0) > best:
             best, cut = float(saved.max()), int(saved.argmax()) + 1
             parts = shown[:cut], shown[cut:]

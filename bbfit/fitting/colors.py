@@ -39,13 +39,6 @@ def matched_colors(cloud: BillboardCloud, views: ViewSet, backend: Backend = "au
     return cloud
 
 
-def rounded(cloud: BillboardCloud, color_bits: int, alpha_bits: int) -> BillboardCloud:
-    """Round texels to multiples of 2 ** (8 - bits) of 255, and the largest to 255: PNG compresses fewer values better."""
-    steps = torch.tensor([float(1 << 8 - bits) for bits in (color_bits,) * 3 + (alpha_bits,)]).to(cloud.texels)
-    texels = ((cloud.texels * 255 / steps).round() * steps).clamp(max=255) / 255
-    return cloud.with_texels(torch.where(steps > 1, texels, cloud.texels))
-
-
 def _mean_color(pictures: Iterable[Tensor]) -> Tensor | None:
     """The mean straight color of premultiplied pictures, float64 [3], or ``None`` if all of them are transparent."""
     total = sum((picture.double().cpu().sum((0, 1, 2)) for picture in pictures), torch.zeros(4, dtype=torch.float64))

@@ -20,7 +20,7 @@ Colors = Literal["views", "matched", "joint"]
 _Binarization = Annotated[float, Range(0, 10)]
 _Density = Annotated[float, Range(0, 16, open_low=True)]
 _Rate = Annotated[float, Range(0, 10, open_low=True)]
-_Bits = Annotated[int, Range(1, 8)]
+_Palette = Annotated[int, Range(0, 256)]
 _Number = Annotated[int, Range(0)]
 _Sharpness = Annotated[float, Range(0, 1000)]
 _Unit = Annotated[float, Range(0, 1)]
@@ -33,6 +33,8 @@ EVEN = 8
 _MANY = 12
 # Billboards of the trunk's own when there are many. One of three crossed planes shows at least cos(30 degrees) = 87 % of the trunk's width.
 _TRUNK = 3
+TRANSPARENT_COLORS = 32
+"""Colors of a palette that are left to transparent texels, which filtering shows beside visible ones."""
 
 _PRESETS: dict[str, dict[str, Any]] = {
     "default": {
@@ -42,8 +44,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "bounds": "silhouette",
         "loss": "backgrounds",
         "ssim_weight": 0.01,
-        "color_bits": 5,
-        "alpha_bits": 6,
+        "palette": 256,
         "levels": 4,
         "steps": 1200,
         "views_per_step": 2,
@@ -63,8 +64,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "loss": "l2",
         "colors": "joint",
         "antialiased": False,
-        "color_bits": 8,
-        "alpha_bits": 8,
+        "palette": 0,
         "ssim_weight": 0.0,
         "sharpness_weight": 0.0,
         "binarization_weight": 0.0,
@@ -145,10 +145,9 @@ class FitConfig:
     """Fit a mask for programs that smooth its edges by alpha to coverage. Preset: yes; thesis: no. Other alpha modes ignore it."""
     max_texels: Count | None = None
     """Most texels of all billboards together; their density is lowered to stay within it. Default: no limit."""
-    color_bits: _Bits | None = None
-    """Bits of each color channel of a texel, 1 to 8. Fewer make the file smaller, and leaves hide the steps. Preset: 5; thesis: 8."""
-    alpha_bits: _Bits | None = None
-    """Bits of a texel's alpha, 1 to 8. Preset: 6; thesis: 8."""
+    palette: _Palette | None = None
+    """Number of different colors, alpha included, of all texels: 34 to 256, or 0 for any number. Up to 256, the PNG stores one byte a
+    texel instead of four, and leaves hide the difference. Preset: 256; thesis: 0."""
     ssim_weight: _Unit | None = None
     """Weight of 1 - SSIM, which preserves structure, beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: _Sharpness | None = None
@@ -235,8 +234,7 @@ class ResolvedFit(FitConfig):
     loss: Loss
     colors: Colors
     antialiased: bool
-    color_bits: _Bits
-    alpha_bits: _Bits
+    palette: _Palette
     ssim_weight: _Unit
     sharpness_weight: _Sharpness
     binarization_weight: _Binarization
@@ -261,5 +259,7 @@ class ResolvedFit(FitConfig):
         fewest = self.billboards or self.least_billboards
         if self.placement == "clusters" and (self.trunk_billboards or 0) >= fewest:
             fail("trunk_billboards", f"{self.trunk_billboards} of {fewest} billboards leave none for the crown", "allow fewer")
+        if 0 < self.palette <= TRANSPARENT_COLORS + 1:
+            fail("palette", f"{self.palette} colors are too few", f"allow at least {TRANSPARENT_COLORS + 2}, or 0 for any number")
         if self.sides == "pair" and self.placement == "clusters":
             fail("sides", "pairs need an even placement around an axis", "add --placement even, or choose one or two")

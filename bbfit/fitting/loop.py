@@ -17,12 +17,13 @@ from torch import Tensor
 from bbfit.checks import InputError, InputTypeError, check_range, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
-from bbfit.fitting.colors import matched_colors, rounded
+from bbfit.fitting.colors import matched_colors
 from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.coverage import matched_coverage
 from bbfit.fitting.initialize import bounded, pixels_per_meter, random_textures, sized, start_cloud, tree_radius
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
 from bbfit.fitting.movement import Movement
+from bbfit.fitting.palette import palettized
 from bbfit.fitting.points import hull_points, mesh_points
 from bbfit.fitting.requirements import check_cameras, check_device
 from bbfit.fitting.search import choose_count, find_placement
@@ -185,13 +186,12 @@ def fit(
     if config.alpha == "mask":
         drawn = matched_coverage(replace(fitted, alpha=replace(fitted.alpha, antialiased=config.antialiased)), views.train, config.backend)
         fitted = replace(drawn, alpha=fitted.alpha)
-    fitted = rounded(fitted, 8, config.alpha_bits)
     # No view determines the colors of transparent texels, but filtering shows them.
     bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
     if config.colors != "joint":
         fitted = matched_colors(fitted, views.train, config.backend)
-    fitted = rounded(fitted, config.color_bits, 8)
+    fitted = palettized(fitted, config.palette)
     if config.placement != "even" or config.placement_learning_rate:
         fitted = trimmed(fitted)
     try:

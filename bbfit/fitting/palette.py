@@ -1,0 +1,69 @@
+"""A palette for all texels of a cloud: PNG files of at most 256 colors store one byte a texel instead of four."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2, vq
+from torch import Tensor
+
+from bbfit.fitting.config import TRANSPARENT_COLORS
+from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import premultiply, unpremultiply
+
+# Least alpha that does not round to 0 in 8 bits.
+_VISIBLE = 0.5 / 255
+# Texels that the palette is chosen from, iterations, and the seed of the choice.
+_SAMPLE, _ITERATIONS, _SEED = 40_000, 12, 0
+# Of a mask's alpha, differences count within so much of the cutoff, where edges are.
+_EDGE = 0.25
+
+
+def palettized(cloud: BillboardCloud, count: int) -> BillboardCloud:
+    """Give the visible texels of a cloud at most ``count`` - :data:`~bbfit.fitting.config.TRANSPARENT_COLORS` different values of color and alpha.
+
+    The values are the means of clusters of texels by k-means (Lloyd 1982; Arthur and Vassilvitskii 2007 for the start), of the quantity
+    whose squared differences a viewer sees (:func:`_seen`). Values have 8 bits. ``count`` is more than :data:`~bbfit.fitting.config.TRANSPARENT_COLORS`; with 0 the
+    cloud is returned as it is.
+
+    Neighboring leaves differ by more than neighboring colors of the palette do, so that no bands show, and no dithering is needed.
+    """
+    visible = torch.nonzero(cloud.texels[:, 3] >= _VISIBLE)[:, 0]
+    if count == 0 or len(visible) == 0:
+        return cloud
+    texels = cloud.texels[visible].detach().cpu().float()
+    seen = _seen(texels, cloud.alpha)
+    generator = np.random.default_rng(_SEED)
+    sample = seen[generator.permutation(len(seen))[:_SAMPLE]]
+    most = min(count - TRANSPARENT_COLORS, len(np.unique(sample, axis=0)))
+    means, _ = kmeans2(sample, most, iter=1, minit="++", rng=generator)
+    for _ in range(_ITERATIONS):
+        means = _means(torch.from_numpy(sample), vq(sample, means)[0], torch.from_numpy(means)).numpy()
+    labels = vq(seen, means)[0]
+    palette = unpremultiply(_means(premultiply(texels), labels, torch.zeros(most, 4)))
+    palette = (palette * 255).round().clamp(min=torch.tensor([0.0, 0.0, 0.0, 1.0])) / 255
+    return cloud.with_texels(cloud.texels.index_copy(0, visible.to(cloud.texels.device), palette[labels].to(cloud.texels)))
+
+
+def _means(points: Tensor, labels: NDArray[np.int32], otherwise: Tensor) -> Tensor:
+    """The means of the points, [P, C], of each cluster, and those of ``otherwise``, [K, C], for clusters without points."""
+    index, count = torch.from_numpy(labels).long(), len(otherwise)
+    number = torch.bincount(index, minlength=count)[:, None]
+    sums = torch.zeros(count, points.shape[1], dtype=torch.float64).index_add_(0, index, points.double())
+    return torch.where(number > 0, sums / number.clamp_min(1), otherwise.double()).to(points.dtype)
+
+
+def _seen(texels: Tensor, alpha: AlphaMode) -> NDArray[np.float32]:
+    """What a viewer sees of straight-alpha texels, [P, 4], as points whose squared distances are squared differences of pictures.
+
+    A blended layer of premultiplied color c and alpha a over a gray background b shows c + (1 - a) b. For b uniform in [0, 1], the mean
+    squared difference of two layers in one channel is (dc - da / 2)^2 + da^2 / 12. A mask shows the straight color where alpha reaches the
+    cutoff, and its edges depend on alpha near the cutoff.
+    """
+    if alpha.kind == "mask":
+        edge = ((texels[:, 3:] - alpha.cutoff) / _EDGE).tanh() * _EDGE
+        return torch.cat([texels[:, :3] * (texels[:, 3:] / alpha.cutoff).clamp(max=1), edge], 1).numpy()
+    color, opaque = texels[:, :3] * texels[:, 3:], texels[:, 3:]
+    return torch.cat([color - opaque / 2, opaque / 2], 1).numpy()
