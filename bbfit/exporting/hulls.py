@@ -84,9 +84,7 @@ def with_hulls(cards: Cards, vertices: int, least: float) -> Cards:
     return cards.with_cards([trimmed(cards, card, vertices, least) for card in cards.cards])
 
 
-def trimmed(
-    cards: Cards, card: Card, vertices: int, least: float, box: NDArray[np.float64] | None = None, beyond: float = MARGIN
-) -> Card:
+def trimmed(cards: Cards, card: Card, vertices: int, least: float, box: NDArray[np.float64] | None = None, beyond: float = MARGIN) -> Card:
     """A card as :func:`with_hulls` trims it; with ``box``, the part of a rectangular card for the squares of texel centers in a box.
 
     The box is [4, 2] in texels, along texel centers. The part may reach ``beyond`` the box by so many texels.

@@ -69,8 +69,10 @@ def with_pieces(cards: Cards, pieces: int, corners: int, least: float) -> Cards:
     boxes: list[list[NDArray[np.float64]]] = [[] for _ in cards.cards]
     for _, _, part, _ in sorted(queue, key=lambda entry: tuple(entry[2].start)):
         boxes[part.card].append(_box(part))
-    both, margin = zip(cards.cards, boxes, strict=True), MARGIN if cards.alpha.kind == "mask" else 0.0
-    return cards.with_cards([trimmed(cards, card, corners, least, box, margin) for card, own in both for box in (own if own[1:] else [None])])
+    margin, made = MARGIN if cards.alpha.kind == "mask" else 0.0, []
+    for card, own in zip(cards.cards, boxes, strict=True):
+        made += [trimmed(cards, card, corners, least, box, margin) for box in (own if own[1:] else [None])]
+    return cards.with_cards(made)
 
 
 def _area(corners: NDArray[np.float64]) -> float:

@@ -1,7 +1,9 @@
 """Planes through the points of a tree by k-planes clustering, and textured rectangles on these planes.
 
 k-planes clustering is k-means with planes in place of means (Bradley and Mangasarian 2000, "k-Plane Clustering"). It serves the purpose of
-billboard clouds (Décoret et al. 2003): it moves every point onto a plane, and the cost is the displacement that the views can see.
+billboard clouds (Décoret et al. 2003): it moves every point onto a plane, and the cost is the displacement that the views can see. With a
+locality above 0, the cost also grows with the distance from the middle of the cluster, as in k-means. Clusters are then compact patches
+instead of slices through the whole tree, and their rectangles have less area.
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ from bbfit.geometry.cloud import BillboardCloud
 _ITERATIONS = 20
 # A cluster with fewer points than this fraction of the average cluster restarts at the point that is farthest from all planes.
 _STARVED = 0.02
+# Iterations of k-means before the first planes of compact clusters.
+_MEANS_ITERATIONS = 4
 
 
 @dataclass(frozen=True)
@@ -43,60 +47,81 @@ def view_projection(camera: Camera) -> Tensor:
     return torch.eye(3, dtype=forward.dtype) - (forward[:, :, None] * forward[:, None, :]).mean(0)
 
 
-def cluster_planes(points: Tensor, count: int, projection: Tensor, *, upright: bool, generator: torch.Generator) -> Planes:
-    """Cluster points, float64 [P, 3], onto ``count`` planes, at least one, from random initial planes.
+def cluster_planes(
+    points: Tensor, count: int, projection: Tensor, *, upright: bool, generator: torch.Generator, locality: float = 0.0
+) -> Planes:
+    """Cluster points, float64 [P, 3], onto ``count`` planes, at least one, from a random start.
 
-    Two steps alternate: assign each point to the plane that displaces it least, and fit each plane to its points. ``projection`` is the
-    :func:`view_projection` of the cameras. With ``upright``, all planes contain the vertical.
+    Two steps alternate: assign each point to the plane that costs least, and fit each plane to its points. The cost is the squared
+    displacement that the views see, where ``projection`` is the :func:`view_projection` of the cameras, plus ``locality`` times the squared
+    distance from the mean of the cluster's points. With ``upright``, all planes contain the vertical.
     """
     normals = torch.randn(count, 3, dtype=points.dtype, generator=generator)
-    if upright:
-        normals[:, 1] = 0
-    normals = torch.nn.functional.normalize(normals, dim=-1)
-    offsets = (normals * points[torch.randint(len(points), (count,), generator=generator)]).sum(-1)
-    return _refined(points, normals, offsets, projection, upright=upright)[0]
+    centers = points[torch.randint(len(points), (count,), generator=generator)]
+    if locality:
+        for _ in range(_MEANS_ITERATIONS):
+            sums = moments(points, torch.cdist(points, centers).argmin(-1), count)
+            centers = torch.where(sums[:, 3, 3:] > 0, _centers(sums), centers)
+        normals, offsets, _ = best_planes(moments(points, torch.cdist(points, centers).argmin(-1), count), upright=upright)
+    else:
+        if upright:
+            normals[:, 1] = 0
+        normals = torch.nn.functional.normalize(normals, dim=-1)
+        offsets = (normals * centers).sum(-1)
+    return _refined(points, normals, offsets, centers, projection, locality, upright=upright)[0]
 
 
-def split_planes(points: Tensor, axes: Tensor, projection: Tensor, *, upright: bool) -> Planes:
+def split_planes(points: Tensor, axes: Tensor, projection: Tensor, *, upright: bool, locality: float = 0.0) -> Planes:
     """Cluster points, float64 [P, 3], onto two planes.
 
     For each of A directions, [A, 3], the clustering starts from the two halves of the points below and above the median along it. The
-    clustering that displaces the points least is returned. ``projection`` and ``upright`` are those of :func:`cluster_planes`.
+    clustering with the least cost is returned. The other parameters are those of :func:`cluster_planes`.
     """
     results = []
     for axis in axes.to(points):
         along = points @ axis
-        normals, offsets, _ = best_planes(moments(points, (along > along.median()).long(), 2), upright=upright)
-        results.append(_refined(points, normals, offsets, projection, upright=upright))
+        sums = moments(points, (along > along.median()).long(), 2)
+        normals, offsets, _ = best_planes(sums, upright=upright)
+        results.append(_refined(points, normals, offsets, _centers(sums), projection, locality, upright=upright))
     return min(results, key=itemgetter(1))[0]
 
 
-def _refined(points: Tensor, normals: Tensor, offsets: Tensor, projection: Tensor, *, upright: bool) -> tuple[Planes, float]:
-    """Iterate the clustering until the assignment is stable. Return the planes and the sum of squared displacements."""
+def _refined(
+    points: Tensor, normals: Tensor, offsets: Tensor, centers: Tensor, projection: Tensor, locality: float, *, upright: bool
+) -> tuple[Planes, float]:
+    """Iterate the clustering until the assignment is stable. Return the planes and the sum of the costs."""
     count = len(normals)
     least = max(3, int(_STARVED * len(points) / count))
     labels = torch.full((len(points),), -1)
     for _ in range(_ITERATIONS):
-        distance, nearest = _displacement(points, normals, offsets, projection).min(-1)
+        cost, nearest = _costs(points, normals, offsets, centers, projection, locality).min(-1)
         for k in torch.nonzero(torch.bincount(nearest, minlength=count) < least)[:, 0].tolist():
-            far = points[distance.argmax()]
+            far = points[cost.argmax()]
             around = (points - far).square().sum(-1).topk(min(len(points), 2 * least), largest=False).indices
-            nearest[around], distance[around] = k, 0
+            nearest[around], cost[around] = k, 0
         if torch.equal(nearest, labels):
             break
         labels = nearest
-        new_normals, new_offsets, _ = best_planes(moments(points, labels, count), upright=upright)
-        enough = torch.bincount(labels, minlength=count) >= 3
+        sums = moments(points, labels, count)
+        new_normals, new_offsets, _ = best_planes(sums, upright=upright)
+        enough = sums[:, 3, 3] >= 3
         normals = torch.where(enough[:, None], new_normals, normals)
         offsets = torch.where(enough, new_offsets, offsets)
-    distance, labels = _displacement(points, normals, offsets, projection).min(-1)
-    return Planes(normals, offsets, labels), float(distance.square().sum())
+        centers = torch.where(enough[:, None], _centers(sums), centers)
+    cost, labels = _costs(points, normals, offsets, centers, projection, locality).min(-1)
+    return Planes(normals, offsets, labels), float(cost.sum())
 
 
-def _displacement(points: Tensor, normals: Tensor, offsets: Tensor, projection: Tensor) -> Tensor:
-    """Compute how far views see each point move onto each plane: the root mean square over views, in meters, [P, K]."""
-    visible = ((normals @ projection) * normals).sum(-1).clamp_min(0).sqrt()
-    return (points @ normals.mT - offsets).abs() * visible
+def _costs(points: Tensor, normals: Tensor, offsets: Tensor, centers: Tensor, projection: Tensor, locality: float) -> Tensor:
+    """The cost of each point in each cluster, in square meters, [P, K]: how far views see the point move, and how far its center is."""
+    visible = ((normals @ projection) * normals).sum(-1).clamp_min(0)
+    costs = (points @ normals.mT - offsets).square() * visible
+    return costs + locality * torch.cdist(points, centers).square() if locality else costs
+
+
+def _centers(sums: Tensor) -> Tensor:
+    """The mean of the points of each cluster, [K, 3], from the :func:`moments`."""
+    return sums[:, :3, 3] / sums[:, 3, 3:].clamp_min(1)
 
 
 def moments(points: Tensor, labels: Tensor, count: int) -> Tensor:
@@ -114,7 +139,7 @@ def best_planes(sums: Tensor, *, upright: bool) -> tuple[Tensor, Tensor, Tensor]
     ``sums`` are the :func:`moments` of K clusters. With ``upright``, all planes contain the vertical. Returns the unit normals, [K, 3], the
     offsets in meters, [K], and the sums of squared distances, [K].
     """
-    means = sums[:, :3, 3] / sums[:, 3, 3:].clamp_min(1)
+    means = _centers(sums)
     scatter = sums[:, :3, :3] - means[:, :, None] * sums[:, None, :3, 3]
     if upright:
         values, vectors = torch.linalg.eigh(scatter[:, ::2, ::2])

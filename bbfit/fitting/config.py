@@ -33,6 +33,7 @@ EVEN = 8
 _MANY = 12
 # Billboards of the trunk's own when there are many. One of three crossed planes shows at least cos(30 degrees) = 87 % of the trunk's width.
 _TRUNK = 3
+_LOCALITY = 0.1
 TRANSPARENT_COLORS = 32
 """Colors of a palette that are left to transparent texels, which filtering shows beside visible ones."""
 
@@ -110,6 +111,10 @@ class FitConfig:
     Preset: clusters; thesis: even."""
     orientation: Orientation = "any"
     """Orientation of clustered billboards: upright, in any direction (free), or whichever of the two fits better (any)."""
+    locality: _Unit | None = None
+    """How compact the parts of the tree are that clustered billboards stand for: the weight of distances within a part against distances
+    from its plane. With 0, billboards are slices through the whole tree; the larger, the smaller they are, and the less there is to draw.
+    Default: 0.1 for twelve billboards or more, else 0."""
     trunk_billboards: _Number | None = None
     """Number of billboards, out of all, that cross in the trunk below the crown; for clusters, and trees with such a trunk.
     Default: 3 for twelve billboards or more, else none."""
@@ -213,9 +218,9 @@ def _effort(count: int | None) -> dict[str, Any]:
     if count is None:
         return {}
     if count >= _MANY:
-        return {"restarts": 1, "candidates": 4, "refinement_rounds": 0, "trunk_billboards": _TRUNK}
+        return {"restarts": 1, "candidates": 4, "refinement_rounds": 0, "locality": _LOCALITY, "trunk_billboards": _TRUNK}
     rounds = min(6, max(1, count - 3))
-    return {"restarts": min(2, max(1, count // 4)), "candidates": 12, "refinement_rounds": rounds, "trunk_billboards": 0}
+    return {"restarts": min(2, max(1, count // 4)), "candidates": 12, "refinement_rounds": rounds, "locality": 0.0, "trunk_billboards": 0}
 
 
 class ResolvedFit(FitConfig):

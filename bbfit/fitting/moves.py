@@ -10,8 +10,9 @@ from torch import Tensor
 from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, splatted, split_planes, view_projection
 from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.initialize import pixels_per_meter
-from bbfit.fitting.points import pixels_of, point_colors
+from bbfit.fitting.points import point_colors
 from bbfit.fitting.trunk import crossed_planes
+from bbfit.fitting.visibility import pixels_of
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 
@@ -42,12 +43,15 @@ class Moves:
         self._density = float(pixels_per_meter(cameras)) * config.texel_density
         self._pixels = [pixels_of(points, cameras[index]) for index in range(len(cameras))]
         self._colors = point_colors(self._pixels, pictures)
+        self._locality = config.locality or 0.0
         self._all_upright, self._proposed = config.orientation == "upright", 0
 
     def clustered(self, index: int, count: int) -> BillboardCloud:
         """``count`` billboards: a clustering of the points from random start number ``index``."""
         generator = torch.Generator().manual_seed((self._config.seed << 16) + index)
-        planes = cluster_planes(self._points, count, self.projection, upright=self._upright(index), generator=generator)
+        planes = cluster_planes(
+            self._points, count, self.projection, upright=self._upright(index), generator=generator, locality=self._locality
+        )
         return self._textured(torch.arange(len(self._points)), planes)
 
     def crossed(self, members: Tensor, count: int) -> BillboardCloud:
@@ -100,7 +104,7 @@ class Moves:
         split = int(torch.multinomial(losses, 1, generator=self._generator))
         members = torch.nonzero(nearest == split)[:, 0]
         axes = torch.stack([cloud.normals[split], cloud.rights[split], cloud.ups[split]])
-        planes = split_planes(self._points[members], axes, self.projection, upright=self._all_upright)
+        planes = split_planes(self._points[members], axes, self.projection, upright=self._all_upright, locality=self._locality)
         return BillboardCloud.joined([cloud.take(k for k in range(len(cloud)) if k != split), self._textured(members, planes)])
 
     def merged(self, cloud: BillboardCloud, number: int) -> BillboardCloud:

@@ -22,11 +22,11 @@ _EDGE = 0.25
 
 
 def palettized(cloud: BillboardCloud, count: int) -> BillboardCloud:
-    """Give the visible texels of a cloud at most ``count`` - :data:`~bbfit.fitting.config.TRANSPARENT_COLORS` different values of color and alpha.
+    """Give the visible texels of a cloud few different values of color and alpha, so that a palette of ``count`` colors holds them.
 
-    The values are the means of clusters of texels by k-means (Lloyd 1982; Arthur and Vassilvitskii 2007 for the start), of the quantity
-    whose squared differences a viewer sees (:func:`_seen`). Values have 8 bits. ``count`` is more than :data:`~bbfit.fitting.config.TRANSPARENT_COLORS`; with 0 the
-    cloud is returned as it is.
+    :data:`~bbfit.fitting.config.TRANSPARENT_COLORS` of the palette are left to transparent texels, so ``count`` is larger; with 0 the cloud
+    is returned as it is. The values are the means of clusters of texels by k-means (Lloyd 1982; start by Arthur and Vassilvitskii 2007), of
+    the quantity whose squared differences a viewer sees (:func:`_seen`). They have 8 bits.
 
     Neighboring leaves differ by more than neighboring colors of the palette do, so that no bands show, and no dithering is needed.
     """

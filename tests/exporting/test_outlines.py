@@ -109,7 +109,8 @@ def test_pieces_are_as_small_as_what_they_show() -> None:
     cards = of_kind(cards_of(angle()), "mask")
     strips = with_pieces(cards, 8, 8, 1.0)
     assert len(strips.cards) == 2 and total(strips) < 1.06 * (5 * 55 + 5 * 49) < 0.4 * total(with_hulls(cards, 8, 1.0))
-    assert [len(with_pieces(of_kind(cards, kind), 8, 8, 1.0).cards) for kind in ("hash", "blend")] == [1, 1]  # all cuts cross a strip
+    for kind in ("hash", "blend"):  # the cut crosses a strip, and the pieces meet there without an overlap
+        assert total(with_pieces(of_kind(cards, kind), 8, 8, 1.0)) < total(strips)
     full = of_kind(cards_of(np.ones((30, 20))), "mask")
     (card,) = with_pieces(full, 8, 8, 0.5).cards
     np.testing.assert_allclose(card.corners, with_hulls(full, 8, 0.5).cards[0].corners)
@@ -173,23 +174,26 @@ def rasterized(corners: NDArray[np.float64], camera: Camera, steps: int = 256) -
 
 
 @pytest.mark.parametrize("kind", ["mask", "blend"])
-def test_graphics_cards_open_no_seams_and_blend_nothing_twice(kind: str, orbit: Camera) -> None:
-    """Corners in files are float32, and on the screen multiples of 1/256 pixel."""
+def test_graphics_cards_open_no_seams(kind: str, orbit: Camera) -> None:
+    """Corners in files are float32, and on the screen multiples of 1/256 pixel.
+
+    Pieces of a mask overlap, so that there are no seams. Blended ones must not. Where their sides differ along a cut, rounded corners leave
+    out or repeat a pixel of a thousand at most.
+    """
     rng, (y, x) = np.random.default_rng(4), np.mgrid[:60, :60]
     bumps = sum(np.hypot(x - a, y - b) < c for a, b, c in zip(*rng.uniform(2, 58, (2, 25)), rng.uniform(1, 6, 25), strict=True))
     picture = np.minimum(bumps, 1.0)
-    picture[28:32] = 0  # a gap for blend
     cards = of_kind(cards_of(picture), kind)
     made = with_pieces(cards, 12, 8, cards.outlined_alpha)
-    assert len(made.cards) == 12 if kind == "mask" else len(made.cards) > 1
-    drawn, again = 0, 0
+    assert len(made.cards) == 12
+    drawn, again, missing = 0, 0, 0
     for index in range(len(orbit)):
         camera = orbit[index].resized(4 * orbit.width, 4 * orbit.height)
         shown = draw_cards(cards, camera)[..., 3].numpy() > 0
         count = sum(rasterized(card.corners, camera) for card in made.cards)
-        assert (count[shown] >= 1).all()
-        drawn, again = drawn + int((count > 0).sum()), again + int((count > 1).sum())
-    assert again <= (0.02 * drawn if kind == "mask" else 0), (drawn, again)
+        drawn, again, missing = drawn + int((count > 0).sum()), again + int((count > 1).sum()), missing + int((count[shown] < 1).sum())
+    assert again <= (0.02 if kind == "mask" else 0.001) * drawn, (drawn, again)
+    assert missing <= (0 if kind == "mask" else 0.001) * drawn, (drawn, missing)
 
 
 def test_files_have_the_default_and_what_is_asked(crossed: BillboardCloud, tmp_path: Path) -> None:

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from bbfit.blender.request import RenderedTree
 from bbfit.checks import InputError, MissingFileError
-from bbfit.fitting.points import hull_points, mesh_points, pixels_of, point_colors
+from bbfit.fitting.points import hull_points, mesh_points, point_colors
+from bbfit.fitting.visibility import pixels_of
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.orbit import Orbit
 from bbfit.tree_files.tree_file import TreeFile
