@@ -27,7 +27,7 @@ VERSIONS: Mapping[str, int] = {
     "evaluate": 9,
     "report": 3,
     "lod": 2,
-    "compare": 2,
+    "compare": 3,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""
 EXECUTION = {"affects_result": False}

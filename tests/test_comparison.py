@@ -54,7 +54,7 @@ def test_costs_are_those_of_the_models(done: CompareResult) -> None:
             model = (done.folder / row.system / "model.glb").read_bytes()
             assert row.bytes == len(model) and row.vertices == glb_counts(model)[0], row.system
     assert rows["bbfit"].vertices == 12 and rows["thesis"].vertices == 32 and rows["crossed"].vertices == 8
-    assert rows["slicing"].planes is not None and rows["slicing"].planes <= 4
+    assert rows["slicing"].planes is not None and rows["slicing"].planes <= 4 and rows["slicing"].vertices == 4 * rows["slicing"].planes
     assert rows["cloud-many"].planes == rows["bbfit-many"].planes == 5
     assert rows["decimated-vertices"].vertices is not None and rows["decimated-vertices"].vertices <= 12
     assert rows["decimated-bytes"].bytes is not None and rows["decimated-bytes"].bytes <= (rows["bbfit"].bytes or 0)

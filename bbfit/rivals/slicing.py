@@ -47,11 +47,6 @@ class Slicings:
         if not self.clouds or not np.allclose(self.azimuths_degrees, even):
             fail("azimuths", f"expected {even.tolist()} for {len(self.clouds)} slicings, got {list(self.azimuths_degrees)}")
 
-    @property
-    def vertex_count(self) -> int:
-        """Vertices of all slicings together."""
-        return sum(cloud.vertex_count for cloud in self.clouds)
-
     def weights(self, camera: Camera) -> list[tuple[int, float]]:
         """The two slicings nearest to a camera's azimuth and their weights, which sum to 1.
 

@@ -135,7 +135,8 @@ def test_stopped_in_the_middle_and_started_again(number: int, code: int, thing_g
     """Blender ends with the command, no temporary folder is left, and the same command goes on."""
     out, temporary = tmp_path / "views", tmp_path / "temporary"
     temporary.mkdir()
-    words = ["views", str(thing_glb), "--out", str(out), "--count", "4", "--size", "32", "--samples", "4", "--no-denoise"]
+    words = ["views", str(thing_glb), "--out", str(out)]
+    words += ["--count", "4", "--size", "32", "--samples", "4", "--no-denoise", "--turned", "0"]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     environment = os.environ | {"TMPDIR": str(temporary)}
     command = [sys.executable, "-c", _COMMAND, *words, "--render-workers", "2"]

@@ -74,19 +74,21 @@ def view_glb(path: Path, camera: Camera) -> NDArray[np.float64]:
     rays = np.stack([(x - k[0, 2]) / k[0, 0], (y - k[1, 2]) / k[1, 1], np.ones(x.shape)], -1) @ pose[:3, :3]
     layers, depths = [], []
     for primitive in primitives:
-        taken = np.zeros(x.shape, bool)
-        for number, triangle in enumerate(primitive.triangles):
+        taken, before = np.zeros(x.shape, bool), np.zeros(4)
+        for triangle in primitive.triangles:
             a, b, c = primitive.positions[triangle]
             normal = np.cross(b - a, c - a)
+            plane = np.append(normal, normal @ a) / np.linalg.norm(normal)
+            if not np.allclose(plane, before, atol=1e-4):
+                taken[:] = False
+            before = plane
             if not primitive.material.get("doubleSided", False) and normal @ (eye - a) <= 0:
                 continue
             depth = (a - eye) @ normal / (rays @ normal)
             hit = eye + rays * depth[..., None]
             weights = np.stack([np.cross(c - b, hit - b) @ normal, np.cross(a - c, hit - c) @ normal], -1) / (normal @ normal)
             weights = np.concatenate([weights, 1 - weights.sum(-1, keepdims=True)], -1)
-            if number % 2 == 0:
-                taken[:] = False
-            inside = (weights >= -1e-12).all(-1) & (depth > 0) & ~taken  # the quads' diagonals belong to one triangle only
+            inside = (weights >= -1e-12).all(-1) & (depth > 0) & ~taken  # an edge inside a plane belongs to one triangle only
             taken |= inside
             layers.append(_shade(texture, weights @ primitive.uvs[triangle], primitive.material) * inside[..., None])
             depths.append(np.where(inside, depth, np.inf))

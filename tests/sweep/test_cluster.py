@@ -110,7 +110,7 @@ def test_a_sweep_on_a_cluster_is_the_sweep_on_one_machine(cluster: Cluster, tmp_
 
 
 def test_trees_are_rendered_on_the_cluster_and_their_views_come_back(cluster: Cluster, tmp_path: Path) -> None:
-    """A file and a species; started again, neither is rendered again."""
+    """A file and a species, each with four views and a second picture of the held-out one; started again, neither is rendered again."""
     assert cluster.address
     views = ViewsConfig(count=4, size=48, samples=1, denoise=False)
     grown = GrowConfig(detail=0.1, leaves=0.02)
@@ -123,7 +123,7 @@ def test_trees_are_rendered_on_the_cluster_and_their_views_come_back(cluster: Cl
     first = sweep()
     assert [(row.tree, row.reason) for row in first.rows] == [("acer", None), ("tree", None)]
     pictures = {path: path.stat().st_mtime_ns for path in (tmp_path / "trees").rglob("images/*.png")}
-    assert len(pictures) == 8 and (tmp_path / "trees" / "acer" / "tree.glb").is_file()
+    assert len(pictures) == 10 and (tmp_path / "trees" / "acer" / "tree.glb").is_file()
     assert all((tmp_path / row.folder / "model.glb").is_file() for row in first.rows)
     again = sweep()
     assert again.kept == 2 and pictures == {path: path.stat().st_mtime_ns for path in (tmp_path / "trees").rglob("images/*.png")}

@@ -177,7 +177,10 @@ def test_a_failed_run_stands_until_it_is_to_be_retried(two_trees: list[Path], tm
 
 
 def test_trees_are_grown_and_rendered_once(tmp_path: Path) -> None:
-    """A species and a tree's file, with views of 48 x 48 pixels by Blender; the second start finds all of them."""
+    """A species and a tree's file, with views of 48 x 48 pixels by Blender; the second start finds all of them.
+
+    Each tree has four views, and a second picture of the one that is held out.
+    """
     stages = RunConfig(
         views=ViewsConfig(count=4, size=48, samples=1, denoise=False),
         fit=FitConfig(billboards=2, candidates=1, refinement_rounds=0, steps=4),
@@ -201,7 +204,7 @@ def test_trees_are_grown_and_rendered_once(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "trees" / "acer" / "tree.glb").is_file()
     assert told[0] == ("trees", 0, 2) and told[-1] == ("runs", 2, 2)
     pictures = {path: path.stat().st_mtime_ns for path in (tmp_path / "out" / "trees").rglob("*.png")}
-    assert len(pictures) == 8
+    assert len(pictures) == 10 and sum(path.name.startswith("turned_") for path in pictures) == 2
     again = sweep()
     assert again.kept == 2 and told == [("trees", 2, 2), ("runs", 2, 2)]
     (tmp_path / "out" / "trees" / "tree" / "views" / "images" / "0002.png").unlink()

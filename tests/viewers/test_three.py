@@ -39,14 +39,15 @@ def test_three_shows_crossing_masked_billboards(two_sided: bool, three: ThreeVie
     (exported,) = export(noise_cloud(3, texels=32, two_sided=two_sided), tmp_path / "model.glb", ExportConfig(alpha="mask"))
     glb = with_min_filter(exported, BILINEAR)
     show = three.show(glb, around)
-    # Measured 35.4 and 36.2 dB (30.3 and 29.1 with mip levels); half a pixel of shift leaves 21.7.
+    # Measured 35.2 and 37.4 dB (30.4 and 29.0 with mip levels); half a pixel of shift leaves 20.6 and 21.0.
     assert psnr(expected(glb, around), show.images) >= 33
     (material,) = show.materials
     assert (material.kind, material.side) == ("MeshBasicMaterial", SIDES[two_sided])
     assert (material.alpha_test, material.transparent) == (ALPHA_TEST, False)
     assert (material.min_filter, material.mag_filter, material.compressed) == (BILINEAR, BILINEAR, False)
-    assert material.size == read_glb(glb)[2].shape[1::-1]
-    assert show.calls == (1,) * 5 and show.triangles == (12 if two_sided else 6,) * 5
+    _, primitives, texture = read_glb(glb)
+    assert material.size == texture.shape[1::-1]
+    assert show.calls == (1,) * 5 and show.triangles == (sum(len(primitive.triangles) for primitive in primitives),) * 5
     assert not show.warnings
 
 

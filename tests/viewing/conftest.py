@@ -12,6 +12,7 @@ from page_browser import Browse, Tab, open_tab
 from playwright.sync_api import Browser
 
 import bbfit
+from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.pipeline import RunConfig, run
 from bbfit.viewing.server import Viewer
@@ -22,8 +23,9 @@ FIT = FitConfig(billboards=4, placement="even", steps=120)
 
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of the project's own tree. Do not change it."""
-    return run(DATA / "views", tmp_path_factory.mktemp("viewing") / "small", RunConfig(tree=DATA / "tree.glb", fit=FIT)).folder
+    """A finished run of the project's own tree, in few pieces, because a browser draws some models ten thousand times. Do not change it."""
+    config = RunConfig(tree=DATA / "tree.glb", fit=FIT, export=ExportConfig(pieces=2))
+    return run(DATA / "views", tmp_path_factory.mktemp("viewing") / "small", config).folder
 
 
 @pytest.fixture(scope="session")
