@@ -21,7 +21,7 @@ VERSIONS: Mapping[str, int] = {
     "grow": 1,
     "convert": 1,
     "views": 2,
-    "budget": 5,
+    "budget": 6,
     "fit": 11,
     "export": 4,
     "evaluate": 9,

@@ -8,8 +8,10 @@ from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
 
-from bbfit.budget.choice import Trial, choose, lookup, within_bytes
+from bbfit.budget.choice import choose
 from bbfit.budget.config import BudgetConfig
+from bbfit.budget.sizes import within_bytes
+from bbfit.budget.trials import Trial, lookup
 from bbfit.checks import InputError, check_record
 from bbfit.exporting.config import ExportConfig
 from bbfit.files import read_json, write_bytes, write_json
