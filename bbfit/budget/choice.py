@@ -68,10 +68,10 @@ def choose(
     """Choose the number, sides, placement and texel density of billboards for a budget. The test views are not used.
 
     Every fifth training view is held out for validation. Short fits to the other views are compared there. A limit of vertices alone is
-    spent in full, and by halves and quarters for the curve. For a target or ``auto``, the numbers of billboards increase until they reach
-    the target or gain too little. A limit of texels or bytes is first spent on 16 billboards, and then on more and on fewer for as long as
-    they are not clearly worse; a last trial has half the texels, for the curve. Few billboards are also tried two-sided, half as many, and
-    evenly placed.
+    spent in full, and by halves and quarters for the curve. For a target or ``auto``, the number of billboards doubles until it reaches the
+    target or gains too little; then the number between the last two that matter is tried. A limit of texels or bytes is first spent on 16
+    billboards, and then on more and on fewer for as long as they are not clearly worse; a last trial has half the texels, for the curve.
+    Few billboards are also tried two-sided, half as many, and evenly placed, unless there is a target.
 
     All short fits of a number of billboards start from one placement, which a quick search finds. What a limit in bytes leaves for texels
     is estimated from the bytes of earlier trials, and the PSNR at the limit from the trial nearest to it.
@@ -170,9 +170,9 @@ class _Chooser:
         if budget.target_psnr is None:
             best = max([best, *self._others(best.trial.billboards)], key=lambda other: other.psnr)
         trial = best.trial
-        fewer = max(2 * trial.textures, int(_CURVE_FRACTION * trial.texels))
-        if budget.target_psnr is None and self._spends and fewer < trial.texels:  # for the curve
-            self._trials.run(trial.billboards, trial.sides, trial.placement, fewer)
+        few, fewer = min(trial.billboards, START), int(_CURVE_FRACTION * trial.texels)
+        if budget.target_psnr is None and self._spends and fewer >= 2 * few:  # for the curve
+            self._trials.run(few, trial.sides, trial.placement, fewer)
         met = budget.target_psnr is None or best.psnr >= budget.target_psnr
         chosen = replace(config, billboards=trial.billboards, sides=trial.sides, placement=trial.placement, max_texels=best.max_texels)
         return Choice(chosen.resolve(), tuple(done), done.index(trial), met, validation)
@@ -191,18 +191,31 @@ class _Chooser:
         return [other for other in others if other is not None]
 
     def _grown(self) -> list[Spent]:
-        """Try increasing numbers of billboards until they are enough."""
-        series = list[Spent]()
-        for count in self._counts:
+        """Double the number of billboards until it is enough, and then try the numbers between the best one and its neighbors.
+
+        If the best one reaches the target, only fewer can be better, and if there is none, only more.
+        """
+        counts, series, tried = self._counts, list[Spent](), list[int]()
+        for count in counts:
+            if self._grows and count & (count - 1) and count not in (counts[0], counts[-1]):
+                continue  # no power of two
+            tried.append(count)
             point = self._spent(count)
             if point is not None:
                 series.append(point)
                 if self._is_enough(series):
                     break
-        return series
+        if not series or not self._grows:
+            return series
+        best, target = self._best(series), self._budget.target_psnr
+        count, met = best.trial.billboards, target is not None and best.psnr >= target
+        fewer = count if target is None else max((other for other in tried if other < count), default=count)
+        more = count if met else min((other for other in tried if other > count), default=count)
+        between = [self._spent(other) for other in counts if fewer < other < more and other != count]
+        return [*series, *(point for point in between if point is not None)]
 
     def _is_enough(self, series: list[Spent]) -> bool:
-        """Whether trials of more billboards can be skipped after those of ``series``."""
+        """Whether more billboards than the last of ``series`` need not be tried."""
         if self._budget.target_psnr is not None:
             return series[-1].psnr >= self._budget.target_psnr
         if self._budget.auto and len(series) > 2:  # one small gain may be chance, two in a row are not
@@ -238,8 +251,9 @@ class _Chooser:
             fail("budget", f"{least.billboards} {named} with {least.bytes:,} bytes exceeds it", "allow more")
         best = max(series, key=lambda point: point.psnr)
         equivalent = [point for point in series if point.psnr >= best.psnr - _NOISE_DB]
-        sign = 1 if budget.vertices is not None else -1  # use all vertices that the budget allows, or draw as few as possible
-        best = max(equivalent, key=lambda point: (sign * point.trial.vertices, point.psnr))
+        if budget.vertices is not None or self._grows:  # use all vertices that the budget allows, or draw as few as possible
+            sign = 1 if budget.vertices is not None else -1
+            best = max(equivalent, key=lambda point: (sign * point.trial.vertices, point.psnr))
         if budget.target_psnr is not None:
             sufficient = [point for point in series if point.psnr >= budget.target_psnr]
             return min(sufficient, key=lambda point: (point.trial.vertices, -point.psnr), default=best)

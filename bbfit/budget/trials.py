@@ -23,10 +23,10 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset, ViewSet
 
-# The length of a short fit and of its search, if the configuration asks for no shorter ones. Levels are of fits with a search, which
-# begins at a coarser resolution.
-_MOST: dict[str, int] = {"steps": 150, "restarts": 1, "candidates": 4, "refinement_rounds": 0}
-_LEVELS, _VIEWS_PER_STEP = 3, 2
+# The length of a short fit and of its search, if the configuration asks for no shorter ones. The search is at lower resolutions than the
+# levels, of which an even placement, without a search, has as many as any fit. Shorter fits would favor few billboards.
+_MOST: dict[str, int] = {"steps": 200, "restarts": 1, "candidates": 4, "refinement_rounds": 0}
+_LEVELS, _VIEWS_PER_STEP = 2, 2
 
 
 @dataclass(frozen=True)

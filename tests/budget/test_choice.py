@@ -36,6 +36,8 @@ BYTES_A_TEXEL, CRISPER, AIM, NEAR = 2.0, 1.05, 0.92, 0.6
 """The first guess; a longer fit packs better; the part of a limit in bytes that a trial aims at, and the least that it is to use."""
 LESS = 1
 """Trials of less than a limit in texels or bytes, for the curve."""
+DOUBLED = [1, 2, 4, 8, 16, 32, 48]
+"""Numbers of billboards that are tried until they are enough."""
 DATA = Path(__file__).resolve().parents[2] / "data"
 Quality = Callable[[int, Sides, Placement], float]
 
@@ -409,17 +411,19 @@ def test_less_is_tried_for_the_curve_alone(views: ViewDataset, choosing: Choosin
     assert found.trials[-1].psnr > found.trials[found.chosen].psnr
 
 
-def test_less_has_two_texels_for_each_at_the_least(choosing: Choosing) -> None:
+def test_less_has_two_texels_for_each_at_the_least(views: ViewDataset, choosing: Choosing) -> None:
     world = World(rising)
-    choosing(world, BudgetConfig(texels=10, vertices=16))
-    assert world.less == [(4, "one", "clusters", 8)] * LESS
+    choosing(world, BudgetConfig(texels=16, vertices=16))
+    assert world.less == [(4, "one", "clusters", 8)]
+    found = choose(views, FitConfig(), BudgetConfig(texels=15, vertices=16), known=World(rising).trial)
+    assert [trial.max_texels for trial in found.trials] == [15] * len(found.trials)
 
 
 def test_a_curve_of_vertices_needs_nothing_else(views: ViewDataset) -> None:
     for budget, tried in (
         (BudgetConfig(vertices=16), [1, 2, 4, 2, 4]),
-        (BudgetConfig(auto=True), list(COUNTS)),
-        (BudgetConfig(texels=500, target_psnr=25), [1, 2, 3]),
+        (BudgetConfig(auto=True), DOUBLED),
+        (BudgetConfig(texels=500, target_psnr=25), [1, 2, 4, 3]),
     ):
         world = World(rising)
         choose(views, FitConfig(), budget, known=world.trial)
@@ -436,14 +440,17 @@ def test_a_target_takes_as_few_as_will_do(choosing: Choosing) -> None:
     """And nothing else is tried, since it would have as many vertices."""
     world = World(curve(n1=20, n2=22, n3=24, n4=25, n6=26))
     found = choosing(world, BudgetConfig(target_psnr=24))
-    assert world.line == [1, 2, 3] and world.others == []
+    assert world.line == [1, 2, 4, 3] and world.others == []
     assert summary(found) == (3, "one", "clusters") and found.met and found.trials[found.chosen].psnr == 24
+    world = World(curve(n1=20, n2=22, n3=24, n4=25, n6=26, n8=26))
+    assert choosing(world, BudgetConfig(target_psnr=25.5)).config.billboards == 6 and world.line == [1, 2, 4, 8, 6]
+    assert choosing(World(world.quality), BudgetConfig(target_psnr=24.5)).config.billboards == 4
 
 
 def test_a_target_that_is_not_reached_gives_the_best(choosing: Choosing) -> None:
-    world = World(curve(n1=20, n2=22, n3=24, n4=25, n6=26, n8=25))
+    world = World(curve(n1=20, n2=22, n3=24, n4=25, n6=26, n8=25.5))
     found = choosing(world, BudgetConfig(target_psnr=26.1, vertices=32))
-    assert world.line == [1, 2, 3, 4, 6, 8] and world.others == []
+    assert world.line == [1, 2, 4, 8, 6] and world.others == []
     assert summary(found) == (6, "one", "clusters") and not found.met
     found = choosing(World(rising), BudgetConfig(target_psnr=90))
     assert found.config.billboards == COUNTS[-1] and not found.met
@@ -479,7 +486,7 @@ def test_auto_stops_at_the_knee(choosing: Choosing) -> None:
     """Twice as many are to gain a certain number of decibels; two steps that do not are the end."""
     world = World(lambda count, sides, placement: 20 + 3 * math.log2(min(count, 4)) + 0.3 * math.log2(max(count / 4, 1)) - (sides != "one"))
     found = choosing(world, BudgetConfig(auto=True), FitConfig(placement="clusters"))
-    assert world.line == [1, 2, 3, 4, 6, 8] and summary(found) == (4, "one", "clusters") and found.met
+    assert world.line == [1, 2, 4, 8, 16, 6] and summary(found) == (4, "one", "clusters") and found.met
     assert world.others == [(2, "two", "clusters")]
 
 
@@ -488,19 +495,25 @@ def test_auto_goes_as_far_as_it_pays(choosing: Choosing, gain: float, last: int)
     """By what a doubling gains, though most steps are smaller than that."""
     world = World(lambda count, sides, placement: 20 + gain * math.log2(count) - (sides != "one") - (placement == "even"))
     found = choosing(world, BudgetConfig(auto=True))
-    assert summary(found) == (last, "one", "clusters") and world.line == (list(COUNTS) if last > 1 else [1, 2, 3])
+    assert summary(found) == (last, "one", "clusters") and world.line == (DOUBLED if last > 1 else [1, 2, 4])
 
 
 def test_auto_steps_over_one_that_was_unlucky(choosing: Choosing) -> None:
-    world = World(curve(n1=20, n2=22, n3=23, n4=24, n6=23.5, n8=26, n12=26.1, n16=26.2))
+    world = World(curve(n1=20, n2=22, n4=22.5, n8=26, n16=26.2, n32=26.4))
     assert summary(choosing(world, BudgetConfig(auto=True))) == (8, "one", "clusters")
-    assert world.line == [1, 2, 3, 4, 6, 8, 12, 16]
+    assert world.line == [1, 2, 4, 8, 16, 32, 12]
+
+
+def test_auto_goes_on_to_the_number_between_if_it_pays(choosing: Choosing) -> None:
+    quality = {"n1": 20, "n2": 22, "n4": 24, "n8": 24.6, "n16": 24.7, "even6": 20, "two3": 20}
+    for psnr, best in ((24.3, 4), (24.5, 6)):
+        assert choosing(World(curve(**quality, n6=psnr)), BudgetConfig(auto=True)).config.billboards == best
 
 
 def test_auto_within_a_limit(choosing: Choosing) -> None:
     world = World(rising)
     found = choosing(world, BudgetConfig(auto=True, vertices=24, texels=5000))
-    assert world.line == [1, 2, 3, 4, 6] and summary(found) == (6, "one", "clusters") and found.config.max_texels == 5000
+    assert world.line == [1, 2, 4, 6] and summary(found) == (6, "one", "clusters") and found.config.max_texels == 5000
 
 
 def test_auto_may_spend_the_vertices_of_the_knee_otherwise(choosing: Choosing) -> None:
@@ -509,24 +522,25 @@ def test_auto_may_spend_the_vertices_of_the_knee_otherwise(choosing: Choosing) -
     assert summary(choosing(World(curve(**knee, even4=24.05)), BudgetConfig(auto=True))) == (4, "one", "even")
 
 
-@pytest.mark.parametrize("better", [-1.1, -0.9, 0.0, 0.9, 1.1])
+@pytest.mark.parametrize("better", [-1.1, -0.9, 0.1, 0.9, 1.1])
 def test_a_little_better_may_be_luck(choosing: Choosing, better: float) -> None:
-    """Of two that differ by little, the one of more vertices if there is a limit to them, and else that of fewer."""
-    quality = curve(n1=20, n2=22, n3=23, n4=24, n6=25, n8=26 + better * LUCK, n12=26, n16=21, n24=21, n32=21, n48=21)
-    expected = 12 if better < 1 else 8
-    for budget in (BudgetConfig(target_psnr=30, vertices=48), BudgetConfig(texels="1M", vertices=48)):
-        world = World(quality)
-        assert choosing(world, budget).config.billboards == expected
-        assert world.others == ([] if expected == 12 or budget.target_psnr else [(4, "two", "clusters"), (8, "one", "even")])
-    for budget in (
-        BudgetConfig(target_psnr=30),
-        BudgetConfig(texels="1M"),
-        BudgetConfig(bytes="1M"),
-        BudgetConfig(target_psnr=30, texels="1M"),
+    """Of two that differ by little, the one of more vertices if there is a limit to them, or fewer for a target; otherwise the better."""
+    quality = curve(n1=20, n2=22, n3=23, n4=24, n6=25, n8=26 + better * LUCK, n16=26, n12=24, n24=21, n32=21, n48=21)
+    for budget, expected in (
+        (BudgetConfig(target_psnr=30, vertices=64), 16 if better < 1 else 8),
+        (BudgetConfig(target_psnr=30), 16 if better < -1 else 8),
+        (BudgetConfig(target_psnr=30, texels="1M"), 16 if better < -1 else 8),
+    ):
+        assert choosing(World(quality), budget).config.billboards == expected
+    quality = curve(n6=25, n8=26 + better * LUCK, n12=26, n16=21, n24=21, n32=21, n48=21)
+    for budget, expected in (
+        (BudgetConfig(texels="1M", vertices=48), 12 if better < 1 else 8),
+        (BudgetConfig(texels="1M"), 12 if better < 0 else 8),
+        (BudgetConfig(bytes="1M"), 12 if better < 0 else 8),
     ):
         world = World(quality)
-        found = choosing(world, budget)
-        assert found.config.billboards == (12 if better < -1 else 8) and 12 in world.line
+        assert choosing(world, budget).config.billboards == expected
+        assert world.others == ([] if expected == 12 else [(4, "two", "clusters"), (8, "one", "even")])
 
 
 @pytest.mark.parametrize(("better", "expected"), [(0.9, 12), (1.1, 6)])
@@ -539,11 +553,9 @@ def test_fewer_than_the_vertices_allow_are_chosen_only_if_they_are_better(choosi
 def test_luck_does_not_make_up_for_a_number(choosing: Choosing) -> None:
     """It is counted from the best, and not from each to the next."""
     step = 0.7 * LUCK
-    quality = curve(n1=26 - 2 * step, n2=26 - step, n3=26, n4=26 - step, n6=26 - 2 * step, n8=26 - 3 * step)
-    found = choosing(World(quality), BudgetConfig(target_psnr=30, vertices=32))
-    assert found.config.billboards == 4
-    found = choosing(World(quality), BudgetConfig(texels="1M"))
-    assert found.config.billboards == 2
+    quality = curve(n1=26 - 2 * step, n2=26 - step, n4=26, n8=26 - step, n16=26 - 2 * step, n32=26 - 3 * step)
+    assert choosing(World(quality), BudgetConfig(target_psnr=30, vertices=128)).config.billboards == 8
+    assert choosing(World(quality), BudgetConfig(target_psnr=30)).config.billboards == 2
 
 
 def test_of_equals_the_first_is_chosen(choosing: Choosing) -> None:
@@ -619,7 +631,7 @@ class Noted(World):
 
 def test_what_is_asked_for_is_kept(views: ViewDataset) -> None:
     """In the trials, steps included, and in the fit, which is not short unless it was asked to be."""
-    asked = FitConfig(steps=7, views_per_step=3, candidates=2, levels=2, loss="l1", texel_density=0.7, orientation="free")
+    asked = FitConfig(steps=7, views_per_step=3, candidates=2, levels=1, loss="l1", texel_density=0.7, orientation="free")
     world = Noted()
     found = choose(views, asked, BudgetConfig(vertices=4), known=world.trial)
     first = dataclasses.replace(asked, billboards=1, placement="clusters", restarts=1, refinement_rounds=0)
@@ -629,11 +641,11 @@ def test_what_is_asked_for_is_kept(views: ViewDataset) -> None:
     short = Noted()
     plain = choose(views, FitConfig(), BudgetConfig(vertices=4), known=short.trial).config
     assert plain == FitConfig(billboards=1, placement=plain.placement).resolve() == plain.resolve()
-    most = {"steps": 150, "views_per_step": 2, "levels": 3, "restarts": 1, "candidates": 4, "refinement_rounds": 0}
+    most = {"steps": 200, "views_per_step": 2, "levels": 2, "restarts": 1, "candidates": 4, "refinement_rounds": 0}
     assert short.configs[0] == FitConfig(billboards=1, placement="clusters", **most)  # type: ignore[arg-type]
     assert short_config(FitConfig(steps=9000, levels=7, candidates=50), 1, "one", "clusters", None) == short.configs[0]
     even = short_config(FitConfig(), 3, "two", "even", 500)
-    assert (even.billboards, even.sides, even.max_texels, even.levels, even.steps) == (3, "two", 500, None, 150)
+    assert (even.billboards, even.sides, even.max_texels, even.levels, even.steps) == (3, "two", 500, None, 200)
 
 
 @pytest.mark.parametrize(
