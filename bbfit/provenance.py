@@ -22,7 +22,7 @@ VERSIONS: Mapping[str, int] = {
     "convert": 1,
     "views": 2,
     "budget": 6,
-    "fit": 11,
+    "fit": 12,
     "export": 4,
     "evaluate": 9,
     "report": 3,

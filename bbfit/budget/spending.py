@@ -18,8 +18,6 @@ _BYTES_PER_TEXEL = 2.0
 _AIM, _MIN_USE, _MOST_AIMS = 0.92, 0.6, 3
 # A trial that has less than this fraction of the texels that it may have is as dense as its configuration asks for.
 _MIN_TEXELS = 0.6
-# Factor on the texels of the full fit, whose textures compress better than those of a short fit.
-_COMPRESSION_GAIN = 1.05
 # Gain in dB for twice the texels, before trials show it, and the least ratio of texels that shows it.
 _TEXEL_GAIN_DB, _LEAST_RATIO = 0.4, 1.3
 
@@ -33,7 +31,7 @@ class Spent:
     psnr: float
     """Estimated PSNR of a short fit at the limits, in dB."""
     max_texels: int | None
-    """Limit of texels with which a full fit is expected to use all that it may."""
+    """Limit of texels with which a short fit is expected to use all that it may. A full fit uses a little more and compresses better."""
 
 
 def spent(trials: Trials, budget: BudgetConfig, count: int, sides: Sides, placement: Placement, *, anyway: bool = False) -> Spent | None:
@@ -65,7 +63,7 @@ def spent(trials: Trials, budget: BudgetConfig, count: int, sides: Sides, placem
     left = min(texels_within([trial], textures, limit), most or math.inf)
     octaves = 0.0 if has_all_texels(trial) else math.log2(left / _granted(trial))
     gain = 0.0 if budget.target_psnr is not None else texel_gain(trials.done) * min(1.0, octaves)
-    return Spent(trial, trial.psnr + gain, min(int(_COMPRESSION_GAIN * left), most or 1 << 40))
+    return Spent(trial, trial.psnr + gain, min(int(left), most or 1 << 40))
 
 
 def texels_within(trials: Sequence[Trial], textures: int, most_bytes: float) -> float:

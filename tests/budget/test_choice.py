@@ -32,8 +32,8 @@ from bbfit.views import ViewDataset
 
 LUCK = 0.15
 """What two short fits may differ by for no reason, in dB."""
-BYTES_A_TEXEL, CRISPER, AIM, NEAR = 2.0, 1.05, 0.92, 0.6
-"""The first guess; a longer fit packs better; the part of a limit in bytes that a trial aims at, and the least that it is to use."""
+BYTES_A_TEXEL, AIM, NEAR = 2.0, 0.92, 0.6
+"""The first guess; the part of a limit in bytes that a trial aims at, and the least that it is to use."""
 LESS = 1
 """Trials of less than a limit in texels or bytes, for the curve."""
 DOUBLED = [1, 2, 4, 8, 16, 32, 48]
@@ -345,7 +345,7 @@ def test_bytes_are_kept_and_made_use_of_whatever_a_texel_takes(choosing: Choosin
     for trial in found.trials[-2:]:
         assert NEAR * 100_000 < trial.bytes <= 100_000
     assert found.config.max_texels is not None
-    assert rate * found.config.max_texels == pytest.approx(CRISPER * 100_000, abs=3 * rate)
+    assert rate * found.config.max_texels == pytest.approx(100_000, abs=3 * rate)
 
 
 def test_bytes_that_are_not_needed_are_not_asked_for_again(choosing: Choosing) -> None:
@@ -353,7 +353,7 @@ def test_bytes_that_are_not_needed_are_not_asked_for_again(choosing: Choosing) -
     world = World(rising, texels=100)
     found = choosing(world, BudgetConfig(vertices=16, bytes="100k"))
     assert world.line == [4, 3] and len(world.asked) == 4
-    assert found.config.max_texels == int(CRISPER * 100_000 / 800 * 400)
+    assert found.config.max_texels == int(100_000 / 800 * 400)
 
 
 def test_what_a_billboard_takes_besides_is_found_out(choosing: Choosing) -> None:
@@ -363,7 +363,7 @@ def test_what_a_billboard_takes_besides_is_found_out(choosing: Choosing) -> None
     assert summary(found) == (12, "one", "clusters") and world.line == [12, 12, 8]
     for trial in found.trials[1:]:
         assert trial.bytes == pytest.approx(AIM * 20_000, abs=2)
-    assert found.config.max_texels == pytest.approx(CRISPER * (20_000 - 4800) / 2, abs=3)
+    assert found.config.max_texels == pytest.approx((20_000 - 4800) / 2, abs=3)
 
 
 def test_so_many_that_no_texel_is_left_are_not_tried(choosing: Choosing) -> None:
@@ -387,7 +387,7 @@ def test_a_budget_of_bytes_that_can_be_kept_is_kept(choosing: Choosing) -> None:
 def test_bytes_and_texels_hold_at_once(choosing: Choosing) -> None:
     world = World(rising, texels=10**6)
     found = choosing(world, BudgetConfig(vertices=16, bytes=40_000, texels="1M"))
-    assert found.trials[found.chosen].bytes <= 40_000 and found.config.max_texels == pytest.approx(CRISPER * 20_000, abs=3)
+    assert found.trials[found.chosen].bytes <= 40_000 and found.config.max_texels == pytest.approx(20_000, abs=3)
     world = World(rising, texels=10**6)
     found = choosing(world, BudgetConfig(vertices=16, bytes="1M", texels=3000))
     assert {asked[3] for asked in world.asked} == {3000} and found.config.max_texels == 3000

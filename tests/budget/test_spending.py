@@ -78,7 +78,7 @@ def test_what_a_trial_leaves_of_the_limit_counts_as_used(trials_of: Callable[...
         trials = trials_of(lambda count, texels: (round(texels * 100_000 / 2**0.5 / 46_000), 20.0))
         found = spent(trials, budget, 4, "one", "clusters")
         assert found is not None and len(trials.done) == 1
-        assert found.psnr == pytest.approx(20 + gain, abs=1e-4) and found.max_texels == pytest.approx(1.05 * 2**0.5 * 46_000, abs=3)
+        assert found.psnr == pytest.approx(20 + gain, abs=1e-4) and found.max_texels == pytest.approx(2**0.5 * 46_000, abs=3)
 
 
 def test_what_exceeds_the_limit_is_nothing(trials_of: Callable[..., Trials]) -> None:
