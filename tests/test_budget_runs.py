@@ -10,8 +10,9 @@ import cv2
 import pytest
 import torch
 
-from bbfit.budget.choice import Trial, model_bytes
 from bbfit.budget.config import BudgetConfig
+from bbfit.budget.sizes import model_bytes
+from bbfit.budget.trials import Trial
 from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
 from bbfit.files import write_json

@@ -97,6 +97,7 @@ def fit(
     config: FitConfig | None = None,
     *,
     tree: str | Path | TreeFile | None = None,
+    placement: BillboardCloud | None = None,
     checkpoint: str | Path | None = None,
     on_step: Callable[[Step], None] | None = None,
     on_place: Callable[[int, int], None] | None = None,
@@ -118,6 +119,9 @@ def fit(
         Options of the fit. Default: the preset ``default``.
     tree
         The mesh that the views show, as glTF, OBJ, PLY or STL, for the search for a placement. Default: the visual hull of the views.
+    placement
+        Billboards with textures to start from in place of a search, as :func:`~bbfit.fitting.search.find_placement` returns them. They
+        determine the number and the sides of the billboards. Default: a search, or the even placement. Not with ``checkpoint``.
     checkpoint
         File that stores the state every ``config.checkpoint_every`` steps. If it contains the state of a fit of the same views and mesh
         with the same configuration, the fit resumes from it and ends with the same result as an uninterrupted fit. The caller removes the
@@ -133,10 +137,12 @@ def fit(
         If the mesh is missing.
     InputError
         If a view cannot be read, all are empty, or they look along one line. If the mesh is not of the tree that the views show, or the
-        device is not available. If the result is not finite.
+        device is not available. If the result is not finite. If both a placement and a checkpoint are given.
     """
     if not isinstance(views, ViewDataset):
         raise InputTypeError(f"views: expected a ViewDataset, got {views!r}; ViewDataset.load(folder) reads one")
+    if placement is not None and checkpoint is not None:
+        fail("checkpoint", "a fit from a given placement keeps none", "leave one of them out")
     config = (config or FitConfig()).resolve()
     device = check_device(config)
     started = time.perf_counter()
@@ -146,7 +152,9 @@ def fit(
     key = cache_key("fit", *fit_inputs(views, config, tree_file))
     checkpoint = Path(checkpoint) if checkpoint is not None else None
     state = _load(checkpoint, key, config.steps) if checkpoint is not None else None
-    if state is None:
+    if state is None and placement is not None:
+        state = _placed_state(views, config, placement)
+    elif state is None:
         state = _initial_state(views, config, tree_file, on_place)
         if checkpoint is not None and state.placement is not None:
             _save(checkpoint, key, replace(state, seconds=time.perf_counter() - started))
@@ -217,14 +225,25 @@ def _initial_state(
         except (torch.linalg.LinAlgError, InputError) as error:
             fail("views", f"their cameras do not show a tree from around it ({error})", "check the cameras")
         return _FitState([], start, None, {}, 0.0)
-    rendered = views.request.tree if views.request else None
-    if tree is None:
-        points = hull_points(views.train, seed=config.seed, own=views.own)
-    else:
-        points = mesh_points(tree, views.train, rendered=rendered, seed=config.seed)
+    points = placement_points(views, config, tree)
     if config.billboards is None:
         config = config.counted(choose_count(views.train, points, config, on_place))
-    placement = find_placement(views.train, points, config, on_place)
+    return _placed_state(views, config, find_placement(views.train, points, config, on_place))
+
+
+def placement_points(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> Tensor:
+    """Sample the points on the tree that a search for a placement clusters, float64 [P, 3]: on its mesh, or in the views' visual hull.
+
+    Raises the errors of :func:`~bbfit.fitting.points.mesh_points` and :func:`~bbfit.fitting.points.hull_points`.
+    """
+    if tree is None:
+        return hull_points(views.train, seed=config.seed, own=views.own)
+    rendered = views.request.tree if views.request else None
+    return mesh_points(tree, views.train, rendered=rendered, seed=config.seed)
+
+
+def _placed_state(views: ViewDataset, config: ResolvedFit, placement: BillboardCloud) -> _FitState:
+    """Start from a placement with textures."""
     density = config.texel_density * float(pixels_per_meter(views.train.cameras))
     return _FitState([], sized(placement, density, config.max_texels), placement, {}, 0.0)
 

@@ -8,8 +8,10 @@ from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
 
-from bbfit.budget.choice import Trial, choose, lookup, within_bytes
+from bbfit.budget.choice import choose
 from bbfit.budget.config import BudgetConfig
+from bbfit.budget.sizes import fitted_within_bytes
+from bbfit.budget.trials import Trial, lookup
 from bbfit.checks import InputError, check_record
 from bbfit.exporting.config import ExportConfig
 from bbfit.files import read_json, write_bytes, write_json
@@ -74,7 +76,8 @@ def fit_stage(
     """Fit billboards and write ``cloud.safetensors``, ``loss.csv`` and ``loss.png``. An interrupted fit continues from its checkpoint.
 
     The fit uses the training views. Without ``tree``, the views alone place the billboards. ``limit`` is the maximum size of the model in
-    bytes with its export options. ``on_step`` is called after every step of the fit.
+    bytes with its export options; a fit that exceeds it is repeated for a few steps with fewer texels. ``on_step`` is called after every
+    step of the fit.
     """
     config = config.resolve()
     checkpoint = folder / "fit.checkpoint"
@@ -89,7 +92,7 @@ def fit_stage(
             on_progress("place", done, total)
 
         result = fit(views, config, tree=tree, checkpoint=checkpoint, on_step=after, on_place=on_place)
-        cloud = result.cloud if limit is None else within_bytes(result.cloud, *limit)
+        cloud = result.cloud if limit is None else fitted_within_bytes(views, result, *limit)
         cloud.save(folder / "cloud.safetensors")
         write_bytes(folder / "loss.csv", _loss_table(result.losses))
         loss_plot(result.losses, folder / "loss.png")

@@ -18,7 +18,18 @@ from bbfit.fitting import loop
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import start_cloud
 from bbfit.fitting.levels import LEAST_SIDE
-from bbfit.fitting.loop import FitResult, ResolutionLevel, Step, fit, learning_rate, resolution_levels, sample_views, step_alpha
+from bbfit.fitting.loop import (
+    FitResult,
+    ResolutionLevel,
+    Step,
+    fit,
+    learning_rate,
+    placement_points,
+    resolution_levels,
+    sample_views,
+    step_alpha,
+)
+from bbfit.fitting.search import find_placement
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
@@ -155,6 +166,18 @@ def test_a_killed_fit_goes_on_to_the_same_result(views: ViewDataset, tmp_path: P
     assert same(whole, resumed)
     again = fit(views, config, checkpoint=state, on_step=lambda step: pytest.fail("there was nothing left to do"))
     assert same(whole, again)
+
+
+def test_a_fit_from_a_placement_is_the_fit_that_finds_it(data_views: ViewDataset, tmp_path: Path) -> None:
+    """Bit for bit; another placement gives another result, and a checkpoint, which would not know of it, is refused."""
+    config = quick(billboards=2, steps=8, views_per_step=1).resolve()
+    points = placement_points(data_views, config, None)
+    found = find_placement(data_views.train, points, config)
+    assert same(fit(data_views, config, placement=found), fit(data_views, config))
+    other = dataclasses.replace(found, centers=found.centers + 0.1)
+    assert not torch.equal(fit(data_views, config, placement=other).cloud.centers, fit(data_views, config).cloud.centers)
+    with pytest.raises(InputError, match=r"^checkpoint: a fit from a given placement keeps none"):
+        fit(data_views, config, placement=found, checkpoint=tmp_path / "state")
 
 
 def test_a_snapshot_is_a_copy_of_the_cloud_at_its_level(views: ViewDataset) -> None:

@@ -11,7 +11,8 @@ import pytest
 import torch
 from billboard_scene import crossing_billboards, write_views
 
-from bbfit.budget.choice import Choice, Trial
+from bbfit.budget.choice import Choice
+from bbfit.budget.trials import Trial
 from bbfit.checks import InputError
 from bbfit.evaluation.backgrounds import over_background
 from bbfit.evaluation.scoring import held_out
@@ -123,7 +124,7 @@ def test_loss_plot_needs_losses(tmp_path: Path) -> None:
 
 def trial(count: int, psnr: float, sides: Sides = "one", placement: Placement = "clusters") -> Trial:
     textures = count * (1 if sides == "one" else 2)
-    return Trial(count, sides, placement, None, 4 * textures, 10_000 * count, 30_000 * count, psnr, 1.0)
+    return Trial(count, sides, placement, None, 4 * textures, 10_000 * count, 30_000 * count, 20_000 * count, psnr, 1.0)
 
 
 def chosen(trials: list[Trial], number: int) -> Choice:

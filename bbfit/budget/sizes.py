@@ -1,0 +1,64 @@
+"""Bytes of a model, and textures that get fewer texels until a model has few enough."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from bbfit.checks import fail
+from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.model import shipped_model
+from bbfit.fitting.levels import resize_textures
+from bbfit.fitting.loop import FitResult, fit
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.glb import split_glb
+from bbfit.views import ViewDataset
+
+# The most steps of a fit that is repeated with fewer texels, the factor on its learning rate, the fraction of the limit that it aims at,
+# and the most repetitions.
+_STEPS, _RATE, _AIM, _MOST_FITS = 100, 1 / 3, 0.98, 3
+
+
+def model_bytes(cloud: BillboardCloud, export: ExportConfig) -> int:
+    """Return the size of the cloud as GLB, in bytes."""
+    return len(shipped_model(cloud, export).glb)
+
+
+def picture_bytes(glb: bytes) -> int:
+    """Return the size of all pictures in a GLB, in bytes."""
+    tree, contents = split_glb(glb)
+    return sum(len(contents[image["bufferView"]]) for image in tree["images"])
+
+
+def fitted_within_bytes(views: ViewDataset, result: FitResult, max_bytes: int, export: ExportConfig) -> BillboardCloud:
+    """Return the cloud of a fit, with fewer texels if the exported model has more than ``max_bytes`` bytes.
+
+    The textures are then fitted to the training views again, from the result on, for at most 100 steps in the same placement. Resized
+    textures without new steps are much worse, above all those of masks, and compress less well, because filtering makes new values. They
+    are the last resort (:func:`within_bytes`, which raises its error).
+    """
+    cloud, config = result.cloud, result.config
+    short = {"levels": 1, "steps": min(config.steps, _STEPS), "placement_learning_rate": 0.0, "learning_rate": _RATE * config.learning_rate}
+    for _ in range(_MOST_FITS):
+        glb = shipped_model(cloud, export).glb
+        if len(glb) <= max_bytes:
+            return cloud
+        pictures = picture_bytes(glb)
+        texels = int(len(cloud.texels) * min(_AIM, (_AIM * max_bytes - len(glb) + pictures) / pictures))
+        if texels < cloud.vertex_count // 2:  # two for each texture
+            break
+        cloud = fit(views, replace(config, billboards=len(cloud), max_texels=texels, **short), placement=cloud).cloud  # type: ignore[arg-type]
+    return within_bytes(cloud, max_bytes, export)
+
+
+def within_bytes(cloud: BillboardCloud, max_bytes: int | None, export: ExportConfig) -> BillboardCloud:
+    """Resize the textures of a cloud until the exported model has at most ``max_bytes`` bytes; ``None`` is no limit.
+
+    Raises InputError if the model is larger even with one texel per texture.
+    """
+    while max_bytes is not None and (size := model_bytes(cloud, export)) > max_bytes:
+        if int(cloud.texture_sizes.amax()) == 1:
+            fail("bytes", f"{max_bytes:,} are too few: {size:,} are needed without textures", "allow more, or fewer billboards")
+        sizes = (cloud.texture_sizes * min(0.98, math.sqrt(max_bytes / size))).long().clamp_min(1)
+        cloud = resize_textures(cloud, sizes)
+    return cloud

@@ -1,0 +1,47 @@
+"""A finished fit that has too many bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from bbfit.budget.sizes import fitted_within_bytes, model_bytes, within_bytes
+from bbfit.budget.trials import validation_psnr
+from bbfit.checks import InputError
+from bbfit.exporting.config import ExportConfig
+from bbfit.fitting.config import FitConfig
+from bbfit.fitting.loop import FitResult, fit
+from bbfit.views import ViewDataset
+
+EXPORT = ExportConfig(outline="rectangle")
+
+
+@pytest.fixture(scope="module")
+def views() -> ViewDataset:
+    return ViewDataset.load(Path(__file__).resolve().parents[2] / "data" / "views")
+
+
+@pytest.fixture(scope="module")
+def result(views: ViewDataset) -> FitResult:
+    return fit(views, FitConfig(billboards=4, placement="even", steps=160))
+
+
+def test_a_fit_with_few_enough_bytes_is_left_alone(views: ViewDataset, result: FitResult) -> None:
+    assert fitted_within_bytes(views, result, model_bytes(result.cloud, EXPORT), EXPORT) is result.cloud
+
+
+@pytest.mark.parametrize("share", [0.98, 0.8, 0.5])
+def test_too_many_bytes_are_fitted_away(views: ViewDataset, result: FitResult, share: float) -> None:
+    """Which is better than to resize textures, and leaves little of the limit; the planes stay."""
+    limit = int(share * model_bytes(result.cloud, EXPORT))
+    cloud, resized = fitted_within_bytes(views, result, limit, EXPORT), within_bytes(result.cloud, limit, EXPORT)
+    assert 0.8 * limit < model_bytes(cloud, EXPORT) <= limit
+    assert torch.equal(cloud.rights, result.cloud.rights) and torch.equal(cloud.ups, result.cloud.ups)
+    assert validation_psnr(cloud, views.train) > validation_psnr(resized, views.train) + 0.2  # measured 0.33 and more
+
+
+def test_a_limit_below_the_rectangles_is_refused(views: ViewDataset, result: FitResult) -> None:
+    with pytest.raises(InputError, match=r"^bytes: 1,000 are too few: \d,\d+ are needed without textures"):
+        fitted_within_bytes(views, result, 1000, EXPORT)
