@@ -47,7 +47,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "ssim_weight": 0.01,
         "palette": 256,
         "levels": 4,
-        "steps": 1200,
+        "steps": 800,
         "views_per_step": 2,
         "learning_rate": 0.3,
         "beta1": 0.8,
@@ -82,9 +82,9 @@ _PRESETS: dict[str, dict[str, Any]] = {
 # Values of the default preset that depend on the alpha mode. A cutoff leaves no half-transparent texels that could smooth an edge, and
 # stochastic alpha is the noisier the more of them there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
-    "mask": {"colors": "views", "antialiased": True, "texel_density": 0.8, "sharpness_weight": 8.0, "binarization_weight": 0.02},
-    "blend": {"colors": "matched", "antialiased": False, "texel_density": 1.0, "sharpness_weight": 14.0, "binarization_weight": 0.004},
-    "hash": {"colors": "views", "antialiased": False, "texel_density": 1.0, "sharpness_weight": 14.0, "binarization_weight": 0.03},
+    "mask": {"colors": "views", "antialiased": True, "texel_density": 0.8, "sharpness_weight": 4.0, "binarization_weight": 0.02},
+    "blend": {"colors": "matched", "antialiased": False, "texel_density": 1.0, "sharpness_weight": 6.0, "binarization_weight": 0.01},
+    "hash": {"colors": "views", "antialiased": False, "texel_density": 1.0, "sharpness_weight": 6.0, "binarization_weight": 0.03},
 }
 
 
@@ -103,7 +103,7 @@ class FitConfig:
     """Number of billboards. Preset: as many as pay for this tree, within least_billboards and most_billboards; thesis: 4."""
     least_billboards: Count = 16
     """Least number of billboards that the preset chooses by itself."""
-    most_billboards: Count = 32
+    most_billboards: Count = 64
     """Largest number of billboards that the preset chooses by itself."""
     placement: Placement | None = None
     """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
@@ -157,15 +157,15 @@ class FitConfig:
     """Weight of 1 - SSIM, which preserves structure, beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: _Sharpness | None = None
     """Weight of the sharpness loss: the squared difference in mean contrast between neighboring pixels, at full resolution.
-    Preset: 8 (mask) or 14; thesis: 0."""
+    Preset: 4 (mask) or 6; thesis: 0."""
     binarization_weight: _Binarization | None = None
     """Weight that pushes alpha to 0 or 1: of alpha * (1 - alpha), summed over texels, over a view's pixels, at full resolution.
-    Preset: 0.02 (mask), 0.004 (blend) or 0.03 (hash); thesis: 0."""
+    Preset: 0.02 (mask), 0.01 (blend) or 0.03 (hash); thesis: 0."""
     levels: Count | None = None
     """Number of resolutions, from coarse to fine; each doubles the sides of the one before. Steps are divided evenly among them.
     Preset: 4; thesis: 1."""
     steps: Count | None = None
-    """Steps of the optimizer. Preset: 1200; thesis: 10000."""
+    """Steps of the optimizer. Preset: 800; thesis: 10000."""
     views_per_step: Count | None = None
     """Views in each step at full resolution; each coarser resolution doubles their number. Preset: 2; thesis: 1."""
     learning_rate: _Rate | None = None

@@ -43,6 +43,8 @@ _START, _PLACEMENT = "start.", "found."
 _ANEW = "remove it to start the fit anew"
 # More texels in a checkpoint than any fit has.
 _MOST_TEXELS = 1 << 28
+# Compact billboards that are opaque to a larger share than this do not grow: what they would gain in quality costs more in drawn pixels.
+_DENSEST = 0.35
 # Fraction of the steps at full resolution during which a mask hardens.
 _HARDENING = 0.3
 
@@ -188,7 +190,9 @@ def fit(
         fitted = stepper.finish()
         del stepper
         if movement is not None:
-            start = bounded(fitted, opaque_bounds(fitted), density, config.max_texels).to(torch.float32)
+            start = bounded(fitted, opaque_bounds(fitted, densest=_DENSEST if config.locality else 1.0), density, config.max_texels).to(
+                torch.float32
+            )
     assert fitted is not None
     fitted = replace(fitted, alpha=AlphaMode(config.alpha, config.alpha_cutoff))
     if config.alpha == "mask":

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bbfit.fitting.config import ResolvedFit
-from bbfit.fitting.initialize import tree_radius
+from bbfit.fitting.initialize import pixels_per_meter, tree_radius
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.moves import ADDITIONS, REFINEMENTS, Moves
@@ -56,7 +56,12 @@ QUICK = Effort(more_steps=30, most_additions=0)
 COUNTS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Numbers of billboards that are compared."""
 LEAST_GAIN_DB = 1.5
-"""Least gain at a low resolution, in dB, for which the area of the billboards may double."""
+"""Least gain at a low resolution, in dB, for which the number of layers may double."""
+MOST_LAYERS = 3.3
+"""Most opaque layers before each other at a low resolution, on average over the pixels of the tree. A finished model shades two to four
+times as many pixels for each pixel of the tree."""
+# Least alpha of a texel that counts as opaque in layers.
+_OPAQUE = 0.25
 
 
 def find_placement(
@@ -65,8 +70,9 @@ def find_placement(
     """Search for the placement of billboards that explains the training views best at a low resolution.
 
     Each of ``restarts`` searches clusters the points on the tree, float64 [P, 3], from ``candidates`` random starts and fits each
-    clustering, placement and textures, for a few steps. The best 30 % continue for more steps. A search then adds the last quarter of the
-    billboards, but at most eight, to the best clouds, by splitting a billboard or by placing one where the loss is largest.
+    clustering, placement and textures, for a few steps. The best 30 % continue for more steps. Unless the clusters are compact
+    (``locality``), a search then adds the last quarter of the billboards, but at most eight, to the best clouds, by splitting a billboard
+    or by placing one where the loss is largest.
 
     ``refinement_rounds`` rounds then refine the cloud with the least loss (:meth:`~bbfit.fitting.moves.Moves.refined`). A round keeps the
     best change only if it lowers the loss.
@@ -89,9 +95,10 @@ def find_placement(
 def choose_count(views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None] | None = None) -> int:
     """Choose the number of billboards at the knee of the curve: from which on more of them cost more than they gain.
 
-    What a graphics card pays for is the area that it shades and the textures on it, and both grow with the area of the billboards. Short
-    searches try increasing numbers of billboards, from ``least_billboards`` to ``most_billboards``. A number replaces the last one that
-    was accepted if every doubling of the area lowers the loss at a low resolution by at least :data:`LEAST_GAIN_DB`.
+    What a graphics card pays for is the pixels that it shades, and they grow with the number of opaque layers before each other. Short
+    searches try increasing numbers of billboards, from ``least_billboards`` to ``most_billboards``, until there are more than
+    :data:`MOST_LAYERS` layers. A number replaces the last one that was accepted if every doubling of the layers lowers the loss at a low
+    resolution by at least :data:`LEAST_GAIN_DB`.
 
     Parameters and progress are those of :func:`find_placement`; ``config.billboards`` is not used.
     """
@@ -103,9 +110,11 @@ def choose_count(views: ViewSet, points: Tensor, config: ResolvedFit, on_progres
     for number, count in enumerate(counts):
         search = _Search(views, points, config.counted(count), lambda done, total: None, QUICK)
         cloud, loss = search.searched(0)
-        area, decibels = float(cloud.half_extents.double().prod(-1).sum()), -10 * math.log10(max(loss, 1e-12))
-        if accepted is None or decibels - accepted[2] >= LEAST_GAIN_DB * max(math.log2(area / accepted[1]), 0.0):
-            accepted = count, area, decibels
+        layers, decibels = search.layers(cloud), -10 * math.log10(max(loss, 1e-12))
+        if accepted is not None and layers > MOST_LAYERS:
+            break
+        if accepted is None or decibels - accepted[2] >= LEAST_GAIN_DB * max(math.log2(layers / accepted[1]), 0.0):
+            accepted = count, layers, decibels
         if on_progress is not None:
             on_progress(number + 1, len(counts))
     assert accepted is not None
@@ -124,7 +133,8 @@ class _Search:
         self.moves = Moves(points, self._targets.cameras, self._pictures, config, self._radius, self._generator)
         assert config.billboards and config.candidates and config.restarts and config.refinement_rounds is not None  # see counted()
         self._restarts, self._candidates, self._rounds = config.restarts, config.candidates, config.refinement_rounds
-        self._added = min(config.billboards // _BILLBOARDS_PER_ADDITION, effort.most_additions)
+        # An addition is a slice through the whole tree, and compact parts leave none out.
+        self._added = 0 if config.locality else min(config.billboards // _BILLBOARDS_PER_ADDITION, effort.most_additions)
         self._clusters, self._survivors = config.billboards - self._added, max(1, round(effort.survivors * config.candidates))
         self._done = 0
         # Clouds that get additions. Every addition halves their number, and few billboards limit it, so that the search stays short.
@@ -132,6 +142,14 @@ class _Search:
         completed = sum(max(1, self._chains >> addition) for addition in range(self._added))
         each = effort.steps * config.candidates + effort.more_steps * self._survivors + effort.mend_steps * ADDITIONS * completed
         self._total = config.restarts * each + effort.mend_steps * (1 + REFINEMENTS) * config.refinement_rounds
+
+    def layers(self, cloud: BillboardCloud) -> float:
+        """How many opaque texels of a cloud lie before each other in a pixel of the tree, on average over the views."""
+        cameras, cloud = self._targets.cameras, cloud.to(torch.float64)
+        opaque = torch.stack([(texture[..., 3] > _OPAQUE).double().mean() for texture in cloud.textures()])
+        facing = (cameras.batch().forward.double() @ cloud.normals.mT).abs().mean(0)
+        drawn = float((4 * cloud.half_extents.prod(-1) * opaque * facing).sum()) * float(pixels_per_meter(cameras)) ** 2
+        return max(drawn / max(float(self._pictures[..., 3].sum((1, 2)).mean()), 1.0), 1e-9)
 
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
