@@ -112,8 +112,8 @@ class FitConfig:
     orientation: Orientation = "any"
     """Orientation of clustered billboards: upright, in any direction (free), or whichever of the two fits better (any)."""
     locality: _Unit | None = None
-    """How compact the parts of the tree are that clustered billboards stand for: the weight of distances within a part against distances
-    from its plane. With 0, billboards are slices through the whole tree; the larger, the smaller they are, and the less there is to draw.
+    """Compactness of what clustered billboards stand for: the weight of distances within a part of the tree against those from its plane.
+    With 0, billboards are slices through the whole tree; the larger it is, the smaller they are, and the less there is to draw.
     Default: 0.1 for twelve billboards or more, else 0."""
     trunk_billboards: _Number | None = None
     """Number of billboards, out of all, that cross in the trunk below the crown; for clusters, and trees with such a trunk.
@@ -151,8 +151,8 @@ class FitConfig:
     max_texels: Count | None = None
     """Most texels of all billboards together; their density is lowered to stay within it. Default: no limit."""
     palette: _Palette | None = None
-    """Number of different colors, alpha included, of all texels: 34 to 256, or 0 for any number. Up to 256, the PNG stores one byte a
-    texel instead of four, and leaves hide the difference. Preset: 256; thesis: 0."""
+    """Number of different colors of all texels, alpha included: 34 to 256, or 0 for any number.
+    The PNG then stores one byte a texel instead of four, and leaves hide the difference. Preset: 256; thesis: 0."""
     ssim_weight: _Unit | None = None
     """Weight of 1 - SSIM, which preserves structure, beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: _Sharpness | None = None

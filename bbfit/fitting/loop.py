@@ -24,10 +24,11 @@ from bbfit.fitting.initialize import bounded, pixels_per_meter, random_textures,
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.palette import palettized
-from bbfit.fitting.points import hull_points, mesh_points
+from bbfit.fitting.points import COUNT, hull_points, mesh_points
 from bbfit.fitting.requirements import check_cameras, check_device
 from bbfit.fitting.search import choose_count, find_placement
 from bbfit.fitting.steps import BLEND, HARDEST, Stepper
+from bbfit.fitting.visibility import visible_points
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
@@ -43,6 +44,8 @@ _START, _PLACEMENT = "start.", "found."
 _ANEW = "remove it to start the fit anew"
 # More texels in a checkpoint than any fit has.
 _MOST_TEXELS = 1 << 28
+# Points on the mesh for each one that is chosen because views see it.
+_DENSE = 5
 # Compact billboards that are opaque to a larger share than this do not grow: what they would gain in quality costs more in drawn pixels.
 _DENSEST = 0.35
 # Fraction of the steps at full resolution during which a mask hardens.
@@ -243,7 +246,8 @@ def placement_points(views: ViewDataset, config: FitConfig, tree: TreeFile | Non
     if tree is None:
         return hull_points(views.train, seed=config.seed, own=views.own)
     rendered = views.request.tree if views.request else None
-    return mesh_points(tree, views.train, rendered=rendered, seed=config.seed)
+    points = mesh_points(tree, views.train, rendered=rendered, count=_DENSE * COUNT, seed=config.seed)
+    return visible_points(points, float(tree.mesh().area), views.train.cameras, COUNT, config.seed)
 
 
 def _placed_state(views: ViewDataset, config: ResolvedFit, placement: BillboardCloud) -> _FitState:

@@ -26,7 +26,7 @@ def palettized(cloud: BillboardCloud, count: int) -> BillboardCloud:
 
     :data:`~bbfit.fitting.config.TRANSPARENT_COLORS` of the palette are left to transparent texels, so ``count`` is larger; with 0 the cloud
     is returned as it is. The values are the means of clusters of texels by k-means (Lloyd 1982; start by Arthur and Vassilvitskii 2007), of
-    the quantity whose squared differences a viewer sees (:func:`_seen`). They have 8 bits.
+    the quantity whose squared differences a viewer sees (:func:`_seen`). All texels are rounded to 8 bits.
 
     Neighboring leaves differ by more than neighboring colors of the palette do, so that no bands show, and no dithering is needed.
     """
@@ -44,7 +44,8 @@ def palettized(cloud: BillboardCloud, count: int) -> BillboardCloud:
     labels = vq(seen, means)[0]
     palette = unpremultiply(_means(premultiply(texels), labels, torch.zeros(most, 4)))
     palette = (palette * 255).round().clamp(min=torch.tensor([0.0, 0.0, 0.0, 1.0])) / 255
-    return cloud.with_texels(cloud.texels.index_copy(0, visible.to(cloud.texels.device), palette[labels].to(cloud.texels)))
+    rounded = (cloud.texels * 255).round() / 255
+    return cloud.with_texels(rounded.index_copy(0, visible.to(cloud.texels.device), palette[labels].to(cloud.texels)))
 
 
 def _means(points: Tensor, labels: NDArray[np.int32], otherwise: Tensor) -> Tensor:

@@ -11,15 +11,13 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from bbfit.blender.request import RenderedTree
 from bbfit.checks import fail
 from bbfit.fitting.initialize import pixels_per_meter
-from bbfit.fitting.visibility import pixels_of, visible_points
+from bbfit.fitting.visibility import pixels_of
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, convergence_point
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewSet
 
 COUNT = 20_000
 """Default number of points."""
-# Points on the mesh for each one that is chosen because it is visible.
-_DENSE = 5
 # Least fraction of the mesh's points, averaged over views, that must project onto the tree in the views.
 _AGREEMENT = 0.95
 # Pixels that cover less of the mesh than this can be empty in a picture: its few samples miss thin parts. Such points of the mesh must be
@@ -37,9 +35,7 @@ _HULL_SIDE = 256
 
 
 def mesh_points(tree: TreeFile, views: ViewSet, *, rendered: RenderedTree | None = None, count: int = COUNT, seed: int = 0) -> Tensor:
-    """Sample ``count`` points on the triangles of a tree's mesh, float64 [P, 3] in the world of the views.
-
-    They are uniform by area where views see the mesh, and few where leaves hide it (:func:`~bbfit.fitting.visibility.visible_points`).
+    """Sample ``count`` points on the triangles of a tree's mesh, uniformly by area, float64 [P, 3] in the world of the views.
 
     The mesh must be readable without Blender. If it is the file that the views were ``rendered`` from, its bounds verify that bbfit reads
     it as Blender does. Otherwise the views verify that the mesh lies where they show the tree. Raises MissingFileError if the file is
@@ -48,7 +44,7 @@ def mesh_points(tree: TreeFile, views: ViewSet, *, rendered: RenderedTree | None
     import trimesh
 
     mesh = tree.mesh()
-    samples, _ = trimesh.sample.sample_surface(mesh, _DENSE * count, seed=seed)
+    samples, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
     points, bounds = torch.tensor(samples, dtype=torch.float64), torch.tensor(mesh.bounds, dtype=torch.float64)
     if tree.up_axis == "z":
         y_up = torch.tensor(Z_UP_TO_Y_UP, dtype=torch.float64)[:3, :3].mT
@@ -57,12 +53,12 @@ def mesh_points(tree: TreeFile, views: ViewSet, *, rendered: RenderedTree | None
     if known and known.bounds:
         difference = (bounds - torch.tensor(known.bounds, dtype=torch.float64)).abs().amax()
         if float(difference) <= _SAME_BOUNDS * float((bounds[1] - bounds[0]).norm()):
-            return visible_points(points, float(mesh.area), views.cameras, count, seed)
-    if _agreement(points[:count], float(mesh.area), views) < _AGREEMENT:
+            return points
+    if _agreement(points, float(mesh.area), views) < _AGREEMENT:
         if known:
             fail("tree", f"bbfit finds the triangles of {tree.path} elsewhere than Blender", "export it from Blender as .glb")
         fail("tree", f"{tree.path} is not where the views show a tree", "give the mesh that they were rendered from, or no mesh")
-    return visible_points(points, float(mesh.area), views.cameras, count, seed)
+    return points
 
 
 def _agreement(points: Tensor, area: float, views: ViewSet) -> float:

@@ -57,7 +57,7 @@ COUNTS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Numbers of billboards that are compared."""
 LEAST_GAIN_DB = 1.5
 """Least gain at a low resolution, in dB, for which the number of layers may double."""
-MOST_LAYERS = 3.3
+MOST_LAYERS = 3.6
 """Most opaque layers before each other at a low resolution, on average over the pixels of the tree. A finished model shades two to four
 times as many pixels for each pixel of the tree."""
 # Least alpha of a texel that counts as opaque in layers.

@@ -34,7 +34,7 @@ def test_few_colors_near_the_old_ones(kind: str, count: int) -> None:
     fewer = palettized(cloud, count)
     visible = cloud.texels[:, 3] >= 0.5 / 255
     assert len(distinct(to_bytes(fewer.texels[visible]))) <= count - TRANSPARENT_COLORS
-    assert torch.equal(fewer.texels[~visible], cloud.texels[~visible]) and (fewer.texels[visible, 3] > 0).all()
+    assert (fewer.texels - cloud.texels)[~visible].abs().max() < 0.51 / 255 and (fewer.texels[visible, 3] > 0).all()
     shown = cloud.texels[:, 3] > (0.5 if kind == "mask" else 0.2)
     error = (fewer.texels - cloud.texels)[shown, :3].square().mean().sqrt()
     assert error < (0.15 if count == 256 else 0.22)  # measured at most 0.14 and 0.20; a single color has 0.29

@@ -80,18 +80,19 @@ def test_many_billboards_get_no_more_than_eight_additions(views: ViewDataset, po
     class Told(Exception):
         pass
 
-    def work(billboards: int) -> int:
+    def work(billboards: int, locality: float) -> int:
         """All work of the search, which is told after its first step."""
 
         def on_progress(done: int, total: int) -> None:
             raise Told(total)
 
-        asked = config(billboards=billboards, candidates=1, restarts=1, refinement_rounds=0, backend="reference")
+        asked = config(billboards=billboards, candidates=1, restarts=1, refinement_rounds=0, locality=locality, backend="reference")
         with pytest.raises(Told) as told:
             find_placement(views.train, points[:500], asked, on_progress, Effort(1, 1, 1))
         return int(told.value.args[0])
 
-    assert [work(billboards) for billboards in (7, 8, 40)] == [1 + 1 + additions * 4 for additions in (1, 2, 8)]
+    assert [work(billboards, 0.0) for billboards in (7, 8, 40)] == [1 + 1 + additions * 4 for additions in (1, 2, 8)]
+    assert work(40, 0.1) == 1 + 1  # compact parts leave nothing out
 
 
 @pytest.mark.parametrize("backend", ["fused", "reference"])
