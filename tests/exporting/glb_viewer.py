@@ -62,7 +62,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], list[Primitive], NDArray[np.ui
             material = tree["materials"][primitive["material"]]
             primitives.append(Primitive(attributes["POSITION"], attributes["NORMAL"], attributes["TEXCOORD_0"], triangles, material))
     (image,) = tree["images"]
-    return tree, primitives, np.array(Image.open(io.BytesIO(blob(tree["bufferViews"][image["bufferView"]]))))
+    return tree, primitives, np.array(Image.open(io.BytesIO(blob(tree["bufferViews"][image["bufferView"]]))).convert("RGBA"))
 
 
 def view_glb(path: Path, camera: Camera) -> NDArray[np.float64]:

@@ -118,9 +118,9 @@ def test_a_hull_saves_area_and_keeps_to_its_corners(crossed: BillboardCloud, tmp
 
 def test_mip_files_are_written_on_request(crossed: BillboardCloud, tmp_path: Path) -> None:
     files = export(crossed, tmp_path / "model.obj", ExportConfig(mip_files=True))
-    pictures = [np.array(Image.open(file)) for file in files if "_mip" in file.name]
+    pictures = [np.array(Image.open(file).convert("RGBA")) for file in files if "_mip" in file.name]
     assert len(pictures) > 4 and pictures[-1].shape == (1, 1, 4)
-    np.testing.assert_array_equal(pictures[0], np.array(Image.open(tmp_path / "model.png")))
+    np.testing.assert_array_equal(pictures[0], np.array(Image.open(tmp_path / "model.png").convert("RGBA")))
     for coarse, fine in zip(pictures[1:], pictures, strict=False):
         assert coarse.shape[:2] == tuple(max(1, side // 2) for side in fine.shape[:2])
 

@@ -174,7 +174,7 @@ def test_obj_says_what_it_can(clouds: dict[str, BillboardCloud], tmp_path: Path)
     assert "mtllib a tree.mtl\n" in model.read_text() and "culling" in model.read_text()
     assert {"map_Kd a tree.png", "map_d a tree.png", "illum 0"} <= set(material.read_text().splitlines())
     (glb,) = export(clouds["mixed"], tmp_path / "model.glb")
-    np.testing.assert_array_equal(np.array(Image.open(texture)), read_glb(glb)[2])
+    np.testing.assert_array_equal(np.array(Image.open(texture).convert("RGBA")), read_glb(glb)[2])
     z_up, y_up = (
         np.array([line.split()[1:] for line in path.read_text().splitlines() if line.startswith("v ")], float)
         for path in (model, export(clouds["mixed"], tmp_path / "y.obj")[0])
