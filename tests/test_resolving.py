@@ -20,7 +20,9 @@ def test_a_resolved_fit_has_every_value(preset: Preset, alpha: AlphaKind | None)
     resolved = given.resolve()
     assert type(resolved) is ResolvedFit and resolved.resolve() is resolved
     missing = {name for name, value in asdict(resolved).items() if value is None}
-    chosen_by_the_fit = {"billboards", "restarts", "candidates", "refinement_rounds", "trunk_billboards"} if preset == "default" else set()
+    chosen_by_the_fit = (
+        {"billboards", "restarts", "candidates", "refinement_rounds", "trunk_billboards", "locality"} if preset == "default" else set()
+    )
     assert missing == {"max_texels"} | chosen_by_the_fit
     assert {name: value for name, value in asdict(given).items() if value is not None}.items() <= asdict(resolved).items()
 
