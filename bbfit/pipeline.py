@@ -103,9 +103,11 @@ class RunConfig:
 
     @property
     def exported(self) -> ExportConfig:
-        """The options of the export: rectangles for a budget of vertices and for the preset ``thesis``, unless they ask for outlines."""
-        counted = self.budget.vertices is not None or self.fit.preset == "thesis"
-        return self.export.comparable() if counted else self.export
+        """The options of the export, unless they say otherwise: rectangles for a budget of vertices and for the preset ``thesis``, which
+        has no mip levels either."""
+        thesis = self.fit.preset == "thesis"
+        export = replace(self.export, mipmaps=False) if thesis and self.export.mipmaps is None else self.export
+        return export.comparable() if thesis or self.budget.vertices is not None else export
 
     def seeded(self, seed: int) -> RunConfig:
         """The same options with one seed for growing, rendering and fitting."""

@@ -46,5 +46,5 @@ def test_a_resolved_export_has_every_choice_but_the_clouds(profile: Profile | No
     resolved = ExportConfig(profile=profile, textures="auto").resolve()
     assert type(resolved) is ResolvedExport and resolved.resolve() is resolved
     assert resolved.textures in ("png", "ktx2") and resolved.split == (profile not in (None, "blender"))
-    assert {name for name, value in asdict(resolved).items() if value is None} - {"profile"} == {"alpha", "alpha_cutoff"}
+    assert {name for name, value in asdict(resolved).items() if value is None} - {"profile"} == {"alpha", "alpha_cutoff", "mipmaps"}
     assert not ExportConfig(profile="three", split=False).resolve().split

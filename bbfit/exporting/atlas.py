@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from bbfit.exporting.packing import packed
+from bbfit.fitting.palette import few_colors
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cards import Atlas
 from bbfit.images import PALETTE, bleed_color, distinct
 
@@ -69,6 +71,14 @@ def _within_palette(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if len(distinct(np.pad(fewer, ((0, 0), (0, 1))))) <= free:
             return fewer
     return colors
+
+
+def palettized_picture(image: NDArray[np.uint8], alpha: AlphaMode) -> NDArray[np.uint8]:
+    """A straight-alpha picture, uint8 [H, W, 4], whose colors fit into the palette of a PNG (:func:`~bbfit.fitting.palette.few_colors`)."""
+    few = few_colors(torch.from_numpy(image).reshape(-1, 4) / 255, alpha, PALETTE)
+    image = (few * 255).round().to(torch.uint8).reshape(image.shape).numpy()
+    image[image[..., 3] == 0, :3] = _within_palette(image)
+    return image
 
 
 def _mean_color(textures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from bbfit.checks import Count, Range, check_fields, fail
-from bbfit.geometry.alpha import AlphaKind, Cutoff
+from bbfit.geometry.alpha import AlphaKind, AlphaMode, Cutoff
 
 Up = Literal["auto", "y", "z"]
 Profile = Literal["three", "babylon", "godot", "unity", "unreal", "blender"]
@@ -15,6 +15,9 @@ Encoding = Literal["png", "webp", "ktx2"]
 Textures = Literal["auto"] | Encoding
 Material = Literal["unlit", "pbr"]
 Outline = Literal["pieces", "hull", "rectangle"]
+
+MOST_AVERAGED = 0.25
+"""The largest cutoff of a mask with which plain averages of alpha, the mip levels that programs compute, keep most of a tree's leaves."""
 
 # Defaults without a profile.
 _OPEN: dict[str, Any] = {"split": False, "material": "unlit", "textures": "png", "outline": "pieces"}
@@ -53,6 +56,9 @@ class ExportConfig:
     Default: PNG, the textures exactly as they were scored."""
     fallback: bool = True
     """Keep the PNG beside a texture in another format, for programs that cannot read that format."""
+    mipmaps: bool | None = None
+    """Read the texture with mip levels from afar, so that the tree does not flicker. Programs compute those of a PNG as plain averages.
+    Default: yes, except for a mask with a cutoff above 0.25, whose leaves would vanish with distance, and for the preset thesis."""
     mip_files: bool = False
     """Also write the mip levels as PNG files beside the model, for programs that import them."""
     material: Material | None = None
@@ -71,10 +77,14 @@ class ExportConfig:
         """The same options with rectangles unless they ask for outlines: all models have as many vertices for each billboard."""
         return replace(self, outline="rectangle") if self.outline is None else self
 
+    def mipmapped(self, alpha: AlphaMode) -> bool:
+        """Whether a model with an alpha mode is read with mip levels."""
+        return (alpha.kind != "mask" or alpha.cutoff <= MOST_AVERAGED) if self.mipmaps is None else self.mipmaps
+
     def resolve(self) -> ResolvedExport:
         """Fill in the choices that depend on the profile and on the installed encoders; a :class:`ResolvedExport` returns itself.
 
-        ``alpha`` and ``alpha_cutoff``, whose default is that of the cloud, stay as they are.
+        ``alpha`` and ``alpha_cutoff``, whose default is that of the cloud, stay as they are, and ``mipmaps``, which depends on them.
         """
         if isinstance(self, ResolvedExport):
             return self
@@ -105,7 +115,7 @@ class ResolvedExport(ExportConfig):
 
     @property
     def has_mips(self) -> bool:
-        """Whether the files include mip levels."""
+        """Whether the files include mip levels of their own."""
         return self.mip_files or self.textures == "ktx2"
 
 

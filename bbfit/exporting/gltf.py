@@ -25,8 +25,8 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
     """A GLB file with one mesh for the cards that show both sides, one for those with back-face culling, and one per card with an origin.
 
     The node of a card with an origin is at that origin, and two vertices that no triangle uses center the mesh's bounds on it: programs
-    sort blended meshes by one or the other. The sampler uses mip levels only if the file includes them (``ktx2``), because mip levels
-    that programs compute lose coverage.
+    sort blended meshes by one or the other. The sampler uses mip levels if the file includes them (``ktx2``) or if the options let
+    programs compute them (:meth:`~bbfit.exporting.config.ExportConfig.mipmapped`).
     """
     import trimesh
     from PIL import Image
@@ -88,7 +88,7 @@ def _complete(tree: dict[str, Any], cards: Cards, config: ResolvedExport) -> Non
     assert len({image["bufferView"] for image in tree["images"]}) == 1
     tree["images"] = [{"bufferView": tree["images"][0]["bufferView"]}]
     tree["textures"] = [{"sampler": 0, "name": "atlas"}]
-    tree["samplers"] = [_WITH_MIPS if config.textures == "ktx2" and cards.chain else _SAMPLER]
+    tree["samplers"] = [_WITH_MIPS if config.textures == "ktx2" or config.mipmapped(cards.alpha) else _SAMPLER]
     used = set(tree.get("extensionsUsed", ()))
     for material in tree["materials"]:
         material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}

@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bbfit.checks import fail
+from bbfit.exporting.atlas import palettized_picture
 from bbfit.exporting.mips import mip_chain
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Atlas, Cards
 from bbfit.geometry.orbit import Orbit
+from bbfit.images import PALETTE, distinct
 from bbfit.operators.drawing.compositing import opacity
 from bbfit.rendering.cards import filtered, hits, joined, sheets_of
 
@@ -64,8 +66,8 @@ def with_mips(cards: Cards) -> Cards:
 def reduced(cards: Cards, halvings: int) -> Cards:
     """Cards whose textures have sides of 2^-halvings and are as dense as before in views from all around.
 
-    The padding of the atlas shrinks too, so it must be at least 2^halvings texels, and the sides of the atlas multiples of 2^halvings
-    blocks.
+    If the atlas's colors fit into the palette of a PNG, those of the result do. The padding of the atlas shrinks too, so it must be at
+    least 2^halvings texels, and the sides of the atlas multiples of 2^halvings blocks.
     """
     if halvings == 0:
         return cards
@@ -78,6 +80,8 @@ def reduced(cards: Cards, halvings: int) -> Cards:
 
     factor = _root(excess, 1.0, *_FIRST) if wanted else 1.0
     image = np.concatenate([image[..., :3], *_scaled([image[..., 3:]], np.array([factor]))], -1)
+    if len(distinct(cards.atlas.image)) <= PALETTE:
+        image = palettized_picture(image, cards.alpha)
     atlas = Atlas(image, cards.atlas.corners >> halvings, -(-cards.atlas.sizes >> halvings))
     return replace(cards, atlas=atlas)
 

@@ -26,6 +26,25 @@ _LARGEST_EXPONENT = 24
 _WHOLE = np.array([[[0.0, 0.0], [1.0, 1.0]]])
 
 
+def plain_chain(image: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+    """The mip levels that graphics cards compute of a straight-alpha display-referred RGBA picture, uint8 [H, W, 4], to 1 x 1 texel.
+
+    Sides are as in :func:`mip_chain`. Each texel is the mean of the texels of the level before that it covers. Colors are averaged in
+    linear light, as in sRGB textures, and alpha is not their weight. No interface prescribes the filter (OpenGL 4.6, section 8.14.4), but
+    drivers take the mean of 2 x 2 texels; so does this where sides are even.
+    """
+    levels = [image]
+    while max(image.shape[:2]) > 1:
+        mean = _shrink(
+            np.concatenate([_linear(image[..., :3]), image[..., 3:].astype(np.float32)], -1),
+            (max(1, image.shape[0] >> 1), max(1, image.shape[1] >> 1)),
+        )
+        mean[..., :3] = 255 * linear_to_srgb(mean[..., :3])
+        image = _rounded(mean)
+        levels.append(image)
+    return levels
+
+
 def mip_chain(atlas: Atlas, cutoff: float | None) -> list[NDArray[np.uint8]]:
     """The mip levels of an atlas, from its own array to 1 x 1 texel: straight-alpha display-referred RGBA, uint8 [h, w, 4] each.
 
@@ -46,7 +65,7 @@ def mip_chain(atlas: Atlas, cutoff: float | None) -> list[NDArray[np.uint8]]:
         check_range("cutoff", cutoff, 0, 1, open_low=True)
     height, width = atlas.image.shape[:2]
     alpha = atlas.image[..., 3:].astype(np.float32)
-    color = srgb_to_linear(np.arange(256) / 255).astype(np.float32)[atlas.image[..., :3]]
+    color = _linear(atlas.image[..., :3])
     weighted = np.concatenate([color * alpha, alpha], -1)
     levels = [atlas.image]
     if cutoff is not None:
@@ -98,6 +117,10 @@ def srgb_to_linear(value: NDArray[np.floating]) -> NDArray[np.floating]:
 def linear_to_srgb(value: NDArray[np.floating]) -> NDArray[np.floating]:
     """Linear light to display-referred sRGB, both in [0, 1] (IEC 61966-2-1)."""
     return np.where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
+
+
+def _linear(color: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return srgb_to_linear(np.arange(256) / 255).astype(np.float32)[color]
 
 
 def _rounded(values: NDArray[np.float32]) -> NDArray[np.uint8]:

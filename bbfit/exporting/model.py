@@ -13,6 +13,7 @@ from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import overdraw, with_hulls
 from bbfit.exporting.mip_matching import reduced, with_mips
+from bbfit.exporting.mips import plain_chain
 from bbfit.exporting.obj import mtl_bytes, obj_bytes
 from bbfit.exporting.outlines import with_pieces
 from bbfit.exporting.splitting import split
@@ -44,7 +45,7 @@ class ShippedModel:
 
     @cached_property
     def cards(self) -> Cards:
-        """The polygons, split and trimmed as the options request, and the mip levels if the files bring any.
+        """The polygons, split and trimmed as the options request, and the mip levels if there are any: the files' own, or the program's.
 
         They are those of the files, so they do not depend on whether a program smooths the edges of masks.
         """
@@ -57,7 +58,9 @@ class ShippedModel:
             cards = with_hulls(cards, self.config.corners, cards.outlined_alpha)
         elif self.config.outline == "pieces":
             cards = with_pieces(cards, self.config.pieces, self.config.corners, cards.outlined_alpha)
-        return with_mips(cards) if self.config.has_mips else cards
+        if self.config.has_mips:
+            return with_mips(cards)
+        return replace(cards, chain=tuple(plain_chain(cards.atlas.image))) if self.config.mipmapped(cards.alpha) else cards
 
     @cached_property
     def glb(self) -> bytes:
@@ -75,7 +78,7 @@ class ShippedModel:
         Without mip levels the polygons show what the cloud's renderer shows, but for the rounding of textures to 8 bits; the renderer is
         faster and draws them. Trimmed outlines cut off nothing visible.
         """
-        if self.config.has_mips or self.halvings:
+        if self.config.has_mips or self.halvings or self.config.mipmapped(self.cloud.alpha):
             return draw_cards(replace(self.cards, alpha=self.cloud.alpha), camera)
         return render(self.cloud, camera.to(self.cloud.texels.device))
 

@@ -66,11 +66,11 @@ def silhouette_bounds(planes: BillboardCloud, views: ViewSet) -> Tensor:
     return torch.where(seen[:, None], bounds, widest)
 
 
-def opaque_bounds(cloud: BillboardCloud, *, densest: float = 1.0) -> Tensor:
+def opaque_bounds(cloud: BillboardCloud, *, grow: bool = True) -> Tensor:
     """Bound the opaque texels of each billboard, with a margin of two texels. The result is that of :func:`facing_view_bounds`.
 
-    Where there are opaque texels at the border of a texture, the tree may extend beyond it, and the bounds grow by a tenth of that side, if
-    at most the share ``densest`` of the texture is opaque. The bounds of a billboard without opaque texels do not change.
+    Where there are opaque texels at the border of a texture, the tree may extend beyond it, and the bounds ``grow`` by a tenth of that
+    side. The bounds of a billboard without opaque texels do not change.
     """
     bounds = []
     for n, texture in enumerate(cloud.textures()):
@@ -82,7 +82,7 @@ def opaque_bounds(cloud: BillboardCloud, *, densest: float = 1.0) -> Tensor:
             bounds.append(torch.stack([-half_width, half_width, -half_height, half_height]))
             continue
         low, high = torch.tensor([x, y]), torch.tensor([x + width, y + height])
-        margin = (sides / 10).ceil().clamp_min(2) if mask.mean() <= densest else torch.zeros(2)
+        margin = (sides / 10).ceil().clamp_min(2) if grow else torch.zeros(2)
         low = torch.where(low < 1, low - margin, (low - 2).clamp_min(0))
         high = torch.where(high > sides - 1, high + margin, torch.minimum(high + 2, sides))
         meters = (torch.stack([low, high]) / sides * 2 - 1) * cloud.half_extents[n]

@@ -42,6 +42,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "alpha": "mask",
         "placement": "clusters",
         "placement_learning_rate": 0.015,
+        "texel_density": 0.8,
         "bounds": "silhouette",
         "loss": "backgrounds",
         "ssim_weight": 0.01,
@@ -60,6 +61,8 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "billboards": 4,
         "placement": "even",
         "placement_learning_rate": 0.0,
+        "alpha_cutoff": 0.5,
+        "least_alpha": 0.0,
         "texel_density": 1.0,
         "bounds": "viewport",
         "loss": "l2",
@@ -82,9 +85,30 @@ _PRESETS: dict[str, dict[str, Any]] = {
 # Values of the default preset that depend on the alpha mode. A cutoff leaves no half-transparent texels that could smooth an edge, and
 # stochastic alpha is the noisier the more of them there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
-    "mask": {"colors": "views", "antialiased": True, "texel_density": 0.8, "sharpness_weight": 4.0, "binarization_weight": 0.02},
-    "blend": {"colors": "matched", "antialiased": False, "texel_density": 1.0, "sharpness_weight": 6.0, "binarization_weight": 0.01},
-    "hash": {"colors": "views", "antialiased": False, "texel_density": 1.0, "sharpness_weight": 6.0, "binarization_weight": 0.03},
+    "mask": {
+        "alpha_cutoff": 0.2,
+        "least_alpha": 0.0,
+        "colors": "views",
+        "antialiased": True,
+        "sharpness_weight": 4.0,
+        "binarization_weight": 0.02,
+    },
+    "blend": {
+        "alpha_cutoff": 0.5,
+        "least_alpha": 0.08,
+        "colors": "matched",
+        "antialiased": False,
+        "sharpness_weight": 6.0,
+        "binarization_weight": 0.01,
+    },
+    "hash": {
+        "alpha_cutoff": 0.5,
+        "least_alpha": 0.08,
+        "colors": "views",
+        "antialiased": False,
+        "sharpness_weight": 6.0,
+        "binarization_weight": 0.03,
+    },
 }
 
 
@@ -97,13 +121,17 @@ class FitConfig:
     alpha: AlphaKind | None = None
     """Alpha mode to fit for: cut off below the cutoff (mask), blended (blend), or drawn at random with alpha as the probability (hash).
     Preset: mask; thesis: blend."""
-    alpha_cutoff: Cutoff = 0.5
-    """Least alpha that shows with mask, in (0, 1)."""
+    alpha_cutoff: Cutoff | None = None
+    """Least alpha that shows with mask, in (0, 1). The lower, the more leaves remain where mip levels average alpha.
+    Preset: 0.2 (mask) or 0.5; thesis: 0.5."""
+    least_alpha: _Unit | None = None
+    """Least alpha that remains. Fainter texels become transparent in the end: nobody sees them, but a graphics card would shade them.
+    Preset: 0.08 (blend, hash) or 0 (mask); thesis: 0."""
     billboards: Count | None = None
     """Number of billboards. Preset: as many as pay for this tree, within least_billboards and most_billboards; thesis: 4."""
     least_billboards: Count = 16
     """Least number of billboards that the preset chooses by itself."""
-    most_billboards: Count = 64
+    most_billboards: Count = 192
     """Largest number of billboards that the preset chooses by itself."""
     placement: Placement | None = None
     """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
@@ -137,7 +165,7 @@ class FitConfig:
     Preset: silhouette; thesis: viewport."""
     texel_density: _Density | None = None
     """Texels per pixel of a view along each side, for a billboard that faces the camera at the tree's axis.
-    Preset: 0.8 (mask) or 1; thesis: 1."""
+    Preset: 0.8; thesis: 1."""
     loss: Loss | None = None
     """Loss to minimize: absolute (l1) or squared (l2) differences of premultiplied RGBA, or squared ones over random backgrounds.
     It is summed over channels and averaged over pixels; for backgrounds it is the expectation.
@@ -232,6 +260,8 @@ class ResolvedFit(FitConfig):
     """
 
     alpha: AlphaKind
+    alpha_cutoff: Cutoff
+    least_alpha: _Unit
     placement: Placement
     placement_learning_rate: _Unit
     bounds: Bounds

@@ -26,7 +26,7 @@ from bbfit.fitting.movement import Movement
 from bbfit.fitting.palette import palettized
 from bbfit.fitting.points import COUNT, hull_points, mesh_points
 from bbfit.fitting.requirements import check_cameras, check_device
-from bbfit.fitting.search import choose_count, find_placement
+from bbfit.fitting.search import find_placement
 from bbfit.fitting.steps import BLEND, HARDEST, Stepper
 from bbfit.fitting.visibility import visible_points
 from bbfit.geometry.alpha import AlphaMode
@@ -46,8 +46,6 @@ _ANEW = "remove it to start the fit anew"
 _MOST_TEXELS = 1 << 28
 # Points on the mesh for each one that is chosen because views see it.
 _DENSE = 5
-# Compact billboards that are opaque to a larger share than this do not grow: what they would gain in quality costs more in drawn pixels.
-_DENSEST = 0.35
 # Fraction of the steps at full resolution during which a mask hardens.
 _HARDENING = 0.3
 
@@ -193,11 +191,12 @@ def fit(
         fitted = stepper.finish()
         del stepper
         if movement is not None:
-            start = bounded(fitted, opaque_bounds(fitted, densest=_DENSEST if config.locality else 1.0), density, config.max_texels).to(
-                torch.float32
-            )
+            # Compact billboards do not grow: more of them gain as much for fewer drawn pixels.
+            bounds = opaque_bounds(fitted, grow=not config.locality)
+            start = bounded(fitted, bounds, density, config.max_texels).to(torch.float32)
     assert fitted is not None
     fitted = replace(fitted, alpha=AlphaMode(config.alpha, config.alpha_cutoff))
+    fitted.texels[:, 3] *= fitted.texels[:, 3] >= config.least_alpha
     if config.alpha == "mask":
         drawn = matched_coverage(replace(fitted, alpha=replace(fitted.alpha, antialiased=config.antialiased)), views.train, config.backend)
         fitted = replace(drawn, alpha=fitted.alpha)
@@ -232,10 +231,7 @@ def _initial_state(
         except (torch.linalg.LinAlgError, InputError) as error:
             fail("views", f"their cameras do not show a tree from around it ({error})", "check the cameras")
         return _FitState([], start, None, {}, 0.0)
-    points = placement_points(views, config, tree)
-    if config.billboards is None:
-        config = config.counted(choose_count(views.train, points, config, on_place))
-    return _placed_state(views, config, find_placement(views.train, points, config, on_place))
+    return _placed_state(views, config, find_placement(views.train, placement_points(views, config, tree), config, on_place))
 
 
 def placement_points(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> Tensor:

@@ -22,19 +22,27 @@ _EDGE = 0.25
 
 
 def palettized(cloud: BillboardCloud, count: int) -> BillboardCloud:
-    """Give the visible texels of a cloud few different values of color and alpha, so that a palette of ``count`` colors holds them.
+    """Give the texels of a cloud few different values of color and alpha, so that a palette of ``count`` colors holds them.
 
-    :data:`~bbfit.fitting.config.TRANSPARENT_COLORS` of the palette are left to transparent texels, so ``count`` is larger; with 0 the cloud
-    is returned as it is. The values are the means of clusters of texels by k-means (Lloyd 1982; start by Arthur and Vassilvitskii 2007), of
-    the quantity whose squared differences a viewer sees (:func:`_seen`). All texels are rounded to 8 bits.
+    With 0 the cloud is returned as it is. The values are those of :func:`few_colors`. All texels are rounded to 8 bits.
+    """
+    return cloud.with_texels(few_colors(cloud.texels, cloud.alpha, count)) if count else cloud
+
+
+def few_colors(texels: Tensor, alpha: AlphaMode, count: int) -> Tensor:
+    """Round straight-alpha texels in [0, 1], [P, 4], to 8 bits and to few different values of color and alpha.
+
+    :data:`~bbfit.fitting.config.TRANSPARENT_COLORS` of the ``count`` colors are left to transparent texels, so ``count`` is larger. The
+    values are the means of clusters of visible texels by k-means (Lloyd 1982; start by Arthur and Vassilvitskii 2007), of the quantity
+    whose squared differences a viewer sees in an alpha mode (:func:`_seen`). Transparent texels are only rounded.
 
     Neighboring leaves differ by more than neighboring colors of the palette do, so that no bands show, and no dithering is needed.
     """
-    visible = torch.nonzero(cloud.texels[:, 3] >= _VISIBLE)[:, 0]
-    if count == 0 or len(visible) == 0:
-        return cloud
-    texels = cloud.texels[visible].detach().cpu().float()
-    seen = _seen(texels, cloud.alpha)
+    rounded, visible = (texels * 255).round() / 255, torch.nonzero(texels[:, 3] >= _VISIBLE)[:, 0]
+    if len(visible) == 0:
+        return rounded
+    straight = texels[visible].detach().cpu().float()
+    seen = _seen(straight, alpha)
     generator = np.random.default_rng(_SEED)
     sample = seen[generator.permutation(len(seen))[:_SAMPLE]]
     most = min(count - TRANSPARENT_COLORS, len(np.unique(sample, axis=0)))
@@ -42,10 +50,9 @@ def palettized(cloud: BillboardCloud, count: int) -> BillboardCloud:
     for _ in range(_ITERATIONS):
         means = _means(torch.from_numpy(sample), vq(sample, means)[0], torch.from_numpy(means)).numpy()
     labels = vq(seen, means)[0]
-    palette = unpremultiply(_means(premultiply(texels), labels, torch.zeros(most, 4)))
+    palette = unpremultiply(_means(premultiply(straight), labels, torch.zeros(most, 4)))
     palette = (palette * 255).round().clamp(min=torch.tensor([0.0, 0.0, 0.0, 1.0])) / 255
-    rounded = (cloud.texels * 255).round() / 255
-    return cloud.with_texels(rounded.index_copy(0, visible.to(cloud.texels.device), palette[labels].to(cloud.texels)))
+    return rounded.index_copy(0, visible.to(texels.device), palette[labels].to(texels))
 
 
 def _means(points: Tensor, labels: NDArray[np.int32], otherwise: Tensor) -> Tensor:

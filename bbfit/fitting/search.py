@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from bbfit.fitting.movement import Movement
 from bbfit.fitting.moves import ADDITIONS, REFINEMENTS, Moves
 from bbfit.fitting.steps import Stepper
 from bbfit.fitting.trunk import trunk_points
+from bbfit.geometry.alpha import AlphaKind
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.image_loss.reference import pixel_loss_reference
 from bbfit.rendering.dispatch import render
@@ -55,11 +56,13 @@ QUICK = Effort(more_steps=30, most_additions=0)
 """The effort of a comparison of numbers of billboards."""
 COUNTS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Numbers of billboards that are compared."""
-LEAST_GAIN_DB = 1.5
-"""Least gain at a low resolution, in dB, for which the number of layers may double."""
-MOST_LAYERS = 3.6
-"""Most opaque layers before each other at a low resolution, on average over the pixels of the tree. A finished model shades two to four
-times as many pixels for each pixel of the tree."""
+LEAST_GAIN_DB = 0.3
+"""Least gain at a low resolution, in dB, for which the number of billboards may double."""
+MOST_LAYERS: Mapping[AlphaKind, float] = {"mask": 2.5, "blend": 1.9, "hash": 1.9}
+"""Most opaque layers before each other at a low resolution, on average over the rectangles around the tree in the views. A finished model
+shades about 2.4 times as many pixels, and fewer with a mask, whose outlines are tighter."""
+# Number of billboards that is tried first.
+_FIRST = 32
 # Least alpha of a texel that counts as opaque in layers.
 _OPAQUE = 0.25
 
@@ -80,45 +83,62 @@ def find_placement(
     ``trunk_billboards`` of the billboards are not searched for. They cross in the trunk below the crown
     (:func:`~bbfit.fitting.trunk.trunk_points`), unless the tree has none, and their textures show the points there.
 
-    ``on_progress`` is called after every step with the work done and the total work, in steps of one candidate. The result is float32 on
-    the CPU and has fitted textures, with the texel density of pictures of about :data:`SIDE` pixels.
+    If ``billboards`` is None, their number is chosen at the knee of the curve, within ``least_billboards`` and ``most_billboards``. What a
+    graphics card pays for is the pixels that it shades, and they grow with the number of opaque layers before each other. Two quick
+    searches measure the layers of few and of many billboards, and the number of billboards with :data:`MOST_LAYERS` is interpolated on a
+    logarithmic scale. If a doubling of the number would gain less than :data:`LEAST_GAIN_DB`, it is the smaller one.
+
+    ``on_progress`` is called with the work done and the total work. The result is float32 on the CPU and has fitted textures, with the
+    texel density of pictures of about :data:`SIDE` pixels.
     """
+    if config.billboards is None:
+        return _at_the_knee(views, points, config, on_progress or (lambda done, total: None))
+    return _found(views, points, config, on_progress, effort)[0]
+
+
+def _found(
+    views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None] | None = None, effort: Effort = USUAL
+) -> tuple[BillboardCloud, _Search]:
+    """The placement of a known number of billboards, and the search that found it."""
     on_progress, own = on_progress or (lambda done, total: None), config.trunk_billboards or 0
     trunk = trunk_points(points, views) if own else points.new_zeros(0)
-    if len(trunk) == 0:
-        return _Search(views, points, config, on_progress, effort).best()
     assert config.billboards is not None  # see counted()
-    search = _Search(views, points, replace(config, billboards=config.billboards - own), on_progress, effort)
-    return BillboardCloud.joined([search.best(), search.moves.crossed(trunk, own)])
+    crown = config.billboards - (own if len(trunk) else 0)
+    search = _Search(views, points, replace(config, billboards=crown), on_progress, effort)
+    best = search.best()
+    return (BillboardCloud.joined([best, search.moves.crossed(trunk, own)]) if len(trunk) else best), search
 
 
-def choose_count(views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None] | None = None) -> int:
-    """Choose the number of billboards at the knee of the curve: from which on more of them cost more than they gain.
+def _at_the_knee(views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None]) -> BillboardCloud:
+    """The placement of as many billboards as pay for the tree; see :func:`find_placement`."""
+    most = MOST_LAYERS[config.alpha]
 
-    What a graphics card pays for is the pixels that it shades, and they grow with the number of opaque layers before each other. Short
-    searches try increasing numbers of billboards, from ``least_billboards`` to ``most_billboards``, until there are more than
-    :data:`MOST_LAYERS` layers. A number replaces the last one that was accepted if every doubling of the layers lowers the loss at a low
-    resolution by at least :data:`LEAST_GAIN_DB`.
+    def tried(number: int, count: int) -> _Trial:
+        cloud, search = _found(views, points, config.counted(count), None, QUICK)
+        on_progress(number, 3)
+        return _Trial(count, cloud, search.layers(cloud), search.decibels(cloud))
 
-    Parameters and progress are those of :func:`find_placement`; ``config.billboards`` is not used.
-    """
-    counts = sorted({config.least_billboards, config.most_billboards} | set(COUNTS))
-    counts = [count for count in counts if config.least_billboards <= count <= config.most_billboards]
-    if len(counts) == 1:
-        return counts[0]
-    accepted: tuple[int, float, float] | None = None
-    for number, count in enumerate(counts):
-        search = _Search(views, points, config.counted(count), lambda done, total: None, QUICK)
-        cloud, loss = search.searched(0)
-        layers, decibels = search.layers(cloud), -10 * math.log10(max(loss, 1e-12))
-        if accepted is not None and layers > MOST_LAYERS:
-            break
-        if accepted is None or decibels - accepted[2] >= LEAST_GAIN_DB * max(math.log2(layers / accepted[1]), 0.0):
-            accepted = count, layers, decibels
-        if on_progress is not None:
-            on_progress(number + 1, len(counts))
-    assert accepted is not None
-    return accepted[0]
+    first = tried(1, min(max(_FIRST, config.least_billboards), config.most_billboards))
+    other = config.most_billboards if first.layers <= most else config.least_billboards
+    if other == first.count:
+        return first.cloud
+    few, many = sorted([first, tried(2, other)], key=attrgetter("count"))
+    doublings = math.log2(many.count / few.count)
+    if many.decibels - few.decibels < LEAST_GAIN_DB * doublings or few.layers >= most:
+        return few.cloud
+    if many.layers <= most:
+        return many.cloud
+    return tried(3, round(few.count * 2 ** (doublings * (most - few.layers) / (many.layers - few.layers)))).cloud
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A placement of a number of billboards, with its layers and its quality at the resolution of the search."""
+
+    count: int
+    cloud: BillboardCloud
+    layers: float
+    decibels: float
 
 
 class _Search:
@@ -144,12 +164,18 @@ class _Search:
         self._total = config.restarts * each + effort.mend_steps * (1 + REFINEMENTS) * config.refinement_rounds
 
     def layers(self, cloud: BillboardCloud) -> float:
-        """How many opaque texels of a cloud lie before each other in a pixel of the tree, on average over the views."""
+        """How many opaque texels of a cloud lie before each other in a pixel of the rectangle around the tree, on average over views."""
         cameras, cloud = self._targets.cameras, cloud.to(torch.float64)
         opaque = torch.stack([(texture[..., 3] > _OPAQUE).double().mean() for texture in cloud.textures()])
         facing = (cameras.batch().forward.double() @ cloud.normals.mT).abs().mean(0)
         drawn = float((4 * cloud.half_extents.prod(-1) * opaque * facing).sum()) * float(pixels_per_meter(cameras)) ** 2
-        return max(drawn / max(float(self._pictures[..., 3].sum((1, 2)).mean()), 1.0), 1e-9)
+        shown = self._pictures[..., 3] > 0
+        height, width = (_extent(shown.any(axis)) for axis in (2, 1))
+        return drawn / max(float((height * width).mean()), 1.0)
+
+    def decibels(self, cloud: BillboardCloud) -> float:
+        """Quality of a cloud at the resolution of the search, in dB."""
+        return -10 * math.log10(max(float(self._losses(cloud).mean()), 1e-12))
 
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
@@ -195,3 +221,11 @@ class _Search:
         device = self._config.device
         image = render(cloud.to(device), self._targets.cameras.to(device), backend=self._config.backend)
         return pixel_loss_reference(image.cpu(), self._pictures, self._config.loss)
+
+
+def _extent(shown: Tensor) -> Tensor:
+    """Distance from the first to the last true value of each row, both included, bool [V, L] -> float64 [V]."""
+    places = torch.arange(1, shown.shape[1] + 1, dtype=torch.float64)
+    last = (places * shown).amax(1)
+    first = torch.where(shown, places, torch.inf).amin(1)
+    return torch.where(last > 0, last - first + 1, 0)

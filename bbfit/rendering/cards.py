@@ -19,7 +19,7 @@ from bbfit.checks import fail
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.polygons import area, sides
-from bbfit.operators.drawing.compositing import composite, coverage, opacity, thresholds
+from bbfit.operators.drawing.compositing import composite_fragments, coverage, opacity, thresholds
 from bbfit.operators.drawing.reference import EDGE_ON
 
 # Distance outside a polygon, as a share of the atlas, at which a pixel's center still counts as inside, so that rounding opens no seams.
@@ -201,28 +201,23 @@ def _bilinear(levels: MipChain, uv: Tensor, level: Tensor) -> Tensor:
 
 def _view(cards: Cards, sheets: list[Sheet], levels: MipChain, camera: Camera) -> Tensor:
     """Picture of a single camera, [H, W, 4]."""
-    height, width = camera.height, camera.width
-    colors, alphas, depths = [], [], []
-    for sheet in sheets:
-        met = hits(cards, sheet, camera)
-        straight = filtered(levels, met.uv, met.detail) / 255
-        if cards.alpha.kind == "hash":
-            straight[:, 3] = (straight[:, 3] >= thresholds(met.x, met.y, sheet.first)).to(straight)
-        elif cards.alpha.antialiased:
-            across, down = ((filtered(levels, uv, met.detail)[:, 3] / 255 - straight[:, 3]).abs() for uv in _beside(met))
-            straight[:, 3] = coverage(straight[:, 3], across + down, cards.alpha)
-        else:
-            straight[:, 3] = opacity(straight[:, 3], cards.alpha)
-        if (straight[:, 3] > 0).any():
-            layer, depth = torch.zeros(4, height, width), torch.full((height, width), torch.inf)
-            layer[:, met.y, met.x] = straight.mT
-            depth[met.y, met.x] = met.depth.float()
-            colors.append(layer[None, :3])
-            alphas.append(layer[None, 3:])
-            depths.append(depth[None, None])
-    return (
-        composite(colors, alphas, depths, nested=cards.alpha.antialiased)[0].permute(1, 2, 0) if colors else torch.zeros(height, width, 4)
-    )
+    count = camera.height * camera.width
+    met = [hits(cards, sheet, camera) for sheet in sheets]
+    straight = filtered(levels, torch.cat([each.uv for each in met]), detail := torch.cat([each.detail for each in met])) / 255
+    colors, alphas = straight[:, :3], straight[:, 3]
+    if cards.alpha.kind == "hash":
+        drawn = torch.cat([thresholds(each.x, each.y, sheet.first) for each, sheet in zip(met, sheets, strict=True)])
+        alphas = (alphas >= drawn).to(alphas)
+    elif cards.alpha.antialiased:
+        beside = (torch.cat(places) for places in zip(*map(_beside, met), strict=True))
+        across, down = ((filtered(levels, uv, detail)[:, 3] / 255 - alphas).abs() for uv in beside)
+        alphas = coverage(alphas, across + down, cards.alpha)
+    else:
+        alphas = opacity(alphas, cards.alpha)
+    pixels, depths = torch.cat([each.y * camera.width + each.x for each in met]), torch.cat([each.depth for each in met])
+    shown = alphas > 0
+    image = composite_fragments(colors[shown], alphas[shown], depths[shown], pixels[shown], count, nested=cards.alpha.antialiased)
+    return image.unflatten(0, (camera.height, camera.width))
 
 
 def _beside(met: Hits) -> list[Tensor]:

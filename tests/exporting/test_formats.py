@@ -68,13 +68,31 @@ def test_other_textures_stand_beside_png_or_in_its_place(
         np.testing.assert_array_equal(np.array(Image.open(io.BytesIO(data))), atlas)  # colors of transparent texels as well
     else:
         assert data.startswith(b"\xabKTX 20\xbb\r\n\x1a\n")
-    # Mip levels are asked for where the file brings them.
-    assert tree["samplers"][0]["minFilter"] == (9987 if textures == "ktx2" else 9729)
+    assert tree["samplers"][0]["minFilter"] == 9987
     if fallback:
         np.testing.assert_array_equal(np.array(Image.open(io.BytesIO(views[tree["images"][0]["bufferView"]]))), atlas)
     # The validator does not know what KTX2 pictures are.
     codes = {message["code"] for message in messages(path) if message["severity"] < 2}
     assert codes <= ({"VALUE_NOT_IN_LIST", "IMAGE_UNRECOGNIZED_FORMAT"} if textures == "ktx2" else set())
+
+
+@pytest.mark.parametrize(
+    ("alpha", "config", "expected"),
+    [
+        (AlphaMode("mask", 0.25), ExportConfig(), 9987),
+        (AlphaMode("mask", 0.26), ExportConfig(), 9729),
+        (AlphaMode("mask", 0.26), ExportConfig(textures="ktx2"), 9987),
+        (AlphaMode("mask", 0.26), ExportConfig(alpha="blend"), 9987),
+        (AlphaMode("mask"), ExportConfig(mipmaps=True), 9987),
+        (AlphaMode("blend"), ExportConfig(mipmaps=False), 9729),
+        (AlphaMode("hash"), ExportConfig(), 9987),
+    ],
+)
+def test_the_sampler_reads_mip_levels_where_leaves_survive_them(
+    crossed: BillboardCloud, tmp_path: Path, alpha: AlphaMode, config: ExportConfig, expected: int
+) -> None:
+    (path,) = export(replace(crossed, alpha=alpha), tmp_path / "model.glb", config)
+    assert tree_of(path)[0]["samplers"][0]["minFilter"] == expected
 
 
 def test_split_nodes_stand_at_their_origins_and_their_bounds_are_centerd_there(crossed: BillboardCloud, tmp_path: Path) -> None:

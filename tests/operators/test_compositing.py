@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 
+import pytest
 import torch
 
-from bbfit.operators.drawing.compositing import composite
+from bbfit.operators.drawing.compositing import TIE, composite, composite_fragments
 
 
 def layer(*values: float) -> torch.Tensor:
@@ -43,3 +44,18 @@ def test_layers_that_are_nowhere_do_nothing() -> None:
     colors = [torch.full((1, 3, 1, 1), value, dtype=torch.float64) for value in (0.5, 1.0)]
     image = composite(colors, [layer(0.5), layer(0.0)], [layer(3), layer(torch.inf)])
     assert image.flatten().tolist() == [0.25, 0.25, 0.25, 0.5]
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_fragments_show_what_layers_show(nested: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    shape = 7, 1, 6, 5
+    colors, alphas = torch.rand(7, 3, 6, 5, generator=generator).double(), torch.rand(shape, generator=generator).double()
+    # Few depths, so that many layers tie, some exactly and others within the tolerance.
+    depths = torch.randint(1, 4, shape, generator=generator) * (1 + TIE / 4 * torch.randint(0, 3, shape, generator=generator)).double()
+    present = torch.rand(shape, generator=generator) < 0.7
+    layers = ([part[None] for part in stack] for stack in (colors, alphas * present, depths.where(present, torch.inf)))
+    expected = composite(*layers, nested=nested)[0].permute(1, 2, 0).reshape(-1, 4)
+    layer, _, y, x = present.nonzero().T
+    image = composite_fragments(colors[layer, :, y, x], alphas[layer, 0, y, x], depths[layer, 0, y, x], y * 5 + x, count=30, nested=nested)
+    assert torch.allclose(image, expected, atol=1e-14)

@@ -32,6 +32,37 @@ def composite(colors: list[Tensor], alphas: list[Tensor], depths: list[Tensor], 
     return torch.cat([color, sum(weights[1:], weights[0])], 1)
 
 
+def composite_fragments(colors: Tensor, alphas: Tensor, depths: Tensor, pixels: Tensor, count: int, *, nested: bool = False) -> Tensor:
+    """Do what :func:`composite` does for M fragments in place of whole layers: premultiplied RGBA of ``count`` pixels, [count, 4].
+
+    A fragment is what one layer shows in one pixel: straight color [M, 3], opacity [M], depth [M] and the index of the pixel, int64 [M].
+    Fragments are in the order of their layers. For sparse layers this is many times faster.
+    """
+    order = depths.sort(stable=True).indices
+    order = order[pixels[order].sort(stable=True).indices]
+    while True:  # within a pixel, the order of neighbors of equal depth is that of the layers; neighbors are swapped until it is
+        near, far = order[:-1], order[1:]
+        wrong = (pixels[near] == pixels[far]) & (depths[far] <= depths[near] * (1 + TIE)) & (far < near)
+        wrong[1:] &= ~wrong[:-1]  # pairs that share no fragment
+        if not wrong.any():
+            break
+        at = wrong.nonzero()[:, 0]
+        order[at], order[at + 1] = order[at + 1], order[at]
+    pixel, number = pixels[order], torch.arange(len(order), device=order.device)
+    first = torch.ones_like(number, dtype=torch.bool)
+    first[1:] = pixel[1:] != pixel[:-1]
+    rank = number - torch.where(first, number, 0).cummax(0).values
+    by_rank = rank.sort(stable=True).indices  # no pixel occurs twice in a rank
+    shown, hidden = colors.new_zeros(count, 4), colors.new_zeros(count)
+    for some in by_rank.split(torch.bincount(rank).tolist()):
+        where, chosen = pixel[some], order[some]
+        alpha, behind = alphas[chosen], hidden[where]
+        weight = (alpha - behind).clamp_min(0) if nested else alpha * (1 - behind)
+        hidden[where] = behind + weight
+        shown[where] += weight[:, None] * torch.nn.functional.pad(colors[chosen], (0, 1), value=1.0)
+    return shown
+
+
 def layer_weights(alphas: list[Tensor], depths: list[Tensor], *, nested: bool = False) -> list[Tensor]:
     """The weights of N >= 1 layers in a picture, N of [V, 1, H, W], by Porter and Duff's over operator (1984, section 4.3).
 
