@@ -17,7 +17,7 @@ from bbfit.geometry.polygons import area
 
 # Least share of all cards' area that a cut must save. A graphics card sets up the triangles of a piece for about as much as some dozens of
 # pixels; where the rectangles draw 200 000 pixels, that is this share.
-_LEAST_SAVED = 0.0002
+_LEAST_SAVED = 0.0003
 
 
 @dataclass(frozen=True, eq=False)

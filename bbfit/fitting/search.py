@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from operator import attrgetter, itemgetter
@@ -18,7 +18,6 @@ from bbfit.fitting.movement import Movement
 from bbfit.fitting.moves import ADDITIONS, REFINEMENTS, Moves
 from bbfit.fitting.steps import Stepper
 from bbfit.fitting.trunk import trunk_points
-from bbfit.geometry.alpha import AlphaKind
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.image_loss.reference import pixel_loss_reference
 from bbfit.rendering.dispatch import render
@@ -58,13 +57,13 @@ COUNTS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Numbers of billboards that are compared."""
 LEAST_GAIN_DB = 0.3
 """Least gain at a low resolution, in dB, for which the number of billboards may double."""
-MOST_LAYERS: Mapping[AlphaKind, float] = {"mask": 2.5, "blend": 1.9, "hash": 1.9}
-"""Most opaque layers before each other at a low resolution, on average over the rectangles around the tree in the views. A finished model
-shades about 2.4 times as many pixels, and fewer with a mask, whose outlines are tighter."""
+MOST_LAYERS = 2.6
+"""Most layers before each other at a low resolution, on average over the rectangles around the tree in the views. A finished model shades
+about 1.6 times as many pixels."""
 # Number of billboards that is tried first.
 _FIRST = 32
-# Least alpha of a texel that counts as opaque in layers.
-_OPAQUE = 0.25
+# Least alpha of a texel that counts in layers.
+_VISIBLE = 0.05
 
 
 def find_placement(
@@ -84,7 +83,7 @@ def find_placement(
     (:func:`~bbfit.fitting.trunk.trunk_points`), unless the tree has none, and their textures show the points there.
 
     If ``billboards`` is None, their number is chosen at the knee of the curve, within ``least_billboards`` and ``most_billboards``. What a
-    graphics card pays for is the pixels that it shades, and they grow with the number of opaque layers before each other. Two quick
+    graphics card pays for is the pixels that it shades, and they grow with the number of layers before each other. Two quick
     searches measure the layers of few and of many billboards, and the number of billboards with :data:`MOST_LAYERS` is interpolated on a
     logarithmic scale. If a doubling of the number would gain less than :data:`LEAST_GAIN_DB`, it is the smaller one.
 
@@ -111,7 +110,6 @@ def _found(
 
 def _at_the_knee(views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None]) -> BillboardCloud:
     """The placement of as many billboards as pay for the tree; see :func:`find_placement`."""
-    most = MOST_LAYERS[config.alpha]
 
     def tried(number: int, count: int) -> _Trial:
         cloud, search = _found(views, points, config.counted(count), None, QUICK)
@@ -119,16 +117,16 @@ def _at_the_knee(views: ViewSet, points: Tensor, config: ResolvedFit, on_progres
         return _Trial(count, cloud, search.layers(cloud), search.decibels(cloud))
 
     first = tried(1, min(max(_FIRST, config.least_billboards), config.most_billboards))
-    other = config.most_billboards if first.layers <= most else config.least_billboards
+    other = config.most_billboards if first.layers <= MOST_LAYERS else config.least_billboards
     if other == first.count:
         return first.cloud
     few, many = sorted([first, tried(2, other)], key=attrgetter("count"))
     doublings = math.log2(many.count / few.count)
-    if many.decibels - few.decibels < LEAST_GAIN_DB * doublings or few.layers >= most:
+    if many.decibels - few.decibels < LEAST_GAIN_DB * doublings or few.layers >= MOST_LAYERS:
         return few.cloud
-    if many.layers <= most:
+    if many.layers <= MOST_LAYERS:
         return many.cloud
-    return tried(3, round(few.count * 2 ** (doublings * (most - few.layers) / (many.layers - few.layers)))).cloud
+    return tried(3, round(few.count * 2 ** (doublings * (MOST_LAYERS - few.layers) / (many.layers - few.layers)))).cloud
 
 
 @dataclass(frozen=True)
@@ -164,11 +162,11 @@ class _Search:
         self._total = config.restarts * each + effort.mend_steps * (1 + REFINEMENTS) * config.refinement_rounds
 
     def layers(self, cloud: BillboardCloud) -> float:
-        """How many opaque texels of a cloud lie before each other in a pixel of the rectangle around the tree, on average over views."""
+        """How many visible texels of a cloud lie before each other in a pixel of the rectangle around the tree, on average over views."""
         cameras, cloud = self._targets.cameras, cloud.to(torch.float64)
-        opaque = torch.stack([(texture[..., 3] > _OPAQUE).double().mean() for texture in cloud.textures()])
+        visible = torch.stack([(texture[..., 3] > _VISIBLE).double().mean() for texture in cloud.textures()])
         facing = (cameras.batch().forward.double() @ cloud.normals.mT).abs().mean(0)
-        drawn = float((4 * cloud.half_extents.prod(-1) * opaque * facing).sum()) * float(pixels_per_meter(cameras)) ** 2
+        drawn = float((4 * cloud.half_extents.prod(-1) * visible * facing).sum()) * float(pixels_per_meter(cameras)) ** 2
         shown = self._pictures[..., 3] > 0
         height, width = (_extent(shown.any(axis)) for axis in (2, 1))
         return drawn / max(float((height * width).mean()), 1.0)

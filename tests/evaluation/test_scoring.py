@@ -18,6 +18,7 @@ from bbfit.evaluation import metrics
 from bbfit.evaluation.backgrounds import BACKGROUNDS
 from bbfit.evaluation.measures import Over, OverBackground, mean_measures
 from bbfit.evaluation.scoring import OriginalTree, evaluate, held_out, measure, view_angles
+from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
@@ -33,7 +34,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> ViewDataset:
 
 def test_a_cloud_scores_full_marks_on_its_own_views(views: ViewDataset) -> None:
     """What is left is the rounding of the pictures to bytes, 58.9 dB (1/255/sqrt(12)) where all pixels are opaque."""
-    report = evaluate(crossing_billboards(), views.test)
+    report = evaluate(crossing_billboards(), views.test, export=ExportConfig(mipmaps=False))
     assert [view.name for view in report.views] == views.test.names == ["0000", "0002", "0004", "0006"]
     assert [view.azimuth_degrees for view in report.views] == [0, 90, 180, 270]
     for view in report.views:
@@ -207,7 +208,7 @@ def test_render_is_clamped_and_not_rounded(views: ViewDataset) -> None:
 def test_bad_input(views: ViewDataset, tmp_path: Path) -> None:
     cloud = crossing_billboards()
     with pytest.raises(InputError, match="cloud: its render of view 0000 has values that are not finite"):
-        evaluate(cloud.with_texels(torch.full_like(cloud.texels, torch.nan)), views.test)
+        evaluate(cloud.with_texels(torch.full_like(cloud.texels, torch.nan)), views.test, export=ExportConfig(mipmaps=False))
     with pytest.raises(InputError, match="no billboards"):
         evaluate(BillboardCloud(**{name: getattr(cloud, name)[:0] for name in TENSORS}), views.test)
     with pytest.raises(InputError, match="no held-out view"):

@@ -169,9 +169,10 @@ def test_opaque_bounds_grow_by_a_tenth_where_the_border_is_reached(
     assert texels_of(cloud, opaque_bounds(cloud)[0]) == expected
 
 
-def test_opaque_bounds_of_what_is_full_grow_on_all_sides() -> None:
+def test_opaque_bounds_of_what_is_full_grow_on_all_sides_or_not_at_all() -> None:
     cloud = painted(20, 30, *((x, y) for x in range(30) for y in range(20)))
     assert texels_of(cloud, opaque_bounds(cloud)[0]) == [-3, 33, -2, 22]
+    assert texels_of(cloud, opaque_bounds(cloud, grow=False)[0]) == [0, 30, 0, 20]
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.3])
