@@ -24,7 +24,7 @@ from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.rendering.cards import fragments
+from bbfit.rendering.cards import CardRenderer
 from bbfit.views import TurnedViews, ViewSet
 
 
@@ -138,7 +138,8 @@ def score_shading(cards: Cards, views: ViewSet) -> float | None:
 
     1 is a model without layers or empty fragments. ``None`` if the targets are empty.
     """
-    shaded = sum(fragments(cards, views.cameras[index]) for index in range(len(views)))
+    renderer = CardRenderer(cards)
+    shaded = sum(renderer.fragments(views.cameras[index]) for index in range(len(views)))
     covered = sum(float(views.targets([index], torch.float64)[0][..., 3].sum()) for index in range(len(views)))
     return shaded / covered if covered else None
 

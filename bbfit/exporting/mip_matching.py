@@ -43,14 +43,14 @@ _FIRST, _LATER, _TOLERANCE = (2.0, 8), (0.25, 5), 0.002
 
 @dataclass(frozen=True)
 class _VisibleTexels:
-    """What V cameras see of the cards: the hits on each sheet, of all views in one list."""
+    """What V cameras see of the cards: the M hits on all sheets, of all views in one list."""
 
-    pixels: list[Tensor]
-    """Index of each hit's pixel among the pixels of all views, int64 [M] for each sheet."""
-    uvs: list[Tensor]
-    """Texture coordinates, float64 [M, 2] each."""
-    details: list[Tensor]
-    """Level of detail minus the median over all hits, float64 [M] each."""
+    pixels: Tensor
+    """Index of each hit's pixel among the pixels of all views, int64 [M]."""
+    uvs: Tensor
+    """Texture coordinates, float64 [M, 2]."""
+    details: Tensor
+    """Level of detail minus the median over all hits, float64 [M]."""
     count: int
     """Number of pixels of all views."""
 
@@ -136,16 +136,14 @@ def matched_chain(cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Cam
 
 def _visible_texels(cards: Cards, cameras: Camera) -> tuple[_VisibleTexels, float]:
     """What the cameras see of the cards, and the median level of detail."""
-    pixels, uvs, details, count = [], [], [], cameras.width * cameras.height
-    for sheet in sheets_of(cards):
-        seen = [hits(cards, sheet, cameras[index]) for index in range(len(cameras))]
-        pixels.append(torch.cat([index * count + met.y * cameras.width + met.x for index, met in enumerate(seen)]))
-        uvs.append(torch.cat([met.uv for met in seen]))
-        details.append(torch.cat([met.detail for met in seen]))
-    if not any(map(len, pixels)):
+    count, sheets = cameras.width * cameras.height, sheets_of(cards)
+    seen = [hits(cards, sheets, cameras[index]) for index in range(len(cameras))]
+    detail = torch.cat([met.detail for met in seen])
+    if not len(detail):
         fail("cameras", "none sees a card", "give those of the views that the cards were fitted to")
-    detail = float(torch.cat(details).median())
-    return _VisibleTexels(pixels, uvs, [each - detail for each in details], count * len(cameras)), detail
+    median = float(detail.median())
+    pixels = torch.cat([index * count + met.y * cameras.width + met.x for index, met in enumerate(seen)])
+    return _VisibleTexels(pixels, torch.cat([met.uv for met in seen]), detail - median, count * len(cameras)), median
 
 
 def _scaled(alphas: list[NDArray[np.uint8]], factors: NDArray[np.float64]) -> list[NDArray[np.uint8]]:
@@ -157,10 +155,9 @@ def _scaled(alphas: list[NDArray[np.uint8]], factors: NDArray[np.float64]) -> li
 
 def _coverage(visible: _VisibleTexels, alphas: list[NDArray[np.uint8]], level: int, mode: AlphaMode) -> float:
     """Mean alpha of the pictures in [0, 1], with ``level`` as the median level of detail; ``alphas`` are those of the levels, [h, w, 1]."""
-    levels, clear = joined(alphas, alphas[0].shape), torch.ones(visible.count)
-    for pixels, uv, detail in zip(visible.pixels, visible.uvs, visible.details, strict=True):
-        alpha = filtered(levels, uv, detail + level)[:, 0] / 255
-        clear[pixels] *= 1 - (alpha if mode.kind == "hash" else opacity(alpha, mode))  # in any order of depth
+    alpha = filtered(joined(alphas, alphas[0].shape), visible.uvs, visible.details + level)[:, 0] / 255
+    alpha = alpha if mode.kind == "hash" else opacity(alpha, mode)
+    clear = torch.ones(visible.count).scatter_reduce_(0, visible.pixels, 1 - alpha, "prod")  # in any order of depth
     return 1 - float(clear.double().mean())
 
 

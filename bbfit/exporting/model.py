@@ -24,7 +24,7 @@ from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png
 from bbfit.model_files import check_model_path
-from bbfit.rendering.cards import draw_cards
+from bbfit.rendering.cards import CardRenderer
 from bbfit.rendering.dispatch import render
 
 
@@ -63,6 +63,10 @@ class ShippedModel:
         return replace(cards, chain=tuple(plain_chain(cards.atlas.image))) if self.config.mipmapped(cards.alpha) else cards
 
     @cached_property
+    def _renderer(self) -> CardRenderer:
+        return CardRenderer(replace(self.cards, alpha=self.cloud.alpha))
+
+    @cached_property
     def glb(self) -> bytes:
         """The GLB file."""
         return glb_bytes(self.cards, self.config)
@@ -79,7 +83,7 @@ class ShippedModel:
         faster and draws them. Trimmed outlines cut off nothing visible.
         """
         if self.config.has_mips or self.halvings or self.config.mipmapped(self.cloud.alpha):
-            return draw_cards(replace(self.cards, alpha=self.cloud.alpha), camera)
+            return self._renderer.draw(camera)
         return render(self.cloud, camera.to(self.cloud.texels.device))
 
     def antialiased(self) -> ShippedModel:

@@ -26,26 +26,47 @@ from bbfit.operators.drawing.reference import EDGE_ON
 _SLACK = 1e-9
 # Relative error of corners up to which a card belongs to a sheet.
 _SAME = 1e-6
+# Most pixels that are compared with polygons at once.
+_AT_ONCE = 1 << 21
 
 
 @dataclass(frozen=True)
-class Sheet:
-    """Cards that are disjoint parts of one textured plane; a ray meets at most one of them."""
+class Sheets:
+    """The S textured planes of cards, and their Q pieces: convex parts of a plane of which a ray meets at most one.
 
-    pieces: list[Card]
-    """At least one card."""
-    to_world: NDArray[np.float64]
-    """From (u, v, 1) to homogeneous world points, [4, 3]."""
-    first: int
-    """Index of its texture's first texel among the texels of all textures, which seeds the mode ``hash``."""
+    Coordinates are float64. Corners and sides are padded to K by repetition.
+    """
+
+    to_world: Tensor
+    """From (u, v, 1) to homogeneous world points, [S, 4, 3]."""
+    normals: Tensor
+    """[S, 3]."""
+    centers: Tensor
+    """Mean of the corners, [S, 3]."""
+    culled: Tensor
+    """Whether only the front is drawn, bool [S]."""
+    first: Tensor
+    """Index of a texture's first texel among the texels of all textures, which seeds the mode ``hash``, int64 [S]."""
+    of_piece: Tensor
+    """The plane of each piece, int64 [Q]. Pieces of a plane keep the order of the cards."""
+    corners: Tensor
+    """Homogeneous, [Q, K, 4]."""
+    sides: Tensor
+    """Coefficients (a, b, c) with a u + b v <= c inside, [Q, K, 3]."""
+
+    def __len__(self) -> int:
+        """The number S of planes."""
+        return len(self.first)
 
 
 @dataclass(frozen=True)
 class Hits:
-    """The M pixels of a camera whose rays meet a sheet on a side that is shown."""
+    """The M places where the rays of a camera's pixels meet sheets on a side that is shown."""
 
+    sheet: Tensor
+    """Which sheet, int64 [M], ascending."""
     x: Tensor
-    """Columns, int64 [M]; no pixel occurs twice."""
+    """Columns, int64 [M]; no pixel of a sheet occurs twice."""
     y: Tensor
     """Rows, int64 [M]."""
     uv: Tensor
@@ -55,7 +76,7 @@ class Hits:
     depth: Tensor
     """Depth in meters, float64 [M]."""
     to_uv: Tensor
-    """From a pixel (x, y, 1) to homogeneous texture coordinates, [3, 3]."""
+    """From a pixel (x, y, 1) to homogeneous texture coordinates of each sheet, [S, 3, 3]."""
 
 
 @dataclass(frozen=True)
@@ -101,11 +122,30 @@ def draw_cards(cards: Cards, camera: Camera) -> Tensor:
     InputError
         If a level is not uint8 or not half as large as the level before, rounded down.
     """
-    levels, sheets = joined([cards.atlas.image] if cards.chain is None else cards.chain, cards.atlas.image.shape), sheets_of(cards)
-    cameras = camera.batch()
-    with torch.no_grad():
-        image = torch.stack([_view(cards, sheets, levels, cameras[index]) for index in range(len(cameras))])
-    return image if camera.batched else image[0]
+    return CardRenderer(cards).draw(camera)
+
+
+class CardRenderer:
+    """Draws cards as :func:`draw_cards` does, for many cameras: what does not depend on the camera is computed once."""
+
+    def __init__(self, cards: Cards) -> None:
+        self._cards, self._sheets = cards, sheets_of(cards)
+        self._levels = joined([cards.atlas.image] if cards.chain is None else cards.chain, cards.atlas.image.shape)
+
+    def draw(self, camera: Camera) -> Tensor:
+        """See :func:`draw_cards`."""
+        cameras = camera.batch()
+        with torch.no_grad():
+            image = torch.stack([_view(self._cards, self._sheets, self._levels, cameras[index]) for index in range(len(cameras))])
+        return image if camera.batched else image[0]
+
+    def fragments(self, camera: Camera) -> int:
+        """How many fragments a graphics card shades for a single camera: the pixel centers inside the polygons of all layers.
+
+        Parts behind the camera and culled sides do not count. Early depth tests, which may save some, are not assumed: an alpha test
+        prevents them. The further pixels of 2 x 2 blocks that only serve derivatives are left out.
+        """
+        return len(hits(self._cards, self._sheets, camera).x)
 
 
 def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> MipChain:
@@ -124,53 +164,85 @@ def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> MipCha
     return MipChain(texels, (heights * widths).cumsum(0) - heights * widths, widths, heights)
 
 
-def sheets_of(cards: Cards) -> list[Sheet]:
+def sheets_of(cards: Cards) -> Sheets:
     """The textured planes of cards, in the order of their first cards; cards without an area are left out."""
-    sheets: list[Sheet] = []
-    areas = cards.atlas.sizes.prod(-1)
+    planes: list[tuple[list[Card], NDArray[np.float64]]] = []
+    known, of_piece, pieces = dict[tuple[int, bool], list[int]](), list[int](), list[Card]()
     for card in cards.cards:
         if area(card.uvs) == 0:
             continue
-        for sheet in sheets:
-            one = sheet.pieces[0]
-            if (one.rectangle, one.culled) == (card.rectangle, card.culled) and one.normal @ card.normal > 0:
-                off = _homogeneous(card.uvs) @ sheet.to_world[:3].T - card.corners
-                if abs(off).max() <= _SAME * abs(card.corners).max():
-                    sheet.pieces.append(card)
-                    break
-        else:
+        numbers = known.setdefault((card.rectangle, card.culled), [])
+        number = next((number for number in numbers if _lies_in(card, *planes[number])), len(planes))
+        if number == len(planes):
             middle, center = card.uvs.mean(0), card.corners.mean(0)
             slopes = (np.linalg.pinv(card.uvs - middle) @ (card.corners - center)).T
-            to_world = np.concatenate([np.column_stack([slopes, center - slopes @ middle]), [[0.0, 0.0, 1.0]]])
-            sheets.append(Sheet([card], to_world, int(areas[: card.rectangle].sum())))
-    return sheets
+            planes.append(([], np.concatenate([np.column_stack([slopes, center - slopes @ middle]), [[0.0, 0.0, 1.0]]])))
+            numbers.append(number)
+        planes[number][0].append(card)
+        of_piece.append(number)
+        pieces.append(card)
+    starts, ones = np.concatenate([[0], cards.atlas.sizes.prod(-1).cumsum()]), [own[0] for own, _ in planes]
+    return Sheets(
+        torch.from_numpy(np.array([to_world for _, to_world in planes], np.float64).reshape(-1, 4, 3)),
+        _rows([one.normal for one in ones], 3),
+        _rows([np.concatenate([card.corners for card in own]).mean(0) for own, _ in planes], 3),
+        torch.tensor([one.culled for one in ones], dtype=torch.bool),
+        torch.tensor([int(starts[one.rectangle]) for one in ones], dtype=torch.int64),
+        torch.tensor(of_piece, dtype=torch.int64),
+        _padded([_homogeneous(card.corners) for card in pieces], 4),
+        _padded([np.column_stack(sides(card.uvs)) for card in pieces], 3),
+    )
 
 
-def hits(cards: Cards, sheet: Sheet, camera: Camera) -> Hits:
-    """The pixels in which a single camera meets one of the cards' sheets, whatever its alpha."""
+def _lies_in(card: Card, own: list[Card], to_world: NDArray[np.float64]) -> bool:
+    """Whether a card lies in the plane of other cards of its texture, and shows its part of the texture."""
+    off = _homogeneous(card.uvs) @ to_world[:3].T - card.corners
+    return bool(own[0].normal @ card.normal > 0 and abs(off).max() <= _SAME * abs(card.corners).max())
+
+
+def _rows(vectors: list[NDArray[np.float64]], width: int) -> Tensor:
+    return torch.from_numpy(np.array(vectors, np.float64).reshape(-1, width))
+
+
+def _padded(arrays: list[NDArray[np.float64]], width: int) -> Tensor:
+    """Arrays [k, width] with their last rows repeated, [Q, K, width]."""
+    longest = max(map(len, arrays), default=1)
+    padded = [np.pad(array, ((0, longest - len(array)), (0, 0)), "edge") for array in arrays]
+    return torch.from_numpy(np.array(padded, np.float64).reshape(-1, longest, width))
+
+
+def hits(cards: Cards, sheets: Sheets, camera: Camera) -> Hits:
+    """The pixels in which a single camera meets the cards' sheets, whatever their alpha."""
     camera = camera.to("cpu").to(torch.float64)
-    to_world = torch.from_numpy(sheet.to_world)
-    to_pixel, to_depth = camera.world_to_pixel @ to_world, camera.world_to_camera[2] @ to_world
-    shown = _faces(sheet, camera)
+    to_pixel, to_depth = camera.world_to_pixel @ sheets.to_world, camera.world_to_camera[2] @ sheets.to_world
+    shown = _faced(sheets, camera)
     # [u, v, 1] / depth for a pinhole, [u, v, 1] for parallel projection, from a pixel [x, y, 1]
-    to_uv = torch.linalg.inv(to_pixel) if shown else torch.eye(3, dtype=torch.float64)
-    free = torch.full((camera.height, camera.width), shown)
-    parts = [_hits(piece, camera, to_uv, to_depth, free) for piece in (sheet.pieces if shown else sheet.pieces[:1])]
-    x, y, u, v, scale, depth = (torch.cat(column) for column in zip(*parts, strict=True))
+    to_uv = torch.linalg.inv(torch.where(shown[:, None, None], to_pixel, torch.eye(3).double()))
+    low, high = _boxes(sheets, camera, shown)
+    extent, areas, found = high - low, (high - low).prod(-1), list[tuple[Tensor, ...]]()
+    for some in torch.arange(len(areas)).split(_pieces_at_once(areas)):
+        piece = some.repeat_interleave(areas[some])
+        inside = torch.arange(len(piece)) - (areas[some].cumsum(0) - areas[some]).repeat_interleave(areas[some])
+        x, y = low[piece, 0] + inside % extent[piece, 0], low[piece, 1] + inside // extent[piece, 0]
+        sheet = sheets.of_piece[piece]
+        u, v, scale = (to_uv[sheet, row, 0] * x + to_uv[sheet, row, 1] * y + to_uv[sheet, row, 2] for row in range(3))
+        u, v = u / scale, v / scale
+        depth = to_depth[sheet, 0] * u + to_depth[sheet, 1] * v + to_depth[sheet, 2]
+        met = (depth > 0) & depth.isfinite()
+        for along_u, along_v, offset in sheets.sides.permute(1, 2, 0):
+            met &= u * along_u[piece] + v * along_v[piece] <= offset[piece] + _SLACK
+        found.append(tuple(values[met] for values in (sheet, x, y, u, v, scale, depth)))
+    sheet, x, y, u, v, scale, depth = (torch.cat(values) for values in zip(*found, strict=True))
+    # Where pieces of a sheet overlap, the first one shows.
+    places, order = ((sheet * camera.height + y) * camera.width + x).sort(stable=True)
+    first = torch.ones_like(places, dtype=torch.bool)
+    first[1:] = places[1:] != places[:-1]
+    sheet, x, y, u, v, scale, depth = (values[order[first]] for values in (sheet, x, y, u, v, scale, depth))
     uv = torch.stack([u, v], -1)
     # d(a / c) = (da - (a / c) dc) / c, in x and in y
     size = torch.tensor(cards.atlas.image.shape[1::-1], dtype=torch.float64)
-    rates = [((to_uv[:2, axis] - uv * to_uv[2, axis]) * size).norm(dim=-1) for axis in (0, 1)]
-    return Hits(x, y, uv, (torch.maximum(*rates) / scale.abs()).log2(), depth, to_uv)
-
-
-def fragments(cards: Cards, camera: Camera) -> int:
-    """How many fragments a graphics card shades for a single camera: the pixel centers inside the polygons of all layers.
-
-    Parts behind the camera and culled sides do not count. Early depth tests, which may save some, are not assumed: an alpha test prevents
-    them. The further pixels of 2 x 2 blocks that only serve derivatives are left out.
-    """
-    return sum(len(hits(cards, sheet, camera).x) for sheet in sheets_of(cards))
+    rates = [((to_uv[sheet, :2, axis] - uv * to_uv[sheet, 2, axis, None]) * size).norm(dim=-1) for axis in (0, 1)]
+    return Hits(sheet, x, y, uv, (torch.maximum(*rates) / scale.abs()).log2(), depth, to_uv)
 
 
 def filtered(levels: MipChain, uv: Tensor, detail: Tensor) -> Tensor:
@@ -199,62 +271,56 @@ def _bilinear(levels: MipChain, uv: Tensor, level: Tensor) -> Tensor:
     return upper + (lower - upper) * y
 
 
-def _view(cards: Cards, sheets: list[Sheet], levels: MipChain, camera: Camera) -> Tensor:
+def _view(cards: Cards, sheets: Sheets, levels: MipChain, camera: Camera) -> Tensor:
     """Picture of a single camera, [H, W, 4]."""
-    count = camera.height * camera.width
-    met = [hits(cards, sheet, camera) for sheet in sheets]
-    straight = filtered(levels, torch.cat([each.uv for each in met]), detail := torch.cat([each.detail for each in met])) / 255
+    met = hits(cards, sheets, camera)
+    straight = filtered(levels, met.uv, met.detail) / 255
     colors, alphas = straight[:, :3], straight[:, 3]
     if cards.alpha.kind == "hash":
-        drawn = torch.cat([thresholds(each.x, each.y, sheet.first) for each, sheet in zip(met, sheets, strict=True)])
-        alphas = (alphas >= drawn).to(alphas)
+        alphas = (alphas >= thresholds(met.x, met.y, sheets.first[met.sheet])).to(alphas)
     elif cards.alpha.antialiased:
-        beside = (torch.cat(places) for places in zip(*map(_beside, met), strict=True))
-        across, down = ((filtered(levels, uv, detail)[:, 3] / 255 - alphas).abs() for uv in beside)
+        across, down = ((filtered(levels, uv, met.detail)[:, 3] / 255 - alphas).abs() for uv in _beside(met))
         alphas = coverage(alphas, across + down, cards.alpha)
     else:
         alphas = opacity(alphas, cards.alpha)
-    pixels, depths = torch.cat([each.y * camera.width + each.x for each in met]), torch.cat([each.depth for each in met])
-    shown = alphas > 0
-    image = composite_fragments(colors[shown], alphas[shown], depths[shown], pixels[shown], count, nested=cards.alpha.antialiased)
+    shown, pixels, count = alphas > 0, met.y * camera.width + met.x, camera.height * camera.width
+    image = composite_fragments(colors[shown], alphas[shown], met.depth[shown], pixels[shown], count, nested=cards.alpha.antialiased)
     return image.unflatten(0, (camera.height, camera.width))
 
 
 def _beside(met: Hits) -> list[Tensor]:
     """Texture coordinates, [M, 2], at the other pixel of each hit's row and at that of its column in its square of 2 x 2 pixels."""
-    places = [(met.x ^ 1, met.y), (met.x, met.y ^ 1)]
-    rows = [torch.stack([row[0] * x + row[1] * y + row[2] for row in met.to_uv], -1) for x, y in places]
-    return [row[:, :2] / row[:, 2:] for row in rows]
+    rows = met.to_uv[met.sheet]
+    places = [torch.stack([x, y, torch.ones_like(x)], -1).double() for x, y in ((met.x ^ 1, met.y), (met.x, met.y ^ 1))]
+    found = [(rows @ place[:, :, None])[..., 0] for place in places]
+    return [place[:, :2] / place[:, 2:] for place in found]
 
 
-def _faces(sheet: Sheet, camera: Camera) -> bool:
-    """Whether the camera sees a side of the plane that is shown, and not edge-on."""
-    normal = torch.from_numpy(sheet.pieces[0].normal)
-    towards = camera.position - torch.from_numpy(np.concatenate([piece.corners for piece in sheet.pieces]).mean(0))
-    if camera.orthographic:
-        towards = -camera.forward
-    distance = float(towards @ normal)
-    return abs(distance) > EDGE_ON * float(towards.norm()) and (distance > 0 or not sheet.pieces[0].culled)
+def _faced(sheets: Sheets, camera: Camera) -> Tensor:
+    """Whether the camera sees a side of each plane that is shown, and not edge-on, bool [S]."""
+    towards = -camera.forward.expand(len(sheets), 3) if camera.orthographic else camera.position - sheets.centers
+    distance = (towards * sheets.normals).sum(-1)
+    return (distance.abs() > EDGE_ON * towards.norm(dim=-1)) & ((distance > 0) | ~sheets.culled)
 
 
-def _hits(piece: Card, camera: Camera, to_uv: Tensor, to_depth: Tensor, free: Tensor) -> tuple[Tensor, ...]:
-    """The ``free`` pixels, bool [H, W], whose rays meet a piece, which then are not free: x, y, u, v, the third homogeneous coordinate
-    and the depth, [M] each."""
-    low, high = torch.zeros(2, dtype=torch.int64), torch.tensor([camera.width, camera.height])
-    corners = torch.from_numpy(_homogeneous(piece.corners)) @ camera.world_to_pixel.mT
-    if bool((corners[:, 2] > 1e-9).all()):  # otherwise a part is behind the camera, and the corners bound nothing
-        at = corners[:, :2] / corners[:, 2:]
-        low, high = (torch.minimum(edge.clamp_min(0), high.double()).long() for edge in (at.amin(0).floor(), at.amax(0).floor() + 2))
-    y, x = torch.meshgrid(torch.arange(int(low[1]), int(high[1])), torch.arange(int(low[0]), int(high[0])), indexing="ij")
-    x, y = x.flatten(), y.flatten()
-    u, v, scale = (row[0] * x + row[1] * y + row[2] for row in to_uv)
-    u, v = u / scale, v / scale
-    depth = to_depth[0] * u + to_depth[1] * v + to_depth[2]
-    met = free[y, x] & (depth > 0) & depth.isfinite()
-    for (along_u, along_v), offset in zip(*sides(piece.uvs), strict=True):
-        met &= u * float(along_u) + v * float(along_v) <= float(offset) + _SLACK
-    free[y[met], x[met]] = False
-    return x[met], y[met], u[met], v[met], scale[met], depth[met]
+def _boxes(sheets: Sheets, camera: Camera, shown: Tensor) -> tuple[Tensor, Tensor]:
+    """The first pixel of the box around each piece, and that after the last, x and y, int64 [Q, 2] each; empty for what is not shown."""
+    corners = sheets.corners @ camera.world_to_pixel.mT
+    bounded = (corners[..., 2] > 1e-9).all(-1, keepdim=True)  # otherwise a part is behind the camera, and the corners bound nothing
+    at, size = corners[..., :2] / corners[..., 2:], torch.tensor([camera.width, camera.height], dtype=torch.float64)
+    low, high = (torch.minimum(edge.clamp_min(0), size) for edge in (at.amin(1).floor(), at.amax(1).floor() + 2))
+    low, high = torch.where(bounded, low, 0), torch.where(bounded, high, size)
+    return low.long(), torch.where(shown[sheets.of_piece, None], torch.maximum(low, high), low).long()
+
+
+def _pieces_at_once(areas: Tensor) -> list[int]:
+    """Numbers of consecutive pieces with at most :data:`_AT_ONCE` pixels in their boxes together, or single ones."""
+    counts, total = [0], 0
+    for pixels in areas.tolist():
+        if total + pixels > _AT_ONCE and counts[-1]:
+            counts, total = [*counts, 0], 0
+        counts[-1], total = counts[-1] + 1, total + pixels
+    return counts
 
 
 def _homogeneous(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -98,9 +98,11 @@ def test_polygons_and_pieces_show_what_the_rectangles_do(crossed: BillboardCloud
     face = Camera(look_at(torch.tensor([[0.1, 1.1, 4.0]]).double(), torch.tensor([0.1, 1.1, 0.0]).double()), orbit.intrinsics[:1], 47, 41)
     face = Camera(face.world_to_camera, pinhole_intrinsics(40, 47, 41)[None], 47, 41)  # the middle column lies on the edge
     torch.testing.assert_close(draw_cards(cards.with_cards(pieces), face), draw_cards(cards, face), rtol=0, atol=1e-6)
-    (first, _), (one, _) = sheets_of(cards.with_cards(pieces)), sheets_of(cards)
-    met, once = hits(cards, first, face[0]), hits(cards, one, face[0])
-    assert len(first.pieces) == 2 and sorted((met.y * 47 + met.x).tolist()) == (once.y * 47 + once.x).tolist()
+    cut, whole_cards = sheets_of(cards.with_cards(pieces)), sheets_of(cards)
+    met, once = hits(cards, cut, face[0]), hits(cards, whole_cards, face[0])
+    assert len(cut) == len(whole_cards) == 2 and torch.bincount(cut.of_piece).tolist() == [2, 2]
+    for name in ("sheet", "x", "y"):
+        assert torch.equal(getattr(met, name), getattr(once, name))
 
 
 def halves(card: Card) -> list[Card]:

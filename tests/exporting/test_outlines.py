@@ -26,7 +26,7 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import MASK_RIM, Cards
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.rendering.cards import draw_cards, fragments, hits, sheets_of
+from bbfit.rendering.cards import CardRenderer, draw_cards, hits, sheets_of
 
 
 def of_kind(cards: Cards, kind: str) -> Cards:
@@ -151,9 +151,9 @@ def test_the_picture_is_that_of_the_rectangles(kind: str, orbit: Camera, tmp_pat
         assert abs(pictures[0] - pictures[1]).max() < 1e-5
     assert len(sheets_of(made)) == len(cards.cards)
     for index in range(len(orbit)):
-        pixels = [hits(made, sheet, orbit[index]) for sheet in sheets_of(made)]
-        assert all(len(set(zip(met.x.tolist(), met.y.tolist(), strict=True))) == len(met.x) for met in pixels)
-        assert sum(len(met.x) for met in pixels) == fragments(made, orbit[index]) < fragments(cards, orbit[index])
+        met = hits(made, sheets_of(made), orbit[index])
+        assert len(set(zip(met.sheet.tolist(), met.x.tolist(), met.y.tolist(), strict=True))) == len(met.x)
+        assert len(met.x) == CardRenderer(made).fragments(orbit[index]) < CardRenderer(cards).fragments(orbit[index])
 
 
 def rasterized(corners: NDArray[np.float64], camera: Camera, steps: int = 256) -> NDArray[np.int64]:

@@ -128,7 +128,7 @@ def contrast(alpha: Tensor) -> Tensor:
     return across + (alpha[..., 1::2, :] - alpha[..., ::2, :]).abs().repeat_interleave(2, -2)
 
 
-def thresholds(x: Tensor, y: Tensor, texture: int) -> Tensor:
+def thresholds(x: Tensor, y: Tensor, texture: int | Tensor) -> Tensor:
     """Pseudo-random thresholds of alpha in (0, 1) for the mode ``hash``, one for each pixel, int64 (x, y), and texture, by its first texel.
 
     An integer hash of 32 bits (lowbias32, C. Wellons, "Prospecting for Hash Functions", 2018).
