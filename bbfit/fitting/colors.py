@@ -6,8 +6,10 @@ from collections.abc import Iterable
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import premultiply, unpremultiply
 from bbfit.operators.config import Backend
 from bbfit.rendering.dispatch import render
 from bbfit.views import ViewSet
@@ -16,6 +18,8 @@ from bbfit.views import ViewSet
 _VIEWS, _ROUNDS = 24, 3
 # Largest factor of a channel, and its inverse the smallest.
 _LARGEST = 2.0
+# Texels on a side of the square whose mean color counts, and the least mean alpha there.
+_AROUND, _LEAST_ALPHA = 5, 1e-4
 
 
 def matched_colors(cloud: BillboardCloud, views: ViewSet, backend: Backend = "auto") -> BillboardCloud:
@@ -37,6 +41,23 @@ def matched_colors(cloud: BillboardCloud, views: ViewSet, backend: Backend = "au
             factors = (target / drawn.clamp_min(1e-6)).clamp(1 / _LARGEST, _LARGEST).to(cloud.texels)
             cloud = cloud.with_texels(torch.cat([(cloud.texels[:, :3] * factors).clamp(0, 1), cloud.texels[:, 3:]], 1))
     return cloud
+
+
+def smoothed_colors(cloud: BillboardCloud) -> BillboardCloud:
+    """Mix the color of each texel with the mean color around it, the more the fainter the texel is; opaque texels stay as they are.
+
+    Faint texels hardly show, so a fit leaves them any color. But programs average straight color and alpha apart for mip levels, so faint
+    texels count there as much as opaque ones: without this step, an acer lost 5 % of its chroma. The mean is over 5 x 5 texels, weighted
+    by alpha. With a mask, texels are opaque from the cutoff on.
+    """
+    full, textures = cloud.alpha.cutoff if cloud.alpha.kind == "mask" else 1.0, []
+    for texture in cloud.textures():
+        color, seen = texture[..., :3], (texture[..., 3:] / full).clamp(max=1)
+        weighted = premultiply(torch.cat([color, seen], -1)).movedim(3, 1)
+        around = unpremultiply(avg_pool2d(weighted, _AROUND, 1, _AROUND // 2).movedim(1, 3))
+        mixed = torch.where(around[..., 3:] > _LEAST_ALPHA, seen * color + (1 - seen) * around[..., :3], color)
+        textures.append(torch.cat([mixed, texture[..., 3:]], -1).reshape(-1, 4))
+    return cloud.with_texels(torch.cat(textures))
 
 
 def _mean_color(pictures: Iterable[Tensor]) -> Tensor | None:

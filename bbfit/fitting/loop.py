@@ -17,7 +17,7 @@ from torch import Tensor
 from bbfit.checks import InputError, InputTypeError, check_range, fail
 from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
-from bbfit.fitting.colors import matched_colors
+from bbfit.fitting.colors import matched_colors, smoothed_colors
 from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.coverage import matched_coverage
 from bbfit.fitting.initialize import bounded, pixels_per_meter, random_textures, sized, start_cloud, tree_radius
@@ -204,7 +204,7 @@ def fit(
     bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
     if config.colors != "joint":
-        fitted = matched_colors(fitted, views.train, config.backend)
+        fitted = matched_colors(smoothed_colors(fitted), views.train, config.backend)
     fitted = palettized(fitted, config.palette)
     if config.placement != "even" or config.placement_learning_rate:
         fitted = trimmed(fitted)
