@@ -21,13 +21,13 @@ VERSIONS: Mapping[str, int] = {
     "grow": 1,
     "convert": 1,
     "views": 2,
-    "budget": 6,
-    "fit": 13,
-    "export": 5,
-    "evaluate": 9,
-    "report": 3,
-    "lod": 2,
-    "compare": 3,
+    "budget": 7,
+    "fit": 14,
+    "export": 6,
+    "evaluate": 10,
+    "report": 4,
+    "lod": 3,
+    "compare": 4,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""
 EXECUTION = {"affects_result": False}
