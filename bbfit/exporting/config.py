@@ -58,7 +58,8 @@ class ExportConfig:
     """Keep the PNG beside a texture in another format, for programs that cannot read that format."""
     mipmaps: bool | None = None
     """Read the texture with mip levels from afar, so that the tree does not flicker. Programs compute those of a PNG as plain averages.
-    Default: yes, except for a mask with a cutoff above 0.25, whose leaves would vanish with distance, and for the preset thesis."""
+    Default: yes, except for a mask with a cutoff above 0.25, whose leaves would vanish with distance, for the preset thesis, and for
+    Blender, whose Cycles has no mip levels."""
     mip_files: bool = False
     """Also write the mip levels as PNG files beside the model, for programs that import them."""
     material: Material | None = None
@@ -79,7 +80,9 @@ class ExportConfig:
 
     def mipmapped(self, alpha: AlphaMode) -> bool:
         """Whether a model with an alpha mode is read with mip levels."""
-        return (alpha.kind != "mask" or alpha.cutoff <= MOST_AVERAGED) if self.mipmaps is None else self.mipmaps
+        if self.mipmaps is not None:
+            return self.mipmaps
+        return self.profile != "blender" and (alpha.kind != "mask" or alpha.cutoff <= MOST_AVERAGED)
 
     def resolve(self) -> ResolvedExport:
         """Fill in the choices that depend on the profile and on the installed encoders; a :class:`ResolvedExport` returns itself.

@@ -57,7 +57,7 @@ COUNTS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Numbers of billboards that are compared."""
 LEAST_GAIN_DB = 0.3
 """Least gain at a low resolution, in dB, for which the number of billboards may double."""
-MOST_LAYERS = 2.6
+MOST_LAYERS = 2.4
 """Most layers before each other at a low resolution, on average over the rectangles around the tree in the views. A finished model shades
 about 1.6 times as many pixels."""
 # Number of billboards that is tried first.
