@@ -3,7 +3,7 @@
 All pictures need Blender. ``pages`` also needs Chromium and playwright.
 
 species    species.png: one view of every species that bbfit grows
-acer       acer.png: held-out views of an acer, and the results of the thesis preset and of the default preset with equal vertices
+acer       acer.png: held-out views of an acer over sky and grass, and the results of the thesis preset and of the default
 pages      report.png and view.png: the report of a run, and its page in ``bbfit view``
 """
 
@@ -16,8 +16,11 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+import torch
 
 import bbfit
+from bbfit.evaluation.backgrounds import BACKGROUNDS
+from bbfit.exporting.model import shipped_model
 from bbfit.images import over_color
 from bbfit.trees.species import known_species
 
@@ -38,29 +41,33 @@ def picture(name: str, folder: Path) -> np.ndarray:
 
 
 def acer() -> None:
-    """Draw acer.png: the views, four two-sided billboards of the thesis preset, and eight blended billboards of the default preset."""
+    """Draw acer.png: held-out views over sky and grass, the thesis preset's billboards, and those of the default."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "acer.glb"
         bbfit.write_tree(bbfit.grow("acer", seed=2), tree)
-        bbfit.render_views(tree, Path(folder) / "views", bbfit.ViewsConfig(count=60, size=512, samples=16))
+        bbfit.render_views(tree, Path(folder) / "views", bbfit.ViewsConfig(size=512, elevations=(0.0,)))
         views = bbfit.ViewDataset.load(Path(folder) / "views")
         thesis = bbfit.fit(views, bbfit.FitConfig(preset="thesis", sides="two")).cloud
-        default = bbfit.fit(views, bbfit.FitConfig(alpha="blend"), tree=tree).cloud
-        draw_acer(views, thesis, default)
+        draw_acer(views, thesis, bbfit.fit(views, tree=tree).cloud)
 
 
 def draw_acer(views: bbfit.ViewDataset, thesis: bbfit.BillboardCloud, default: bbfit.BillboardCloud) -> None:
     """Draw acer.png from two fitted clouds."""
-    columns = {"held-out view": None, "thesis preset": thesis, "default preset": default}
+    models = {
+        "thesis preset": shipped_model(thesis, bbfit.ExportConfig(outline="rectangle", mipmaps=False)),
+        "default": shipped_model(default).antialiased(),
+    }
     figure, axes = plt.subplots(2, 3, figsize=(12, 8.4))
-    for column, (title, cloud) in zip(axes.T, columns.items(), strict=True):
-        if cloud is not None:
-            mean = bbfit.evaluate(cloud, views.test).mean.over.mean
-            title += f": {cloud.vertex_count} vertices, {mean.psnr:.2f} dB, FLIP {mean.flip:.3f}"
+    for column, title in zip(axes.T, ("held-out view", *models), strict=True):
+        model = models.get(title)
+        if model is not None:
+            report = bbfit.evaluate(model.cloud, views.test, export=model.config)
+            mean = (report.antialiased or report.mean).over.mean
+            title += f": {len(model.glb) / 1000:.0f} kB, {mean.psnr:.2f} dB, FLIP {mean.flip:.3f}"
         column[0].set_title(title, fontsize=10)
-        for axis, index in zip(column, (0, len(views.test) // 3), strict=True):
-            image = views.test.targets([index])[0] if cloud is None else bbfit.render(cloud, views.test.cameras[index])
-            axis.imshow(over_color(image.clamp(0, 1), 1.0).numpy()[40:472, 40:472])
+        for axis, index, background in zip(column, (0, len(views.test) // 3), ("sky", "grass"), strict=True):
+            image = views.test.targets([index])[0] if model is None else model.draw(views.test.cameras[index])
+            axis.imshow(over_color(image.clamp(0, 1), torch.tensor(BACKGROUNDS[background])).numpy()[40:472, 40:472])
             axis.axis("off")
     figure.tight_layout()
     figure.savefig(DOCS / "acer.png", dpi=100)

@@ -17,9 +17,9 @@ from bbfit.fitting.config import FitConfig, Placement, ResolvedFit
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views import ViewDataset
 
-COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
+COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128)
 """Numbers of billboards to try, in addition to the largest number that the limit of vertices allows, up to the last number."""
-START = 16
+START = 32
 """Number of billboards that a limit of texels or bytes is first spent on."""
 MIN_GAIN_DB = 0.75
 """Least gain, in dB, for which ``auto`` doubles the number of billboards."""
@@ -69,7 +69,7 @@ def choose(
 
     Every fifth training view is held out for validation. Short fits to the other views are compared there. A limit of vertices alone is
     spent in full, and by halves and quarters for the curve. For a target or ``auto``, the number of billboards doubles until it reaches the
-    target or gains too little; then the number between the last two that matter is tried. A limit of texels or bytes is first spent on 16
+    target or gains too little; then the number between the last two that matter is tried. A limit of texels or bytes is first spent on 32
     billboards, and then on more and on fewer for as long as they are not clearly worse; a last trial has half the texels, for the curve.
     Few billboards are also tried two-sided, half as many, and evenly placed, unless there is a target.
 

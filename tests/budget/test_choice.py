@@ -36,7 +36,7 @@ BYTES_A_TEXEL, AIM, NEAR = 2.0, 0.92, 0.6
 """The first guess; the part of a limit in bytes that a trial aims at, and the least that it is to use."""
 LESS = 1
 """Trials of less than a limit in texels or bytes, for the curve."""
-DOUBLED = [1, 2, 4, 8, 16, 32, 48]
+DOUBLED = [1, 2, 4, 8, 16, 32, 64, 128]
 """Numbers of billboards that are tried until they are enough."""
 DATA = Path(__file__).resolve().parents[2] / "data"
 Quality = Callable[[int, Sides, Placement], float]
@@ -237,7 +237,7 @@ def summary(found: Choice) -> tuple[int | None, Sides, Placement | None]:
         (43, [2, 5, 10]),
         (124, [7, 15, 31]),
         (128, [8, 16, 32]),
-        (10**6, [12, 24, 48]),
+        (10**6, [32, 64, 128]),
     ],
 )
 def test_a_limit_of_vertices_is_made_use_of(choosing: Choosing, vertices: int, counts: list[int]) -> None:
@@ -293,11 +293,11 @@ def test_a_placement_that_is_asked_for_is_kept(choosing: Choosing) -> None:
 @pytest.mark.parametrize(
     ("quality", "line", "best"),
     [
-        (curve(n16=25, n24=26, n32=26.5, n48=26), [16, 24, 32, 48], 32),
-        (curve(n16=25, n24=24, n32=30, n12=25.5, n8=25.2, n6=30), [16, 24, 12, 8], 12),
-        (curve(n16=25, n24=24, n12=24, n8=30), [16, 24, 12], 16),
-        (rising, [16, 24, 32, 48], 48),
-        (lambda count, *kind: 30.0 - count, [16, 24, 12, 8, 6, 4, 3, 2, 1], 1),
+        (curve(n32=25, n64=26, n128=25.8), [32, 64, 128], 64),
+        (curve(n32=25, n64=24, n128=30, n24=25.5, n16=25.2, n12=30), [32, 64, 24, 16], 24),
+        (curve(n32=25, n64=24, n24=24, n16=30), [32, 64, 24], 32),
+        (rising, [32, 64, 128], 128),
+        (lambda count, *kind: 30.0 - count, [32, 64, 24, 16, 12, 8, 6, 4, 3, 2, 1], 1),
     ],
 )
 def test_texels_go_to_more_and_to_fewer_until_that_is_in_vain(choosing: Choosing, quality: Quality, line: list[int], best: int) -> None:
@@ -319,12 +319,12 @@ def test_other_manners_have_the_texels_too(choosing: Choosing) -> None:
 
 def test_a_step_in_vain_may_be_bad_luck(choosing: Choosing) -> None:
     """One that loses little is followed by the next, in both directions."""
-    world = World(curve(n16=25, n24=25 - 0.9 * LUCK, n32=26, n48=25))
-    assert choosing(world, BudgetConfig(texels=10**6)).config.billboards == 32
-    assert world.line == [16, 24, 32, 48]
-    world = World(curve(n16=25, n24=20, n12=25 - 0.9 * LUCK, n8=26, n6=25))
-    assert choosing(world, BudgetConfig(texels=10**6)).config.billboards == 8
-    assert world.line == [16, 24, 12, 8, 6]
+    world = World(curve(n32=25, n64=25 - 0.9 * LUCK, n128=26))
+    assert choosing(world, BudgetConfig(texels=10**6)).config.billboards == 128
+    assert world.line == [32, 64, 128]
+    world = World(curve(n32=25, n64=20, n24=25 - 0.9 * LUCK, n16=26, n12=25))
+    assert choosing(world, BudgetConfig(texels=10**6)).config.billboards == 16
+    assert world.line == [32, 64, 24, 16, 12]
 
 
 def test_limits_of_vertices_and_texels_hold_at_once(choosing: Choosing) -> None:
@@ -370,10 +370,10 @@ def test_so_many_that_no_texel_is_left_are_not_tried(choosing: Choosing) -> None
     """Nor are more of them; the fewest are tried in any case."""
     world = World(rising, texels=10**6, bare=lambda count: 1000 * count)
     assert choosing(world, BudgetConfig(bytes=7500), FitConfig(placement="clusters")).config.billboards == 6
-    assert world.line == [16, 6, 4]
+    assert world.line == [32, 6, 4]
     world = World(rising, texels=10**6, bare=lambda count: 1000)
     assert choosing(world, BudgetConfig(bytes=1010), FitConfig(placement="clusters")).config.billboards == 1
-    assert world.line[0] == 16 and world.line[-1] == 1
+    assert world.line[0] == 32 and world.line[-1] == 1
 
 
 def test_a_budget_of_bytes_that_can_be_kept_is_kept(choosing: Choosing) -> None:
