@@ -42,6 +42,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "alpha": "mask",
         "placement": "clusters",
         "placement_learning_rate": 0.015,
+        "texel_density": 0.8,
         "bounds": "silhouette",
         "loss": "backgrounds",
         "ssim_weight": 0.01,
@@ -89,7 +90,6 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
         "least_alpha": 0.0,
         "colors": "views",
         "antialiased": True,
-        "texel_density": 0.8,
         "sharpness_weight": 4.0,
         "binarization_weight": 0.02,
     },
@@ -98,7 +98,6 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
         "least_alpha": 0.08,
         "colors": "matched",
         "antialiased": False,
-        "texel_density": 1.0,
         "sharpness_weight": 6.0,
         "binarization_weight": 0.01,
     },
@@ -107,7 +106,6 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
         "least_alpha": 0.08,
         "colors": "views",
         "antialiased": False,
-        "texel_density": 1.0,
         "sharpness_weight": 6.0,
         "binarization_weight": 0.03,
     },
@@ -167,7 +165,7 @@ class FitConfig:
     Preset: silhouette; thesis: viewport."""
     texel_density: _Density | None = None
     """Texels per pixel of a view along each side, for a billboard that faces the camera at the tree's axis.
-    Preset: 0.8 (mask) or 1; thesis: 1."""
+    Preset: 0.8; thesis: 1."""
     loss: Loss | None = None
     """Loss to minimize: absolute (l1) or squared (l2) differences of premultiplied RGBA, or squared ones over random backgrounds.
     It is summed over channels and averaged over pixels; for backgrounds it is the expectation.
