@@ -58,8 +58,7 @@ class ExportConfig:
     """Keep the PNG beside a texture in another format, for programs that cannot read that format."""
     mipmaps: bool | None = None
     """Read the texture with mip levels from afar, so that the tree does not flicker. Programs compute those of a PNG as plain averages.
-    Default: yes, except for a mask with a cutoff above 0.25, whose leaves would vanish with distance, for the preset thesis, and for
-    Blender, whose Cycles has no mip levels."""
+    Default: yes, except for masks with a cutoff above 0.25, whose leaves would vanish; for the preset thesis; and for Blender."""
     mip_files: bool = False
     """Also write the mip levels as PNG files beside the model, for programs that import them."""
     material: Material | None = None
@@ -82,6 +81,7 @@ class ExportConfig:
         """Whether a model with an alpha mode is read with mip levels."""
         if self.mipmaps is not None:
             return self.mipmaps
+        # Blender's Cycles has no mip levels.
         return self.profile != "blender" and (alpha.kind != "mask" or alpha.cutoff <= MOST_AVERAGED)
 
     def resolve(self) -> ResolvedExport:

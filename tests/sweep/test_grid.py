@@ -47,7 +47,7 @@ def test_a_file_may_vary_any_option(tmp_path: Path) -> None:
         ("mask", 1, 5),
     ]
     assert cells[0].labels == {"alpha": "mask", "seed": "0", "steps": "5"}
-    assert cells[0].config.texel_density != cells[6].config.texel_density, "presets are resolved for each cell"
+    assert cells[0].config.alpha_cutoff != cells[6].config.alpha_cutoff, "presets are resolved for each cell"
 
 
 def test_what_is_asked_for_on_top_counts_unless_it_is_varied() -> None:
