@@ -14,7 +14,7 @@ from bbfit.budget.sizes import picture_bytes
 from bbfit.evaluation.backgrounds import mean_psnr
 from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import shipped_model
+from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.fitting.config import FitConfig, Placement, Sides
 from bbfit.fitting.loop import fit, placement_points
 from bbfit.fitting.requirements import check_cameras, check_device
@@ -108,9 +108,9 @@ class Trials:
         started = time.perf_counter()
         start = None if placement == "even" else self._placement(config)
         cloud = fit(self._views, config, tree=self._tree, placement=start).cloud
-        glb = shipped_model(cloud, self._export).glb
-        psnr, seconds = round(validation_psnr(cloud, self._views.test), 3), round(time.perf_counter() - started, 1)
-        sizes = len(cloud.texels), len(glb), picture_bytes(glb)
+        model = shipped_model(cloud, self._export)
+        psnr, seconds = round(validation_psnr(model, self._views.test), 3), round(time.perf_counter() - started, 1)
+        sizes = len(cloud.texels), len(model.glb), picture_bytes(model.glb)
         return Trial(count, config.sides, placement, config.max_texels, cloud.vertex_count, *sizes, psnr, seconds)
 
     def _placement(self, config: FitConfig) -> BillboardCloud:
@@ -134,7 +134,6 @@ def short_config(config: FitConfig, count: int, sides: Sides, placement: Placeme
     return replace(config, billboards=count, sides=sides, placement=placement, max_texels=max_texels, **short)
 
 
-def validation_psnr(cloud: BillboardCloud, views: ViewSet) -> float:
-    """Compute the PSNR of a cloud in dB, averaged over views and :data:`~bbfit.evaluation.backgrounds.BACKGROUNDS`."""
-    draw = shipped_model(cloud).draw
-    return float(np.mean([mean_psnr(*held_out(draw, views, index)) for index in range(len(views))]))
+def validation_psnr(model: ShippedModel, views: ViewSet) -> float:
+    """Compute the PSNR of a model in dB, averaged over views and :data:`~bbfit.evaluation.backgrounds.BACKGROUNDS`."""
+    return float(np.mean([mean_psnr(*held_out(model.draw, views, index)) for index in range(len(views))]))

@@ -62,6 +62,8 @@ MOST_LAYERS = 2.4
 about 1.6 times as many pixels."""
 # Number of billboards that is tried first.
 _FIRST = 32
+# Most searches for that choice.
+_SEARCHES = 3
 # Least alpha of a texel that counts in layers.
 _VISIBLE = 0.05
 
@@ -91,7 +93,10 @@ def find_placement(
     texel density of pictures of about :data:`SIDE` pixels.
     """
     if config.billboards is None:
-        return _at_the_knee(views, points, config, on_progress or (lambda done, total: None))
+        on_progress = on_progress or (lambda done, total: None)
+        cloud = _at_the_knee(views, points, config, on_progress)
+        on_progress(_SEARCHES, _SEARCHES)
+        return cloud
     return _found(views, points, config, on_progress, effort)[0]
 
 
@@ -113,7 +118,7 @@ def _at_the_knee(views: ViewSet, points: Tensor, config: ResolvedFit, on_progres
 
     def tried(number: int, count: int) -> _Trial:
         cloud, search = _found(views, points, config.counted(count), None, QUICK)
-        on_progress(number, 3)
+        on_progress(number, _SEARCHES)
         return _Trial(count, cloud, search.layers(cloud), search.decibels(cloud))
 
     first = tried(1, min(max(_FIRST, config.least_billboards), config.most_billboards))

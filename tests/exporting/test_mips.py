@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from bbfit.checks import InputError
 from bbfit.exporting.atlas import pack_atlas
-from bbfit.exporting.mips import coverage, linear_to_srgb, mip_chain, srgb_to_linear
+from bbfit.exporting.mips import coverage, linear_to_srgb, mip_chain, plain_chain, srgb_to_linear
 from bbfit.geometry.cards import Atlas
 
 WHOLE = np.array([[0.0, 0.0], [1.0, 1.0]])
@@ -219,3 +219,16 @@ def test_transfer_functions() -> None:
 def test_cutoffs_out_of_range_are_refused(cutoff: float) -> None:
     with pytest.raises(InputError, match=r"cutoff: expected a value in \(0, 1\]"):
         mip_chain(alone(picture(8, 8)), cutoff)
+
+
+def test_plain_levels_are_means_of_four_texels() -> None:
+    """Of alpha, and of colors in linear light whatever their alpha, from level to level."""
+    image = picture(8, 16)
+    chain = plain_chain(image)
+    assert [level.shape[:2] for level in chain] == [(8, 16), (4, 8), (2, 4), (1, 2), (1, 1)]
+    for finer, level in pairwise(chain[:4]):
+        values = finer.astype(float) / 255
+        values[..., :3] = srgb_to_linear(values[..., :3])
+        mean = values.reshape(len(level), 2, level.shape[1], 2, 4).mean((1, 3))
+        mean[..., :3] = linear_to_srgb(mean[..., :3])
+        assert abs(level - 255 * mean).max() <= 0.51
