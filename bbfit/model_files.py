@@ -41,8 +41,8 @@ def names_beside(path: Path, *, texture: bool = False, mip_files: bool = False) 
     return [path.name, *(path.with_suffix(suffix).name for suffix in others), *levels]
 
 
-def glb_of_scene(scene: trimesh.Scene, complete: Callable[[dict[str, Any]], None]) -> bytes:
-    """A scene as binary glTF 2.0, with its unit normals as they are and with what trimesh leaves out of the JSON.
+def glb_of_scene(scene: trimesh.Scene, complete: Callable[[dict[str, Any]], None], *, normals: bool = True) -> bytes:
+    """A scene as binary glTF 2.0, with its unit normals as they are, or without, and with what trimesh leaves out of the JSON.
 
     ``complete`` is given the glTF's JSON last, to change it in place. The same scene gives the same bytes.
     """
@@ -58,7 +58,7 @@ def glb_of_scene(scene: trimesh.Scene, complete: Callable[[dict[str, Any]], None
                 tree["bufferViews"][tree["accessors"][primitive["indices"]]["bufferView"]]["target"] = _ELEMENT_ARRAY_BUFFER
         complete(tree)
 
-    return trimesh.exchange.gltf.export_glb(scene, include_normals=True, unitize_normals=False, tree_postprocessor=finish)
+    return trimesh.exchange.gltf.export_glb(scene, include_normals=normals, unitize_normals=False, tree_postprocessor=finish)
 
 
 def generator() -> str:

@@ -95,7 +95,7 @@ def test_textures_are_as_fine_as_the_screen_shows(built: LodResult) -> None:
 
     def array(number: int) -> np.ndarray:
         accessor = tree["accessors"][number]
-        kind = {5125: "<u4", 5126: "<f4"}[accessor["componentType"]]
+        kind = {5123: "<u2", 5125: "<u4", 5126: "<f4"}[accessor["componentType"]]
         return np.frombuffer(views[accessor["bufferView"]], kind).reshape(accessor["count"], -1)
 
     for level in built.levels[1:]:

@@ -19,7 +19,7 @@ from PIL import Image
 
 from bbfit.geometry.camera import Camera
 
-COMPONENTS = {5126: ("<f4", 4), 5125: ("<u4", 4)}
+COMPONENTS = {5126: ("<f4", 4), 5125: ("<u4", 4), 5123: ("<u2", 2)}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
 
 
@@ -28,7 +28,7 @@ class Primitive:
     """One drawn list of triangles."""
 
     positions: NDArray[np.float64]
-    normals: NDArray[np.float64]
+    normals: NDArray[np.float64] | None
     uvs: NDArray[np.float64]
     triangles: NDArray[np.int64]
     material: dict[str, Any]
@@ -60,7 +60,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], list[Primitive], NDArray[np.ui
             attributes = {name: array(index).astype(np.float64) for name, index in primitive["attributes"].items()}
             triangles = array(primitive["indices"]).astype(np.int64).reshape(-1, 3)
             material = tree["materials"][primitive["material"]]
-            primitives.append(Primitive(attributes["POSITION"], attributes["NORMAL"], attributes["TEXCOORD_0"], triangles, material))
+            primitives.append(Primitive(attributes["POSITION"], attributes.get("NORMAL"), attributes["TEXCOORD_0"], triangles, material))
     (image,) = tree["images"]
     return tree, primitives, np.array(Image.open(io.BytesIO(blob(tree["bufferViews"][image["bufferView"]]))).convert("RGBA"))
 

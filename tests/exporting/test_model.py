@@ -121,10 +121,14 @@ def test_mask_cuts_where_alpha_reaches_the_cutoff(kind: str, clouds: dict[str, B
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_quads_are_the_rectangles(kind: str, clouds: dict[str, BillboardCloud], tmp_path: Path) -> None:
-    """Corners half a texel outside the rectangles, in the cloud's own meters; winding and normals agree; nothing merged or split."""
+    """Corners half a texel outside the rectangles, in the cloud's own meters; winding and normals agree; nothing merged or split.
+
+    Without light, a model has no normals.
+    """
     cloud = in_file_order(clouds[kind])
     (path,) = export(clouds[kind], tmp_path / "model.glb")
     tree, primitives, _ = read_glb(path)
+    _, lit, _ = read_glb(export(clouds[kind], tmp_path / "lit.glb", ExportConfig(material="pbr"))[0])
     positions = np.concatenate([primitive.positions for primitive in primitives])
     assert len(positions) == cloud.vertex_count
     quad = 0
@@ -138,18 +142,21 @@ def test_quads_are_the_rectangles(kind: str, clouds: dict[str, BillboardCloud], 
             np.testing.assert_allclose(found, corners[nearest], rtol=0, atol=1e-6)
             quad += 1
     culled = []
-    for primitive in primitives:
+    for primitive, with_normals in zip(primitives, lit, strict=True):
+        assert primitive.normals is None and with_normals.normals is not None
+        np.testing.assert_array_equal(primitive.positions, with_normals.positions)
+        np.testing.assert_array_equal(primitive.triangles, with_normals.triangles)
         a, b, c = (primitive.positions[primitive.triangles[:, i]] for i in range(3))
         winding = np.cross(b - a, c - a)
         winding /= np.linalg.norm(winding, axis=-1, keepdims=True)
         for i in range(3):
-            np.testing.assert_allclose(primitive.normals[primitive.triangles[:, i]], winding, rtol=0, atol=1e-5)
+            np.testing.assert_allclose(with_normals.normals[primitive.triangles[:, i]], winding, rtol=0, atol=1e-5)
         sides = -1 if not primitive.material["doubleSided"] else 1
         chosen = cloud.two_sided if sides == -1 else ~cloud.two_sided
         expected = cloud.normals[chosen].repeat_interleave(2 if sides == -1 else 1, 0).numpy().copy()
         if sides == -1:
             expected[1::2] *= -1
-        np.testing.assert_allclose(primitive.normals[::4], expected, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(with_normals.normals[::4], expected, rtol=0, atol=1e-6)
         culled.append(sides == -1)
     assert culled == sorted({bool(two) for two in cloud.two_sided})
     assert tree["asset"]["generator"].startswith("bbfit")
