@@ -10,13 +10,14 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
 from bbfit.fitting.levels import resize_textures
 from bbfit.fitting.loop import FitResult, fit
+from bbfit.fitting.palette import palettized
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.glb import split_glb
 from bbfit.views import ViewDataset
 
 # The most steps of a fit that is repeated with fewer texels, the factor on its learning rate, the fraction of the limit that it aims at,
 # and the most repetitions.
-_STEPS, _RATE, _AIM, _MOST_FITS = 100, 1 / 3, 0.98, 3
+_STEPS, _RATE, _AIM, _MOST_FITS = 100, 1 / 3, 0.98, 5
 
 
 def model_bytes(cloud: BillboardCloud, export: ExportConfig) -> int:
@@ -48,17 +49,20 @@ def fitted_within_bytes(views: ViewDataset, result: FitResult, max_bytes: int, e
         if texels < cloud.vertex_count // 2:  # two for each texture
             break
         cloud = fit(views, replace(config, billboards=len(cloud), max_texels=texels, **short), placement=cloud).cloud  # type: ignore[arg-type]
-    return within_bytes(cloud, max_bytes, export)
+    return within_bytes(cloud, max_bytes, export, palette=config.palette)
 
 
-def within_bytes(cloud: BillboardCloud, max_bytes: int | None, export: ExportConfig) -> BillboardCloud:
+def within_bytes(cloud: BillboardCloud, max_bytes: int | None, export: ExportConfig, *, palette: int = 0) -> BillboardCloud:
     """Resize the textures of a cloud until the exported model has at most ``max_bytes`` bytes; ``None`` is no limit.
+
+    A ``palette`` above 0 is the number of colors of the resized textures (:func:`~bbfit.fitting.palette.palettized`).
 
     Raises InputError if the model is larger even with one texel per texture.
     """
+    whole, scale = cloud, 1.0
     while max_bytes is not None and (size := model_bytes(cloud, export)) > max_bytes:
         if int(cloud.texture_sizes.amax()) == 1:
             fail("bytes", f"{max_bytes:,} are too few: {size:,} are needed without textures", "allow more, or fewer billboards")
-        sizes = (cloud.texture_sizes * min(0.98, math.sqrt(max_bytes / size))).long().clamp_min(1)
-        cloud = resize_textures(cloud, sizes)
+        scale *= min(0.98, math.sqrt(max_bytes / size))
+        cloud = palettized(resize_textures(whole, (whole.texture_sizes * scale).long().clamp_min(1)), palette)
     return cloud
