@@ -22,7 +22,7 @@ VERSIONS: Mapping[str, int] = {
     "convert": 1,
     "views": 2,
     "budget": 8,
-    "fit": 15,
+    "fit": 16,
     "export": 7,
     "evaluate": 10,
     "report": 4,
