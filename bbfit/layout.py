@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -57,17 +58,19 @@ def split_views(count: int, seed: int) -> tuple[list[int], list[int]]:
 
 
 def split_rings(counts: Sequence[int], seed: int) -> tuple[list[int], list[int]]:
-    """:func:`split_views` of each ring of views, so that the test views come from all of them. A ring of one view is for training.
+    """A seeded random quarter of each ring of views as test views: sorted training and test indices. A ring of one view is for training.
 
-    ``counts`` are the numbers of views on rings that follow each other. There are at least two views.
+    The test views of a ring are spread around the tree: one at random out of every four neighbors. A tree is harder to show from some sides
+    than from others, so rings would not be comparable if their test views came from different sides. ``counts`` are the numbers of views on
+    rings that follow each other. There are at least two views.
     """
-    train, test, begin = list[int](), list[int](), 0
+    test, begin = list[int](), 0
     for ring, count in enumerate(counts):
-        parts = split_views(count, seed + ring) if count > 1 else ([0], [])
-        for indices, part in zip((train, test), parts, strict=True):
-            indices += [begin + index for index in part]
+        parts, random = len(split_views(count, seed)[1]) if count > 1 else 0, np.random.default_rng(seed + ring)
+        edges = [begin + count * part // max(parts, 1) for part in range(parts + 1)]
+        test += [int(random.integers(first, last)) for first, last in pairwise(edges)]
         begin += count
-    return (train, test) if test else split_views(begin, seed)
+    return (sorted(set(range(begin)) - set(test)), test) if test else split_views(begin, seed)
 
 
 def write_transforms(folder: Path, camera: Camera, image_paths: list[str], train: list[int], test: list[int]) -> None:

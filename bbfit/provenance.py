@@ -20,9 +20,9 @@ from bbfit.checks import check_file
 VERSIONS: Mapping[str, int] = {
     "grow": 1,
     "convert": 1,
-    "views": 2,
-    "budget": 8,
-    "fit": 16,
+    "views": 3,
+    "budget": 9,
+    "fit": 17,
     "export": 7,
     "evaluate": 10,
     "report": 4,

@@ -14,7 +14,7 @@ import torch
 from bbfit.checks import InputError, MissingFileError
 from bbfit.geometry.camera import Camera, camera_from_nerf
 from bbfit.geometry.orbit import Orbit
-from bbfit.layout import cameras_of, read_frames, split_views, write_transforms
+from bbfit.layout import cameras_of, read_frames, split_rings, split_views, write_transforms
 
 POSE = [[1.0, 0, 0, 0], [0, 0, -1, -22], [0, 1, 0, 5], [0, 0, 0, 1]]
 
@@ -157,6 +157,26 @@ def test_a_seeded_quarter_is_held_out(count: int, tests: int) -> None:
     assert split_views(count, 7) == (train, test)
     if count > 50:
         assert split_views(count, 8) != (train, test)
+
+
+@pytest.mark.parametrize("counts", [(2,), (90,), (35, 18, 16, 13, 8), (3, 1, 9), (1, 5)])
+def test_the_test_views_of_a_ring_are_spread_around_the_tree(counts: tuple[int, ...]) -> None:
+    train, test = split_rings(counts, 7)
+    assert sorted(train + test) == list(range(sum(counts))) and train == sorted(train) and test == sorted(test)
+    assert split_rings(counts, 7) == (train, test)
+    begin = 0
+    for count in counts:
+        held = [index - begin for index in test if begin <= index < begin + count]
+        assert len(held) == (len(split_views(count, 0)[1]) if count > 1 else 0)
+        assert all(count * part // len(held) <= index < count * (part + 1) // len(held) for part, index in enumerate(held))
+        begin += count
+    if len(test) > 5:
+        assert split_rings(counts, 8) != (train, test)
+
+
+def test_rings_of_one_view_share_the_test_views() -> None:
+    train, test = split_rings((1, 1, 1, 1), 0)
+    assert len(test) == 1 and sorted(train + test) == [0, 1, 2, 3]
 
 
 def test_shared_views(shared: Path) -> None:

@@ -29,11 +29,12 @@ _Config = TypeVar("_Config", bound="FitConfig")
 
 EVEN = 8
 """Number of evenly placed billboards of the default preset."""
-# From so many billboards on, searches are short: different clusterings lead to nearly equal results.
-_MANY = 12
-# Billboards of the trunk's own when there are many. One of three crossed planes shows at least cos(30 degrees) = 87 % of the trunk's width.
-_TRUNK = 3
-_LOCALITY = 0.1
+# From so many billboards on, searches are short: different clusterings lead to nearly equal results. From _VERY_MANY on, to equal ones:
+# with 192 billboards, an acer gained 0.03 dB from four candidates in place of one.
+_MANY, _VERY_MANY = 12, 64
+# Billboards of the trunk's own when there are many: three for each part of it, and one part for every 16 billboards, up to three parts.
+_TRUNK, _PER_PART, _MOST_PARTS = 3, 16, 3
+_LOCALITY = 0.5
 TRANSPARENT_COLORS = 32
 """Colors of a palette that are left to transparent texels, which filtering shows beside visible ones."""
 
@@ -131,7 +132,7 @@ class FitConfig:
     """Number of billboards. Preset: as many as pay for this tree, within least_billboards and most_billboards; thesis: 4."""
     least_billboards: Count = 16
     """Least number of billboards that the preset chooses by itself."""
-    most_billboards: Count = 192
+    most_billboards: Count = 384
     """Largest number of billboards that the preset chooses by itself."""
     placement: Placement | None = None
     """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
@@ -142,15 +143,15 @@ class FitConfig:
     locality: _Unit | None = None
     """Compactness of what clustered billboards stand for: the weight of distances within a part of the tree against those from its plane.
     With 0, billboards are slices through the whole tree; the larger it is, the smaller they are, and the less there is to draw.
-    Default: 0.1 for twelve billboards or more, else 0."""
+    Default: 0.5 for twelve billboards or more, else 0."""
     trunk_billboards: _Number | None = None
     """Number of billboards, out of all, that cross in the trunk below the crown; for clusters, and trees with such a trunk.
-    Default: 3 for twelve billboards or more, else none."""
+    Three cross in each part of the trunk, from the ground up. Default: 9 for 48 billboards or more, 6 for 32, 3 for 12, else none."""
     restarts: Count | None = None
     """Independent searches for a placement; the best result is kept. Default: two for eight to eleven billboards, else one."""
     candidates: Count | None = None
     """Clusterings that a search compares; more take longer and may find a better placement.
-    Default: 12, or 4 for twelve billboards or more, of which any clustering is about as good as any other."""
+    Default: 12; 4 for twelve billboards or more, and 1 for 64 or more, of which any clustering is about as good as any other."""
     refinement_rounds: _Number | None = None
     """Rounds that refine the best placement by moving, splitting and merging billboards.
     Default: three fewer than there are billboards, at least one and at most six; none for twelve billboards or more."""
@@ -246,7 +247,9 @@ def _effort(count: int | None) -> dict[str, Any]:
     if count is None:
         return {}
     if count >= _MANY:
-        return {"restarts": 1, "candidates": 4, "refinement_rounds": 0, "locality": _LOCALITY, "trunk_billboards": _TRUNK}
+        trunk = _TRUNK * min(max(count // _PER_PART, 1), _MOST_PARTS)
+        candidates = 4 if count < _VERY_MANY else 1
+        return {"restarts": 1, "candidates": candidates, "refinement_rounds": 0, "locality": _LOCALITY, "trunk_billboards": trunk}
     rounds = min(6, max(1, count - 3))
     return {"restarts": min(2, max(1, count // 4)), "candidates": 12, "refinement_rounds": rounds, "locality": 0.0, "trunk_billboards": 0}
 

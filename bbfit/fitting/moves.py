@@ -11,7 +11,7 @@ from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments,
 from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.fitting.points import point_colors
-from bbfit.fitting.trunk import crossed_planes
+from bbfit.fitting.trunk import crossed_planes, trunk_parts
 from bbfit.fitting.visibility import pixels_of
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
@@ -55,10 +55,15 @@ class Moves:
         return self._textured(torch.arange(len(self._points)), planes)
 
     def crossed(self, members: Tensor, count: int) -> BillboardCloud:
-        """``count`` upright billboards that cross in the middle of the points at the indices ``members``, each around all of them."""
-        planes = crossed_planes(self._points[members], count)
-        each = (self._on_plane(members, *plane) for plane in zip(planes.normals, planes.offsets, strict=True))
-        return BillboardCloud.joined(list(each))
+        """``count`` upright billboards that cross in the trunk, whose points have the indices ``members``.
+
+        Those of each of the trunk's parts (:func:`~bbfit.fitting.trunk.trunk_parts`) cross in its middle and are around all of its points.
+        """
+        billboards = []
+        for part, number in trunk_parts(self._points[members], count):
+            planes = crossed_planes(self._points[members[part]], number)
+            billboards += [self._on_plane(members[part], *plane) for plane in zip(planes.normals, planes.offsets, strict=True)]
+        return BillboardCloud.joined(billboards)
 
     def extended(self, cloud: BillboardCloud, losses: Losses) -> list[BillboardCloud]:
         """Add one billboard to a cloud in :data:`ADDITIONS` ways: split a billboard, or place one where the loss is large."""

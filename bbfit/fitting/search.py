@@ -81,7 +81,7 @@ def find_placement(
     ``refinement_rounds`` rounds then refine the cloud with the least loss (:meth:`~bbfit.fitting.moves.Moves.refined`). A round keeps the
     best change only if it lowers the loss.
 
-    ``trunk_billboards`` of the billboards are not searched for. They cross in the trunk below the crown
+    ``trunk_billboards`` of the billboards are not searched for. They cross in the parts of the trunk below the crown
     (:func:`~bbfit.fitting.trunk.trunk_points`), unless the tree has none, and their textures show the points there.
 
     If ``billboards`` is None, their number is chosen at the knee of the curve, within ``least_billboards`` and ``most_billboards``. What a

@@ -20,8 +20,11 @@ _FORKED, _NARROW = 2.0, 0.2
 _HANGING = 0.05
 # Least height of the trunk below the crown, as a share of the tree's height. The foot of a tree whose leaves hang to the ground is lower.
 _LEAST_HEIGHT = 0.05
-# Most views that points are looked for in, least share of them that show a trunk below the crown, and least number of points.
-_VIEWS, _SHARE, _LEAST_POINTS = 24, 0.5, 12
+# Most views that points are looked for in, least share of them that show a trunk below the crown, and least number of points. Of these
+# views, the least share that shows a point below the crown: a branch that hangs beside the trunk hides it from few sides.
+_VIEWS, _SHARE, _LEAST_POINTS, _AGREEING = 24, 0.5, 12, 0.75
+PLANES = 3
+"""Number of planes that cross in each part of a trunk. One of three shows at least cos(30 degrees) = 87 % of its width."""
 
 
 def is_level(camera: Camera) -> Tensor:
@@ -52,10 +55,10 @@ def trunk_top(inside: Tensor) -> int | None:
 
 
 def trunk_points(points: Tensor, views: ViewSet) -> Tensor:
-    """Select the points, float64 [P, 3], that all views show below the crown (:func:`trunk_top`). Returns their indices, int64.
+    """Select the points, float64 [P, 3], that views show below the crown (:func:`trunk_top`). Returns their indices, int64.
 
-    Of the views from near the horizon, at most 24 are used. There are no such points if fewer than half of them show a trunk below the
-    crown, and if there are fewer than 12 points.
+    Of the views from near the horizon, at most 24 are used, and three quarters of those that show a trunk below the crown must agree on a
+    point. There are no such points if fewer than half of the views show a trunk, and if there are fewer than 12 points.
     """
     level = [index for index in torch.nonzero(is_level(views.cameras))[:, 0].tolist() if views.shows(index)]
     level = level[:: max(1, len(level) // _VIEWS)]
@@ -63,11 +66,23 @@ def trunk_points(points: Tensor, views: ViewSet) -> Tensor:
     none = torch.zeros(0, dtype=torch.int64)
     if not tops or len(tops) < _SHARE * len(level):
         return none
-    below = torch.ones(len(points), dtype=torch.bool)
+    below = torch.zeros(len(points), dtype=torch.int64)
     for index, top in tops:
-        below &= views.cameras[index].project(points)[:, 1] >= top - 0.5  # not for NaN
-    found = torch.nonzero(below)[:, 0]
+        below += views.cameras[index].project(points)[:, 1] >= top - 0.5  # not for NaN
+    found = torch.nonzero(below >= _AGREEING * len(tops))[:, 0]
     return found if len(found) >= _LEAST_POINTS else none
+
+
+def trunk_parts(points: Tensor, count: int) -> list[tuple[Tensor, int]]:
+    """Divide a trunk's points, float64 [P, 3], into parts above each other, and ``count`` planes among them.
+
+    A trunk bends, and a plane through all of it is off its axis almost everywhere. Each part has as many points as the others, at least 12
+    if it is not the only one, and :data:`PLANES` planes or more. Returns the indices of each part's points, int64, and its number of
+    planes, from the lowest part upwards.
+    """
+    parts = max(1, min(count // PLANES, len(points) // _LEAST_POINTS))
+    members = points[:, 1].argsort(stable=True).tensor_split(parts)
+    return [(part, count // parts + (number < count % parts)) for number, part in enumerate(members)]
 
 
 def crossed_planes(points: Tensor, count: int) -> Planes:

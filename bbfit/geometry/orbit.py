@@ -13,6 +13,8 @@ from torch import Tensor
 from bbfit.checks import check_count, check_range, fail
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinhole_intrinsics
 
+# Weight of the ring nearest to the horizon, where people are, among rings of cameras (docs/results.md, "From above").
+_EYE_LEVEL = 2.0
 # No vertex is nearer to a camera, and no orthographic image narrower, than this share of the tree's radius.
 NEAREST = 1e-3
 
@@ -26,7 +28,7 @@ class Orbit:
 
     count: int = 90
     """Number of views, divided among the rings in proportion to the square roots of their circumferences: in proportion to the
-    circumferences, a fit to a dome is visibly worse at 60 degrees than at eye level."""
+    circumferences, a fit to a dome is visibly worse at 60 degrees than at eye level. The ring nearest to the horizon counts twice."""
     elevations_degrees: tuple[float, ...] = (0.0,)
     """Elevation of each ring, in [-90, 90]."""
 
@@ -40,7 +42,8 @@ class Orbit:
     @property
     def ring_counts(self) -> tuple[int, ...]:
         """Number of views on each ring, at least one, by the method of largest remainders."""
-        weights = np.sqrt(np.cos(np.radians(self.elevations_degrees)).clip(1e-18))
+        heights = np.abs(self.elevations_degrees)
+        weights = np.sqrt(np.cos(np.radians(heights)).clip(1e-18)) * np.where(heights == heights.min(), _EYE_LEVEL, 1)
         quotas = (self.count - len(weights)) * weights / weights.sum()  # one of each ring's views is certain
         counts = 1 + np.floor(quotas + 1e-9).astype(int)
         largest = np.argsort(-(quotas - (counts - 1)).round(9), kind="stable")[: self.count - counts.sum()]

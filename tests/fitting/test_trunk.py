@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ import torch
 from bbfit.checks import InputError
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.search import Effort, find_placement
-from bbfit.fitting.trunk import crossed_planes, is_level, trunk_points, trunk_top
+from bbfit.fitting.trunk import crossed_planes, is_level, trunk_parts, trunk_points, trunk_top
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.orbit import Orbit
 from bbfit.views import ViewSet
@@ -92,6 +93,48 @@ def test_points_below_the_crown_are_the_trunks() -> None:
     assert len(trunk_points(points, tree_views(hidden=True))) == 0
 
 
+def test_a_branch_beside_the_trunk_hides_it_from_a_quarter_of_the_views_at_most() -> None:
+    points, views = tree_points(500), tree_views()
+
+    def beside(hidden: int) -> ViewSet:
+        """Views of which some show a branch that hangs down to the middle of the trunk."""
+        pictures = views.images(range(len(views))).clone()
+        shown = torch.nonzero(pictures[0, ..., 3].any(1))[:, 0]
+        middle = trunk_top(pictures[0, ..., 3] >= 128)
+        assert middle is not None
+        pictures[:hidden, : (middle + int(shown.max())) // 2, 4 : SIZE - 4] = 255
+        return ViewSet.from_arrays(pictures.numpy(), views.cameras)
+
+    whole = len(trunk_points(points, views))
+    assert len(trunk_points(points, beside(3))) > 0.95 * whole  # of twelve views; those at the rim are in fewer views
+    assert 0 < len(trunk_points(points, beside(4))) < 0.7 * whole
+
+
+@pytest.mark.parametrize(("count", "planes"), [(1, [1]), (2, [2]), (3, [3]), (5, [5]), (6, [3, 3]), (8, [4, 4]), (9, [3, 3, 3])])
+def test_a_trunk_has_three_planes_in_each_of_its_parts(count: int, planes: list[int]) -> None:
+    points = tree_points(400)[:400]
+    parts = trunk_parts(points, count)
+    assert [number for _, number in parts] == planes
+    assert torch.equal(torch.cat([part for part, _ in parts]).sort().values, torch.arange(400))
+    ranges = [(float(points[part, 1].min()), float(points[part, 1].max())) for part, _ in parts]
+    assert all(below[1] <= above[0] for below, above in pairwise(ranges))
+    assert max(len(part) for part, _ in parts) - min(len(part) for part, _ in parts) <= 1
+
+
+def test_a_part_of_a_trunk_has_at_least_twelve_points() -> None:
+    points = tree_points(400)
+    assert [len(part) for part, _ in trunk_parts(points[:30], 9)] == [15, 15]
+    assert [number for _, number in trunk_parts(points[:30], 9)] == [5, 4]
+    assert [len(part) for part, _ in trunk_parts(points[:12], 9)] == [12]
+
+
+def test_the_planes_of_a_bent_trunk_follow_it() -> None:
+    height = torch.linspace(0, 3, 300, dtype=torch.float64)
+    bent = torch.stack([0.5 * (height / 3) ** 2, height, torch.zeros_like(height)], -1)  # towards +X
+    off = [max(float((bent[part] - bent[part].mean(0))[:, 0].abs().max()) for part, _ in trunk_parts(bent, count)) for count in (3, 9)]
+    assert off[1] < 0.5 * off[0]
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 def test_one_of_the_crossed_planes_faces_every_side(count: int) -> None:
     points = tree_points(400)[:400] + torch.tensor([3.0, 1.0, -2.0])
@@ -123,7 +166,8 @@ def test_the_trunk_has_billboards_of_its_own_within_the_number_of_billboards() -
 
 
 def test_many_billboards_have_some_for_the_trunk_and_few_have_none_and_never_all() -> None:
-    assert [FitConfig(billboards=count).resolve().trunk_billboards for count in (4, 8, 11, 12, 32)] == [0, 0, 0, 3, 3]
+    counts = (4, 8, 11, 12, 31, 32, 47, 48, 192)
+    assert [FitConfig(billboards=count).resolve().trunk_billboards for count in counts] == [0, 0, 0, 3, 3, 6, 6, 9, 9]
     assert FitConfig().resolve().counted(16).trunk_billboards == 3
     assert FitConfig(trunk_billboards=0).resolve().counted(16).trunk_billboards == 0
     assert FitConfig(preset="thesis").resolve().trunk_billboards == 0

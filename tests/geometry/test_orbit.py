@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -31,8 +33,15 @@ def test_elevation_lifts_the_camera() -> None:
 
 def test_rings_share_an_uneven_count_and_are_turned_by_half_a_step() -> None:
     angles = Orbit(8, (0.0, 20.0, 40.0)).angles_degrees
-    assert angles[:, 1].tolist() == [0] * 3 + [20] * 3 + [40] * 2
-    assert np.allclose(angles[:, 0], [0, 120, 240, 60, 180, 300, 0, 180])
+    assert angles[:, 1].tolist() == [0] * 4 + [20] * 2 + [40] * 2
+    assert np.allclose(angles[:, 0], [0, 90, 180, 270, 90, 270, 0, 180])
+
+
+def test_the_ring_nearest_to_the_horizon_has_twice_its_share() -> None:
+    counts = Orbit(1000, (-30.0, 0.0, 30.0)).ring_counts
+    assert sum(counts) == 1000 and counts[0] == counts[2] and counts[1] == pytest.approx(2 * counts[0] / math.cos(math.pi / 6) ** 0.5, abs=2)
+    assert Orbit(30, (20.0,)).ring_counts == (30,)
+    assert Orbit(30, (-20.0, 20.0)).ring_counts == (15, 15)
 
 
 @pytest.mark.parametrize(("count", "elevations"), [(0, (0.0,)), (1, (0.0, 20.0)), (4, ()), (4, (91.0,)), (4, (float("nan"),))])
