@@ -114,9 +114,17 @@ def _refined(
 
 def _costs(points: Tensor, normals: Tensor, offsets: Tensor, centers: Tensor, projection: Tensor, locality: float) -> Tensor:
     """The cost of each point in each cluster, in square meters, [P, K]: how far views see the point move, and how far its center is."""
-    visible = ((normals @ projection) * normals).sum(-1).clamp_min(0)
-    costs = (points @ normals.mT - offsets).square() * visible
-    return costs + locality * torch.cdist(points, centers).square() if locality else costs
+    origin = points.mean(0)  # near which squares of coordinates lose no digits
+    points, offsets, centers = points - origin, offsets - normals @ origin, centers - origin
+    visible = ((normals @ projection) * normals).sum(-1, keepdim=True).clamp_min(0)
+    # The cost is a quadratic form in (x, y, z, 1), so that one product of matrices has those of all clusters.
+    planes = torch.cat([normals, -offsets[:, None]], -1)
+    forms = visible[..., None] * planes[:, :, None] * planes[:, None, :]
+    forms[:, :3, :3] += locality * torch.eye(3, dtype=points.dtype)
+    forms[:, 3, :3] -= 2 * locality * centers
+    forms[:, 3, 3] += locality * centers.square().sum(-1)
+    extended = torch.nn.functional.pad(points, (0, 1), value=1.0)
+    return (extended[:, :, None] * extended[:, None, :]).flatten(1) @ forms.flatten(1).mT
 
 
 def _centers(sums: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ _Palette = Annotated[int, Range(0, 256)]
 _Number = Annotated[int, Range(0)]
 _Sharpness = Annotated[float, Range(0, 1000)]
 _Unit = Annotated[float, Range(0, 1)]
+_Layers = Annotated[float, Range(0, 1000, open_low=True)]
 _Decay = Annotated[float, Range(0, 0.9999)]
 _Config = TypeVar("_Config", bound="FitConfig")
 
@@ -31,7 +32,7 @@ EVEN = 8
 """Number of evenly placed billboards of the default preset."""
 # From so many billboards on, searches are short: different clusterings lead to nearly equal results. From _VERY_MANY on, to equal ones:
 # with 192 billboards, an acer gained 0.03 dB from four candidates in place of one.
-_MANY, _VERY_MANY = 12, 64
+_MANY, _VERY_MANY = 12, 32
 # Billboards of the trunk's own when there are many: three for each part of it, and one part for every 16 billboards, up to three parts.
 _TRUNK, _PER_PART, _MOST_PARTS = 3, 16, 3
 _LOCALITY = 0.5
@@ -134,6 +135,9 @@ class FitConfig:
     """Least number of billboards that the preset chooses by itself."""
     most_billboards: Count = 384
     """Largest number of billboards that the preset chooses by itself."""
+    most_layers: _Layers = 1.85
+    """How many billboards may lie before each other, on average over the rectangle around the tree, when the preset chooses their number.
+    More layers look better, and a graphics card shades all of them."""
     placement: Placement | None = None
     """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
     A search compares clusterings of points on the mesh or, without a mesh, in the visual hull of the views.
@@ -151,7 +155,7 @@ class FitConfig:
     """Independent searches for a placement; the best result is kept. Default: two for eight to eleven billboards, else one."""
     candidates: Count | None = None
     """Clusterings that a search compares; more take longer and may find a better placement.
-    Default: 12; 4 for twelve billboards or more, and 1 for 64 or more, of which any clustering is about as good as any other."""
+    Default: 12; 4 for twelve billboards or more, and 1 for 32 or more, of which any clustering is about as good as any other."""
     refinement_rounds: _Number | None = None
     """Rounds that refine the best placement by moving, splitting and merging billboards.
     Default: three fewer than there are billboards, at least one and at most six; none for twelve billboards or more."""

@@ -171,7 +171,9 @@ def fit(
             continue  # the checkpoint is from a later level
         sizes = shrunk_sizes(start, level.halvings)
         cloud = random_textures(start, sizes, config.seed) if fitted is None else resampled(fitted, start, sizes)
-        movement = Movement(cloud, radius) if config.placement_learning_rate and (level.halvings or len(levels) == 1) else None
+        moving = config.placement_learning_rate and (level.halvings or len(levels) == 1)
+        # Compact billboards do not grow: more of them gain more for as many drawn pixels.
+        movement = Movement(cloud, radius, grow=not config.locality) if moving else None
         level_config = config.coarse() if level.halvings else config
         stepper = Stepper(cloud.to(device), Targets.at(views.train, level.halvings), level_config, movement)
         del cloud  # the stepper has its own copy of the texels, which can take hundreds of megabytes
@@ -191,7 +193,6 @@ def fit(
         fitted = stepper.finish()
         del stepper
         if movement is not None:
-            # Compact billboards do not grow: more of them gain as much for fewer drawn pixels.
             bounds = opaque_bounds(fitted, grow=not config.locality)
             start = bounded(fitted, bounds, density, config.max_texels).to(torch.float32)
     assert fitted is not None

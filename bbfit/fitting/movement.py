@@ -21,13 +21,17 @@ class Movement:
 
     Three parameters are a translation, in multiples of ``reach`` meters. Three are a rotation vector about the billboard's center, in
     radians. Two are the logarithms of the growth of its half extents, in units of 0.3. Their gradients come from the homographies.
+
+    Unless they may ``grow``, half extents stay at most as large as they are at the start. A larger billboard nearly always lowers the loss,
+    and no loss knows that a graphics card shades all of its pixels.
     """
 
-    def __init__(self, cloud: BillboardCloud, reach: float) -> None:
+    def __init__(self, cloud: BillboardCloud, reach: float, *, grow: bool = True) -> None:
         cloud = cloud.without_textures().to("cpu")
         self._cloud = replace(cloud, **{name: getattr(cloud, name).double() for name in ("centers", "rights", "ups", "half_extents")})
         self._units = torch.tensor([reach] * 3 + [1.0] * 3 + [_EXTENT_RATE] * 2, dtype=torch.float64)
         self._state = torch.zeros(3, len(cloud), 8, dtype=torch.float64)  # parameters, their first and second moments
+        self._most = math.inf if grow else 0.0
         self._steps = 0
 
     @property
@@ -88,6 +92,7 @@ class Movement:
         second.lerp_(gradient.square(), 1 - BETAS[1])
         root = (second / (1 - BETAS[1] ** self._steps)).sqrt()
         value -= rate / (1 - BETAS[0] ** self._steps) * first / (root + EPSILON)
+        value[:, 6:].clamp_(max=self._most)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the state that steps change."""

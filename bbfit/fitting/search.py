@@ -57,9 +57,6 @@ COUNTS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Numbers of billboards that are compared."""
 LEAST_GAIN_DB = 0.3
 """Least gain at a low resolution, in dB, for which the number of billboards may double."""
-MOST_LAYERS = 2.4
-"""Most layers before each other at a low resolution, on average over the rectangles around the tree in the views. A finished model shades
-about 1.6 times as many pixels."""
 # Number of billboards that is tried first.
 _FIRST = 32
 # Most searches for that choice.
@@ -86,7 +83,7 @@ def find_placement(
 
     If ``billboards`` is None, their number is chosen at the knee of the curve, within ``least_billboards`` and ``most_billboards``. What a
     graphics card pays for is the pixels that it shades, and they grow with the number of layers before each other. Two quick
-    searches measure the layers of few and of many billboards, and the number of billboards with :data:`MOST_LAYERS` is interpolated on a
+    searches measure the layers of few and of many billboards, and the number of billboards with ``most_layers`` is interpolated on a
     logarithmic scale. If a doubling of the number would gain less than :data:`LEAST_GAIN_DB`, it is the smaller one.
 
     ``on_progress`` is called with the work done and the total work. The result is float32 on the CPU and has fitted textures, with the
@@ -122,16 +119,17 @@ def _at_the_knee(views: ViewSet, points: Tensor, config: ResolvedFit, on_progres
         return _Trial(count, cloud, search.layers(cloud), search.decibels(cloud))
 
     first = tried(1, min(max(_FIRST, config.least_billboards), config.most_billboards))
-    other = config.most_billboards if first.layers <= MOST_LAYERS else config.least_billboards
+    other = config.most_billboards if first.layers <= config.most_layers else config.least_billboards
     if other == first.count:
         return first.cloud
     few, many = sorted([first, tried(2, other)], key=attrgetter("count"))
     doublings = math.log2(many.count / few.count)
-    if many.decibels - few.decibels < LEAST_GAIN_DB * doublings or few.layers >= MOST_LAYERS:
+    if many.decibels - few.decibels < LEAST_GAIN_DB * doublings or few.layers >= config.most_layers:
         return few.cloud
-    if many.layers <= MOST_LAYERS:
+    if many.layers <= config.most_layers:
         return many.cloud
-    return tried(3, round(few.count * 2 ** (doublings * (MOST_LAYERS - few.layers) / (many.layers - few.layers)))).cloud
+    position = (config.most_layers - few.layers) / (many.layers - few.layers)
+    return tried(3, round(few.count * 2 ** (doublings * position))).cloud
 
 
 @dataclass(frozen=True)
@@ -153,11 +151,12 @@ class _Search:
         self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
         self._pictures = self._targets.pictures(range(len(views)))
         self._radius, self._generator = tree_radius(views), torch.Generator().manual_seed(config.seed)
+        self._locality = config.locality
         self.moves = Moves(points, self._targets.cameras, self._pictures, config, self._radius, self._generator)
         assert config.billboards and config.candidates and config.restarts and config.refinement_rounds is not None  # see counted()
         self._restarts, self._candidates, self._rounds = config.restarts, config.candidates, config.refinement_rounds
         # An addition is a slice through the whole tree, and compact parts leave none out.
-        self._added = 0 if config.locality else min(config.billboards // _BILLBOARDS_PER_ADDITION, effort.most_additions)
+        self._added = 0 if self._locality else min(config.billboards // _BILLBOARDS_PER_ADDITION, effort.most_additions)
         self._clusters, self._survivors = config.billboards - self._added, max(1, round(effort.survivors * config.candidates))
         self._done = 0
         # Clouds that get additions. Every addition halves their number, and few billboards limit it, so that the search stays short.
@@ -208,7 +207,7 @@ class _Search:
     def _fitted(self, clouds: list[BillboardCloud], steps: int, rate: float) -> tuple[list[BillboardCloud], list[float]]:
         """Fit clouds of equal size side by side, placement and textures. Return the clouds and their losses over all views."""
         config, joined = self._config, BillboardCloud.joined(clouds)
-        movement = Movement(joined, self._radius) if config.placement_learning_rate else None
+        movement = Movement(joined, self._radius, grow=not self._locality) if config.placement_learning_rate else None
         stepper = Stepper(joined.to(config.device), self._targets, config, movement, groups=len(clouds))
         for step in range(steps):
             decay = 0.5 * (1 + math.cos(math.pi * step / steps))

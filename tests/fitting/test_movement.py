@@ -217,6 +217,23 @@ def test_what_gets_no_gradient_stays() -> None:
     assert not movement.parameters.any()
 
 
+def test_billboards_that_may_not_grow_move_and_shrink() -> None:
+    cloud, gradient = leaning_cloud(4), torch.ones(4, 8, dtype=torch.float64)
+    gradient[:2, 6:] = -1  # these would grow
+    limited, free = Movement(cloud, REACH, grow=False), Movement(cloud, REACH)
+    for _ in range(5):
+        limited.update(gradient, 0.1)
+        free.update(gradient, 0.1)
+    now, other = limited.now(cloud.texels), free.now(cloud.texels)
+    assert torch.equal(now.half_extents[:2], cloud.half_extents[:2].float()) and (other.half_extents[:2] > now.half_extents[:2]).all()
+    assert torch.equal(now.half_extents[2:], other.half_extents[2:]) and (now.half_extents[2:] < cloud.half_extents[2:]).all()
+    assert torch.equal(now.centers, other.centers) and torch.equal(now.rights, other.rights)
+    gradient[:2, 6:] = 1
+    for _ in range(5):
+        limited.update(gradient, 0.1)
+    assert (limited.now(cloud.texels).half_extents[:2] < now.half_extents[:2]).all()
+
+
 def test_moving_changes_neither_the_cloud_nor_the_gradient() -> None:
     cloud, gradient = leaning_cloud(4), uniform(4, 8)
     before, given = {name: getattr(cloud, name).clone() for name in PLACEMENT}, gradient.clone()

@@ -191,9 +191,9 @@ def test_what_is_revised_for_the_worse_is_not_kept(views: ViewDataset, points: t
 @pytest.mark.parametrize(
     ("layers", "gain", "most", "expected"),
     [
-        (1.0, 0.0, 12, range(12, 13)),  # measured: 0.60 layers with 2 billboards and 0.71 with 12
+        (1.0, 0.0, 12, range(12, 13)),  # measured: 0.57 layers with 2 billboards and 0.64 with 12
         (0.1, 0.0, 12, range(2, 3)),
-        (0.65, 0.0, 12, range(3, 9)),
+        (0.61, 0.0, 12, range(3, 9)),
         (2.0, 0.0, 40, range(40, 41)),
         (2.0, 100.0, 40, range(32, 33)),
     ],
@@ -201,7 +201,8 @@ def test_what_is_revised_for_the_worse_is_not_kept(views: ViewDataset, points: t
 def test_the_number_of_billboards_is_the_one_that_pays(
     views: ViewDataset, points: torch.Tensor, monkeypatch: pytest.MonkeyPatch, layers: float, gain: float, most: int, expected: range
 ) -> None:
-    monkeypatch.setattr(search, "MOST_LAYERS", layers)
     monkeypatch.setattr(search, "LEAST_GAIN_DB", gain)
     fixed = config(billboards=None, candidates=1, refinement_rounds=0, locality=0.1, trunk_billboards=0)
-    assert len(find_placement(views.train, points, replace(fixed, least_billboards=2, most_billboards=most))) in expected
+    assert (
+        len(find_placement(views.train, points, replace(fixed, least_billboards=2, most_billboards=most, most_layers=layers))) in expected
+    )
