@@ -88,6 +88,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
 # stochastic alpha is the noisier the more of them there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
     "mask": {
+        "most_layers": 1.9,
         "alpha_cutoff": 0.2,
         "least_alpha": 0.0,
         "colors": "views",
@@ -96,6 +97,7 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
         "binarization_weight": 0.02,
     },
     "blend": {
+        "most_layers": 2.6,
         "alpha_cutoff": 0.5,
         "least_alpha": 0.08,
         "colors": "matched",
@@ -104,6 +106,7 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
         "binarization_weight": 0.01,
     },
     "hash": {
+        "most_layers": 2.6,
         "alpha_cutoff": 0.5,
         "least_alpha": 0.08,
         "colors": "views",
@@ -135,9 +138,9 @@ class FitConfig:
     """Least number of billboards that the preset chooses by itself."""
     most_billboards: Count = 384
     """Largest number of billboards that the preset chooses by itself."""
-    most_layers: _Layers = 1.85
-    """How many billboards may lie before each other, on average over the rectangle around the tree, when the preset chooses their number.
-    More layers look better, and a graphics card shades all of them."""
+    most_layers: _Layers | None = None
+    """How many billboards may lie before each other, on average over the rectangle around the tree, when the fit chooses their number.
+    More layers look better, and a graphics card shades all of them. Preset: 1.9 (mask) or 2.6."""
     placement: Placement | None = None
     """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
     A search compares clusterings of points on the mesh or, without a mesh, in the visual hull of the views.
@@ -269,6 +272,7 @@ class ResolvedFit(FitConfig):
     alpha: AlphaKind
     alpha_cutoff: Cutoff
     least_alpha: _Unit
+    most_layers: _Layers
     placement: Placement
     placement_learning_rate: _Unit
     bounds: Bounds

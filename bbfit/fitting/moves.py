@@ -22,7 +22,7 @@ ADDITIONS, REFINEMENTS = 4, 4
 """Number of the clouds that :meth:`Moves.extended` and :meth:`Moves.refined` return."""
 # Random planes that are scored for a new billboard. The plane takes the points within _NEAR times the tree's radius.
 _NEAR, _PLANES = 0.08, 150
-# Margin around the points of a billboard, as a fraction of the tree's radius. That of compact billboards (locality) is smaller: there are many.
+# Margin around the points of a billboard, and of one of many compact billboards (locality), as a fraction of the tree's radius.
 _MARGIN, _COMPACT_MARGIN = 0.06, 0.02
 
 

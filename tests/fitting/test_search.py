@@ -203,6 +203,5 @@ def test_the_number_of_billboards_is_the_one_that_pays(
 ) -> None:
     monkeypatch.setattr(search, "LEAST_GAIN_DB", gain)
     fixed = config(billboards=None, candidates=1, refinement_rounds=0, locality=0.1, trunk_billboards=0)
-    assert (
-        len(find_placement(views.train, points, replace(fixed, least_billboards=2, most_billboards=most, most_layers=layers))) in expected
-    )
+    fixed = replace(fixed, least_billboards=2, most_billboards=most, most_layers=layers)
+    assert len(find_placement(views.train, points, fixed)) in expected
