@@ -30,8 +30,8 @@ _Config = TypeVar("_Config", bound="FitConfig")
 
 EVEN = 8
 """Number of evenly placed billboards of the default preset."""
-# From so many billboards on, searches are short: different clusterings lead to nearly equal results. From _VERY_MANY on, to equal ones:
-# with 192 billboards, an acer gained 0.03 dB from four candidates in place of one.
+# From so many billboards on, searches are short: different clusterings lead to nearly equal results. From _VERY_MANY on, one has to do:
+# with 192 billboards, an acer gained 0.03 dB from four candidates in place of one, in five times the time of the search.
 _MANY, _VERY_MANY = 12, 32
 # Billboards of the trunk's own when there are many: three for each part of it, and one part for every 16 billboards, up to three parts.
 _TRUNK, _PER_PART, _MOST_PARTS = 3, 16, 3
@@ -88,7 +88,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
 # stochastic alpha is the noisier the more of them there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
     "mask": {
-        "most_layers": 1.9,
+        "most_layers": 1.85,
         "alpha_cutoff": 0.2,
         "least_alpha": 0.0,
         "colors": "views",
@@ -140,7 +140,7 @@ class FitConfig:
     """Largest number of billboards that the preset chooses by itself."""
     most_layers: _Layers | None = None
     """How many billboards may lie before each other, on average over the rectangle around the tree, when the fit chooses their number.
-    More layers look better, and a graphics card shades all of them. Preset: 1.9 (mask) or 2.6."""
+    More layers look better, and a graphics card shades all of them. Preset: 1.85 (mask) or 2.6."""
     placement: Placement | None = None
     """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
     A search compares clusterings of points on the mesh or, without a mesh, in the visual hull of the views.
