@@ -269,7 +269,7 @@ def share(cards: Cards, camera: Camera, chain: list[NDArray[np.uint8]], wanted: 
 def test_matched_levels_cover_as_much_as_the_views_from_everywhere(kind: str, least: float, most: float) -> None:
     """From views that they were not matched to, of a half and an eighth of the size.
 
-    A mask is farther off than a blend, twelve views being few; a rounding that falls otherwise may move a texel of 12 x 12 pixels' textures.
+    A mask is farther off than a blend, twelve views being few; other rounding may move a texel of 12 x 12 pixels' textures.
     Unmatched, at an eighth, a mask covers 0.68 and a blend 1.07 of what it should.
     """
     cloud, camera = leafy(kind)
