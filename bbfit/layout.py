@@ -52,9 +52,13 @@ def split_views(count: int, seed: int) -> tuple[list[int], list[int]]:
 
     At least one view stays on either side when there are two or more.
     """
-    test_count = min(max(round(count * TEST_SHARE), 1), count - 1)
-    test = sorted(np.random.default_rng(seed).permutation(count)[:test_count].tolist())
+    test = sorted(np.random.default_rng(seed).permutation(count)[: _test_count(count)].tolist())
     return sorted(set(range(count)) - set(test)), test
+
+
+def _test_count(count: int) -> int:
+    """Number of test views among ``count`` >= 1 views."""
+    return min(max(round(count * TEST_SHARE), 1), count - 1)
 
 
 def split_rings(counts: Sequence[int], seed: int) -> tuple[list[int], list[int]]:
@@ -66,7 +70,7 @@ def split_rings(counts: Sequence[int], seed: int) -> tuple[list[int], list[int]]
     """
     test, begin = list[int](), 0
     for ring, count in enumerate(counts):
-        parts, random = len(split_views(count, seed)[1]) if count > 1 else 0, np.random.default_rng(seed + ring)
+        parts, random = _test_count(count), np.random.default_rng(seed + ring)
         edges = [begin + count * part // max(parts, 1) for part in range(parts + 1)]
         test += [int(random.integers(first, last)) for first, last in pairwise(edges)]
         begin += count

@@ -33,8 +33,10 @@ EVEN = 8
 # From so many billboards on, searches are short: different clusterings lead to nearly equal results. From _VERY_MANY on, one has to do:
 # with 192 billboards, an acer gained 0.03 dB from four candidates in place of one, in five times the time of the search.
 _MANY, _VERY_MANY = 12, 32
-# Billboards of the trunk's own when there are many: three for each part of it, and one part for every 16 billboards, up to three parts.
-_TRUNK, _PER_PART, _MOST_PARTS = 3, 16, 3
+TRUNK_PLANES = 3
+"""Number of planes that cross in each part of a trunk. One of three shows at least cos(30 degrees) = 87 % of its width."""
+# When there are many billboards, a trunk has one part for so many of them, up to so many parts.
+_PER_PART, _MOST_PARTS = 16, 3
 _LOCALITY = 0.5
 TRANSPARENT_COLORS = 32
 """Colors of a palette that are left to transparent texels, which filtering shows beside visible ones."""
@@ -254,7 +256,7 @@ def _effort(count: int | None) -> dict[str, Any]:
     if count is None:
         return {}
     if count >= _MANY:
-        trunk = _TRUNK * min(max(count // _PER_PART, 1), _MOST_PARTS)
+        trunk = TRUNK_PLANES * min(max(count // _PER_PART, 1), _MOST_PARTS)
         candidates = 4 if count < _VERY_MANY else 1
         return {"restarts": 1, "candidates": candidates, "refinement_rounds": 0, "locality": _LOCALITY, "trunk_billboards": trunk}
     rounds = min(6, max(1, count - 3))

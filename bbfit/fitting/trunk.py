@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from bbfit.fitting.clusters import Planes
+from bbfit.fitting.config import TRUNK_PLANES
 from bbfit.geometry.camera import Camera
 from bbfit.views import ViewSet
 
@@ -23,8 +24,6 @@ _LEAST_HEIGHT = 0.05
 # Most views that points are looked for in, least share of them that show a trunk below the crown, and least number of points. Of these
 # views, the least share that shows a point below the crown: a branch that hangs beside the trunk hides it from few sides.
 _VIEWS, _SHARE, _LEAST_POINTS, _AGREEING = 24, 0.5, 12, 0.75
-PLANES = 3
-"""Number of planes that cross in each part of a trunk. One of three shows at least cos(30 degrees) = 87 % of its width."""
 
 
 def is_level(camera: Camera) -> Tensor:
@@ -77,10 +76,10 @@ def trunk_parts(points: Tensor, count: int) -> list[tuple[Tensor, int]]:
     """Divide a trunk's points, float64 [P, 3], into parts above each other, and ``count`` planes among them.
 
     A trunk bends, and a plane through all of it is off its axis almost everywhere. Each part has as many points as the others, at least 12
-    if it is not the only one, and :data:`PLANES` planes or more. Returns the indices of each part's points, int64, and its number of
-    planes, from the lowest part upwards.
+    if it is not the only one, and at least :data:`~bbfit.fitting.config.TRUNK_PLANES` planes if ``count`` allows. Returns the indices of
+    each part's points, int64, and its number of planes, from the lowest part upwards.
     """
-    parts = max(1, min(count // PLANES, len(points) // _LEAST_POINTS))
+    parts = max(1, min(count // TRUNK_PLANES, len(points) // _LEAST_POINTS))
     members = points[:, 1].argsort(stable=True).tensor_split(parts)
     return [(part, count // parts + (number < count % parts)) for number, part in enumerate(members)]
 
