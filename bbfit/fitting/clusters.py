@@ -24,6 +24,9 @@ _ITERATIONS = 20
 _STARVED = 0.02
 # Iterations of k-means before the first planes of compact clusters.
 _MEANS_ITERATIONS = 4
+# Rounds that fit a plane, and the share of a cluster's extent or of a view's displacement below which either counts as none.
+_PLANE_ROUNDS = 4
+_FLAT = 1e-12
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def cluster_planes(
         for _ in range(_MEANS_ITERATIONS):
             sums = moments(points, torch.cdist(points, centers).argmin(-1), count)
             centers = torch.where(sums[:, 3, 3:] > 0, _centers(sums), centers)
-        normals, offsets, _ = best_planes(moments(points, torch.cdist(points, centers).argmin(-1), count), upright=upright)
+        normals, offsets, _ = best_planes(moments(points, torch.cdist(points, centers).argmin(-1), count), projection, upright=upright)
     else:
         if upright:
             normals[:, 1] = 0
@@ -81,7 +84,7 @@ def split_planes(points: Tensor, axes: Tensor, projection: Tensor, *, upright: b
     for axis in axes.to(points):
         along = points @ axis
         sums = moments(points, (along > along.median()).long(), 2)
-        normals, offsets, _ = best_planes(sums, upright=upright)
+        normals, offsets, _ = best_planes(sums, projection, upright=upright)
         results.append(_refined(points, normals, offsets, _centers(sums), projection, locality, upright=upright))
     return min(results, key=itemgetter(1))[0]
 
@@ -103,7 +106,7 @@ def _refined(
             break
         labels = nearest
         sums = moments(points, labels, count)
-        new_normals, new_offsets, _ = best_planes(sums, upright=upright)
+        new_normals, new_offsets, _ = best_planes(sums, projection, upright=upright)
         enough = sums[:, 3, 3] >= 3
         normals = torch.where(enough[:, None], new_normals, normals)
         offsets = torch.where(enough, new_offsets, offsets)
@@ -116,7 +119,7 @@ def _costs(points: Tensor, normals: Tensor, offsets: Tensor, centers: Tensor, pr
     """The cost of each point in each cluster, in square meters, [P, K]: how far views see the point move, and how far its center is."""
     origin = points.mean(0)  # near which squares of coordinates lose no digits
     points, offsets, centers = points - origin, offsets - normals @ origin, centers - origin
-    visible = ((normals @ projection) * normals).sum(-1, keepdim=True).clamp_min(0)
+    visible = _form(projection, normals)[:, None].clamp_min(0)
     # The cost is a quadratic form in (x, y, z, 1), so that one product of matrices has those of all clusters.
     planes = torch.cat([normals, -offsets[:, None]], -1)
     forms = visible[..., None] * planes[:, :, None] * planes[:, None, :]
@@ -141,22 +144,43 @@ def moments(points: Tensor, labels: Tensor, count: int) -> Tensor:
     return points.new_zeros(count, 4, 4).index_add_(0, labels, extended[:, :, None] * extended[:, None, :])
 
 
-def best_planes(sums: Tensor, *, upright: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit a plane to each cluster by least squares: the normal is the direction of least variance (Pearson 1901).
+def best_planes(sums: Tensor, projection: Tensor, *, upright: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Fit a plane through the mean of each cluster, so that the views see the least displacement of its points onto the plane.
+
+    The squared displacement that views see along a unit normal n is the product of n . S n, where S is the scatter of the points, and
+    n . M n, where M is the :func:`view_projection`. The logarithm of each factor is at most its tangent, so that every round lowers the
+    product by the least eigenvector of the sum of the tangents (majorization and minimization, Hunter and Lange 2004). Where views see all
+    displacements alike, the result is the plane of least squares (Pearson 1901).
 
     ``sums`` are the :func:`moments` of K clusters. With ``upright``, all planes contain the vertical. Returns the unit normals, [K, 3], the
     offsets in meters, [K], and the sums of squared distances, [K].
     """
-    means = _centers(sums)
-    scatter = sums[:, :3, :3] - means[:, :, None] * sums[:, None, :3, 3]
-    if upright:
-        values, vectors = torch.linalg.eigh(scatter[:, ::2, ::2])
-        x, z = vectors[:, :, 0].unbind(-1)
-        normals = torch.stack([x, torch.zeros_like(x), z], -1)
-    else:
-        values, vectors = torch.linalg.eigh(scatter)
-        normals = vectors[:, :, 0]
-    return normals, (normals * means).sum(-1), values[:, 0].clamp_min(0)
+    means, axes = _centers(sums), [0, 2] if upright else [0, 1, 2]
+    scatter = (sums[:, :3, :3] - means[:, :, None] * sums[:, None, :3, 3])[:, axes][:, :, axes]
+    visible, scale = projection[axes][:, axes], scatter.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(_FLAT)
+
+    def least(apart: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The least eigenvectors for the values of both factors, [K], and the values at these vectors."""
+        within = torch.linalg.eigh(scatter / apart[:, None, None] + visible / seen[:, None, None])[1][..., 0]
+        return within, _form(scatter, within).maximum(_FLAT * scale), _form(visible, within).clamp_min(_FLAT)
+
+    # The product has several minima. One search begins where both factors weigh the same, the other at the plane of least squares.
+    results = []
+    for weight in (1, 1 / _FLAT):
+        within, apart, seen = least(scale, weight * visible.diagonal().mean().expand_as(scale))
+        for _ in range(_PLANE_ROUNDS):
+            within, apart, seen = least(apart, seen)
+        results.append((within, apart * seen))
+    (within, product), (other, other_product) = results
+    within = torch.where((product <= other_product)[:, None], within, other)
+    normals = within.new_zeros(len(sums), 3)
+    normals[:, axes] = within
+    return normals, (normals * means).sum(-1), _form(scatter, within).clamp_min(0)
+
+
+def _form(matrix: Tensor, vectors: Tensor) -> Tensor:
+    """The quadratic forms v . A v of vectors, [K, D], and one or K matrices, [D, D] or [K, D, D]."""
+    return (vectors[:, None] @ matrix @ vectors[:, :, None])[:, 0, 0]
 
 
 def rectangles(points: Tensor, planes: Planes, texels_per_meter: float, margin: float, *, two_sided: bool) -> BillboardCloud:

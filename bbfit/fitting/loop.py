@@ -108,11 +108,11 @@ def fit(
     """Fit a billboard cloud to the training views. The test views are not used.
 
     A search first finds a placement, unless the configuration requests the even placement. Each step then samples training views, renders
-    the cloud from their cameras, and updates the texels by Adam (Kingma and Ba 2015) on the gradient of the loss. At all levels but the
-    finest it also updates the placement. Texels are clamped to [0, 1].
+    the cloud from their cameras, and updates the texels and the placement by Adam (Kingma and Ba 2015) on the gradient of the loss. Texels
+    are clamped to [0, 1].
 
-    Views and textures start at a coarse resolution, and each level doubles it. After a level that moves billboards, the rectangles get new
-    bounds around their opaque texels. At the end, transparent texels take the color of their neighbors.
+    Views and textures start at a coarse resolution, and each level doubles it. Between levels, the rectangles get new bounds around their
+    opaque texels. At the end, transparent texels take the color of their neighbors.
 
     Parameters
     ----------
@@ -166,14 +166,13 @@ def fit(
     config = config.counted(len(state.start))
     start, fitted, losses = state.start, state.placement, state.losses
     density, radius = config.texel_density * float(pixels_per_meter(views.train.cameras)), tree_radius(views.train)
-    for level in (levels := resolution_levels(config, views.train.cameras)):
+    for level in resolution_levels(config, views.train.cameras):
         if len(losses) > level.end:
             continue  # the checkpoint is from a later level
         sizes = shrunk_sizes(start, level.halvings)
         cloud = random_textures(start, sizes, config.seed) if fitted is None else resampled(fitted, start, sizes)
-        moving = config.placement_learning_rate and (level.halvings or len(levels) == 1)
         # Compact billboards do not grow: more of them gain more for as many drawn pixels.
-        movement = Movement(cloud, radius, grow=not config.locality) if moving else None
+        movement = Movement(cloud, radius, grow=not config.locality) if config.placement_learning_rate else None
         level_config = config.coarse() if level.halvings else config
         stepper = Stepper(cloud.to(device), Targets.at(views.train, level.halvings), level_config, movement)
         del cloud  # the stepper has its own copy of the texels, which can take hundreds of megabytes
@@ -192,7 +191,7 @@ def fit(
                 _save(checkpoint, key, _FitState(losses, start, None, stepper.tensors(), time.perf_counter() - started))
         fitted = stepper.finish()
         del stepper
-        if movement is not None:
+        if movement is not None and level.halvings:
             bounds = opaque_bounds(fitted, grow=not config.locality)
             start = bounded(fitted, bounds, density, config.max_texels).to(torch.float32)
     assert fitted is not None

@@ -117,8 +117,8 @@ class Moves:
         nearest, upright = self.nearest(cloud), self._all_upright
         sums = moments(self._points, nearest, len(cloud))
         pairs = torch.combinations(torch.arange(len(cloud)))
-        normals, offsets, squares = best_planes(sums[pairs].sum(1), upright=upright)
-        increase = squares - best_planes(sums, upright=upright)[2][pairs].sum(1)
+        normals, offsets, squares = best_planes(sums[pairs].sum(1), self.projection, upright=upright)
+        increase = squares - best_planes(sums, self.projection, upright=upright)[2][pairs].sum(1)
         pair = int(increase.argsort()[number % min(3, len(pairs))])
         merged = torch.isin(torch.arange(len(cloud)), pairs[pair])
         members = torch.nonzero(merged[nearest])[:, 0]
@@ -129,7 +129,7 @@ class Moves:
         return BillboardCloud.joined([cloud, self._proposal(weight)])
 
     def _upright(self, index: int) -> bool:
-        return self._all_upright or (self._config.orientation == "any" and index % 2 == 0)
+        return self._all_upright or (self._config.orientation == "any" and index % 2 == 1)
 
     def _weights(self, losses: Tensor) -> Tensor:
         """Average the losses of the pixels that show each point, float64 [P]."""

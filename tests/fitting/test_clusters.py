@@ -390,10 +390,10 @@ def test_a_billboard_without_points_is_grey_and_transparent(two_sided: bool) -> 
 
 @pytest.mark.parametrize("upright", [False, True])
 def test_best_planes_of_moments_are_those_of_the_points(upright: bool) -> None:
-    """Against the singular vectors of the points themselves; far from the origin as well."""
+    """Against the singular vectors of the points themselves, where views see all displacements alike; far from the origin as well."""
     points = random_points(500) * torch.tensor([3.0, 1.0, 0.4]) + torch.tensor([40.0, 5.0, -60.0])
     labels = torch.arange(500) % 3
-    normals, offsets, squares = best_planes(moments(points, labels, 4), upright=upright)
+    normals, offsets, squares = best_planes(moments(points, labels, 4), torch.eye(3).double(), upright=upright)
     for k in range(3):
         own = points[labels == k]
         flat = own * torch.tensor([1.0, 0.0, 1.0]) if upright else own
@@ -403,6 +403,38 @@ def test_best_planes_of_moments_are_those_of_the_points(upright: bool) -> None:
         assert float(squares[k]) == pytest.approx(float(values[last] ** 2), rel=1e-6)
         assert float((own @ normals[k] - offsets[k]).square().sum()) == pytest.approx(float(squares[k]), rel=1e-6)
     assert normals.norm(dim=-1)[3] == pytest.approx(1) and float(squares[3]) == 0  # a cluster without points
+
+
+@pytest.mark.parametrize("upright", [False, True])
+@pytest.mark.parametrize("flatness", [1.0, 0.7, 0.2, 1e-7])
+def test_best_planes_move_points_least_in_the_views(upright: bool, flatness: float) -> None:
+    """Against a search over many directions; views from the sides see vertical displacements twice as well as horizontal ones."""
+    points = random_points(900) * torch.tensor([1.0, flatness, 0.9])
+    labels = torch.arange(900) % 3
+    seen = torch.diag(torch.tensor([0.5, 1.0, 0.4], dtype=torch.float64))
+    normals, offsets, squares = best_planes(moments(points, labels, 3), seen, upright=upright)
+    directions = torch.nn.functional.normalize(
+        torch.randn(20_000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)), dim=-1
+    )
+    directions = torch.cat([directions, torch.eye(3).double()])
+    if upright:
+        directions[:, 1] = 0
+        directions = torch.nn.functional.normalize(directions[directions.norm(dim=-1) > 1e-3], dim=-1)
+        assert (normals[:, 1] == 0).all()
+    for k in range(3):
+        own = points[labels == k]
+        distances = (own - own.mean(0)) @ directions.mT
+        moved = distances.square().sum(0) * ((directions @ seen) * directions).sum(-1)
+        assert float(squares[k] * (normals[k] @ seen @ normals[k])) <= 1.001 * float(moved.min()) + 1e-12
+        assert float((own @ normals[k] - offsets[k]).square().sum()) == pytest.approx(float(squares[k]), rel=1e-6, abs=1e-12)
+
+
+def test_planes_face_views_from_one_direction() -> None:
+    """Such views see no displacement across them; neither do they decide where points have no extent at all."""
+    seen = torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64))
+    for points in (random_points(100), torch.zeros(100, 3, dtype=torch.float64)):
+        normals, _, _ = best_planes(moments(points, torch.zeros(100, dtype=torch.int64), 1), seen, upright=False)
+        assert normals.isfinite().all() and normals[0, 2].abs() == pytest.approx(1, abs=1e-4)
 
 
 def test_moments_of_a_union_are_the_sums() -> None:
@@ -431,7 +463,7 @@ def test_split_planes_are_upright_where_they_have_to_be(ring: Camera) -> None:
     def moved(planes: Planes) -> float:
         return float(((points @ planes.normals.mT - planes.offsets).abs().amin(-1)).square().mean())
 
-    one = best_planes(moments(points, torch.zeros(300, dtype=torch.int64), 1), upright=True)[2]
+    one = best_planes(moments(points, torch.zeros(300, dtype=torch.int64), 1), seen, upright=True)[2]
     assert moved(upright) < 0.8 * float(one) / 300 and moved(free) < 1.2 * moved(upright)
 
 

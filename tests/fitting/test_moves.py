@@ -101,7 +101,7 @@ def test_merging_takes_two_that_lie_almost_on_one_plane(moves: Moves, clustered:
     assert len(merged) == 3
     given_up = [k for k in range(4) if k not in kept(cloud, merged)]
     held = points[torch.isin(moves.nearest(cloud), torch.tensor(given_up))]
-    least = best_planes(moments(held, torch.zeros(len(held), dtype=torch.int64), 1), upright=False)[2]
+    least = best_planes(moments(held, torch.zeros(len(held), dtype=torch.int64), 1), moves.projection, upright=False)[2]
     assert float(on_planes(merged.take([2]), held)) == pytest.approx(float((least / len(held)).sqrt()), rel=1e-3)
     if turn % 3 == 0:
         assert given_up == [0, 3]
