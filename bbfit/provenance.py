@@ -20,9 +20,9 @@ from bbfit.checks import check_file
 VERSIONS: Mapping[str, int] = {
     "grow": 1,
     "convert": 1,
-    "views": 3,
+    "views": 4,
     "budget": 9,
-    "fit": 17,
+    "fit": 18,
     "export": 7,
     "evaluate": 10,
     "report": 4,

@@ -91,6 +91,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
 _BY_ALPHA: dict[str, dict[str, Any]] = {
     "mask": {
         "most_layers": 1.85,
+        "margin": 0.02,
         "alpha_cutoff": 0.2,
         "least_alpha": 0.0,
         "colors": "views",
@@ -99,7 +100,8 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
         "binarization_weight": 0.02,
     },
     "blend": {
-        "most_layers": 2.6,
+        "most_layers": 3.2,
+        "margin": 0.05,
         "alpha_cutoff": 0.5,
         "least_alpha": 0.08,
         "colors": "matched",
@@ -108,7 +110,8 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
         "binarization_weight": 0.01,
     },
     "hash": {
-        "most_layers": 2.6,
+        "most_layers": 3.2,
+        "margin": 0.05,
         "alpha_cutoff": 0.5,
         "least_alpha": 0.08,
         "colors": "views",
@@ -142,7 +145,7 @@ class FitConfig:
     """Largest number of billboards that the preset chooses by itself."""
     most_layers: _Layers | None = None
     """How many billboards may lie before each other, on average over the rectangle around the tree, when the fit chooses their number.
-    More layers look better, and a graphics card shades all of them. Preset: 1.85 (mask) or 2.6."""
+    More layers look better, and a graphics card shades all of them. Preset: 1.85 (mask) or 3.2."""
     placement: Placement | None = None
     """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
     A search compares clusterings of points on the mesh or, without a mesh, in the visual hull of the views.
@@ -153,6 +156,9 @@ class FitConfig:
     """Compactness of what clustered billboards stand for: the weight of distances within a part of the tree against those from its plane.
     With 0, billboards are slices through the whole tree; the larger it is, the smaller they are, and the less there is to draw.
     Default: 0.5 for twelve billboards or more, else 0."""
+    margin: _Unit | None = None
+    """Width of the margin around what a compact billboard stands for, as a fraction of the tree's radius. The wider it is, the better it looks,
+    because billboards share the leaves between them, and the more pixels a graphics card shades. Preset: 0.02 (mask) or 0.05."""
     trunk_billboards: _Number | None = None
     """Number of billboards, out of all, that cross in the trunk below the crown; for clusters, and trees with such a trunk.
     Three cross in each part of the trunk, from the ground up. Default: 9 for 48 billboards or more, 6 for 32, 3 for 12, else none."""
@@ -275,6 +281,7 @@ class ResolvedFit(FitConfig):
     alpha_cutoff: Cutoff
     least_alpha: _Unit
     most_layers: _Layers
+    margin: _Unit
     placement: Placement
     placement_learning_rate: _Unit
     bounds: Bounds

@@ -22,8 +22,8 @@ ADDITIONS, REFINEMENTS = 4, 4
 """Number of the clouds that :meth:`Moves.extended` and :meth:`Moves.refined` return."""
 # Random planes that are scored for a new billboard. The plane takes the points within _NEAR times the tree's radius.
 _NEAR, _PLANES = 0.08, 150
-# Margin around the points of a billboard, and of one of many compact billboards (locality), as a fraction of the tree's radius.
-_MARGIN, _COMPACT_MARGIN = 0.06, 0.02
+# Margin around the points of a billboard that is a slice through the whole tree, as a fraction of the tree's radius.
+_SLICE_MARGIN = 0.06
 
 
 class Moves:
@@ -165,7 +165,7 @@ class Moves:
     def _textured(self, members: Tensor, planes: Planes) -> BillboardCloud:
         """Place billboards on planes around the points at the indices ``members`` and splat the points into the textures."""
         points, colors = self._points[members], self._colors[members]
-        margin = (_COMPACT_MARGIN if self._locality else _MARGIN) * self._radius
+        margin = (self._config.margin if self._locality else _SLICE_MARGIN) * self._radius
         without_textures = rectangles(points, planes, self._density, margin, two_sided=self._config.sides == "two")
         return splatted(without_textures, points, colors, planes.labels).to(torch.float32)
 

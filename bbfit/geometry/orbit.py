@@ -14,7 +14,7 @@ from bbfit.checks import check_count, check_range, fail
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinhole_intrinsics
 
 # Weight of the ring nearest to the horizon, where people are, among rings of cameras (docs/results.md, "From above").
-_EYE_LEVEL = 2.0
+_EYE_LEVEL = 3.0
 # No vertex is nearer to a camera, and no orthographic image narrower, than this share of the tree's radius.
 NEAREST = 1e-3
 
@@ -28,7 +28,7 @@ class Orbit:
 
     count: int = 90
     """Number of views, divided among the rings in proportion to the square roots of their circumferences: in proportion to the
-    circumferences, a fit to a dome is visibly worse at 60 degrees than at eye level. The ring nearest to the horizon counts twice."""
+    circumferences, a fit to a dome is visibly worse at 60 degrees than at eye level. The ring nearest to the horizon counts three times."""
     elevations_degrees: tuple[float, ...] = (0.0,)
     """Elevation of each ring, in [-90, 90]."""
 
