@@ -30,7 +30,7 @@ class ViewsConfig:
     """How a tree is rendered."""
 
     count: Annotated[int, Range(2)] = 90
-    """Number of pictures; steep rings of cameras get fewer of them, and a random quarter of each ring is held out for the score."""
+    """Number of pictures; steep rings of cameras get fewer of them, and one view out of every four neighbors is held out for the score."""
     size: Annotated[int, Range(11, 16384)] = 384
     """Width and height of a picture in pixels."""
     turned: Annotated[int, Range(0)] = 6
