@@ -191,9 +191,9 @@ def test_what_is_revised_for_the_worse_is_not_kept(views: ViewDataset, points: t
 @pytest.mark.parametrize(
     ("layers", "gain", "most", "expected"),
     [
-        (1.0, 0.0, 12, range(12, 13)),  # measured: 0.57 layers with 2 billboards and 0.64 with 12
+        (1.0, 0.0, 12, range(12, 13)),  # measured: 0.54 layers with 2 billboards and 0.58 with 12
         (0.1, 0.0, 12, range(2, 3)),
-        (0.61, 0.0, 12, range(3, 9)),
+        (0.56, 0.0, 12, range(3, 9)),
         (2.0, 0.0, 40, range(40, 41)),
         (2.0, 100.0, 40, range(32, 33)),
     ],
