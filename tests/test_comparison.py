@@ -18,6 +18,7 @@ from bbfit.blender.config import ViewsConfig
 from bbfit.checks import InputError
 from bbfit.comparison import CompareResult, compare
 from bbfit.evaluation.scoring import evaluate
+from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
@@ -63,7 +64,7 @@ def test_costs_are_those_of_the_models(done: CompareResult) -> None:
 
 def test_bbfits_row_is_its_run(done: CompareResult) -> None:
     cloud = BillboardCloud.load(done.folder / "bbfit" / "run" / "cloud.safetensors")
-    report = evaluate(cloud, ViewDataset.load(done.folder / "views").test)
+    report = evaluate(cloud, ViewDataset.load(done.folder / "views").test, export=ExportConfig(outline="rectangle"))
     assert done.rows[0].measures == report.mean and cloud.alpha.kind == "mask"
     assert BillboardCloud.load(done.folder / "bbfit-blend" / "run" / "cloud.safetensors").alpha.kind == "blend"
 

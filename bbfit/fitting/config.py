@@ -157,8 +157,9 @@ class FitConfig:
     With 0, billboards are slices through the whole tree; the larger it is, the smaller they are, and the less there is to draw.
     Default: 0.5 for twelve billboards or more, else 0."""
     margin: _Unit | None = None
-    """Margin around what a compact billboard stands for, as a fraction of the tree's radius. The wider it is, the more billboards share
-    leaves, which looks better, and the more pixels a graphics card shades. Preset: 0.02 (mask) or 0.05."""
+    """Margin around what a compact billboard stands for, as a fraction of the tree's radius.
+    The wider it is, the more billboards share leaves, which looks better, and the more pixels a graphics card shades.
+    Preset: 0.02 (mask) or 0.05."""
     trunk_billboards: _Number | None = None
     """Number of billboards, out of all, that cross in the trunk below the crown; for clusters, and trees with such a trunk.
     Three cross in each part of the trunk, from the ground up. Default: 9 for 48 billboards or more, 6 for 32, 3 for 12, else none."""
