@@ -151,7 +151,8 @@ class FitConfig:
     A search compares clusterings of points on the mesh or, without a mesh, in the visual hull of the views.
     Preset: clusters; thesis: even."""
     orientation: Orientation = "any"
-    """Orientation of clustered billboards: upright, in any direction (free), or whichever of the two fits better (any)."""
+    """Orientation of clustered billboards: upright, in any direction (free), or whichever of the two fits better (any).
+    A single candidate, as for 32 billboards or more, is free with any."""
     locality: _Unit | None = None
     """Compactness of what clustered billboards stand for: the weight of distances within a part of the tree against those from its plane.
     With 0, billboards are slices through the whole tree; the larger it is, the smaller they are, and the less there is to draw.
