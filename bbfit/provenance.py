@@ -24,8 +24,8 @@ VERSIONS: Mapping[str, int] = {
     "budget": 9,
     "fit": 18,
     "export": 7,
-    "evaluate": 10,
-    "report": 4,
+    "evaluate": 11,
+    "report": 5,
     "lod": 3,
     "compare": 4,
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,11 +30,14 @@ class ViewScore:
     elevation_degrees: float
     """Angle of the camera above the horizon, in [-90, 90]."""
     measures: Measures
+    antialiased: Measures | None = None
+    """The measures of a mask that is drawn with alpha to coverage (:class:`~bbfit.geometry.alpha.AlphaMode`), while ``measures`` are those
+    of its hard edges; ``None`` for other alpha modes."""
 
     def to_json(self) -> dict[str, Any]:
         """The name, the angles and the groups of measures in one dictionary."""
         angles = {"azimuth_degrees": self.azimuth_degrees, "elevation_degrees": self.elevation_degrees}
-        return {"name": self.name} | angles | self.measures.to_json()
+        return {"name": self.name} | angles | _measures(self)
 
 
 @dataclass(frozen=True)
@@ -46,10 +49,12 @@ class RingScore:
     views: int
     """Number of views."""
     measures: Measures
+    antialiased: Measures | None = None
+    """The means with alpha to coverage, as in :class:`ViewScore`."""
 
     def to_json(self) -> dict[str, Any]:
         """The elevation, the number of views and the groups of measures in one dictionary."""
-        return {"elevation_degrees": self.elevation_degrees, "views": self.views} | self.measures.to_json()
+        return {"elevation_degrees": self.elevation_degrees, "views": self.views} | _measures(self)
 
 
 @dataclass(frozen=True)
@@ -123,9 +128,6 @@ class Report:
     """Share of the model's area that is drawn although nothing is visible there, in [0, 1]."""
     sizes: tuple[SizeScore, ...] = ()
     """The exported model in smaller and smaller pictures, the largest first."""
-    antialiased: Measures | None = None
-    """The means over the views of a mask that is drawn with alpha to coverage (:class:`~bbfit.geometry.alpha.AlphaMode`), while all other
-    scores are those of its hard edges; ``None`` for other alpha modes."""
     shaded: float | None = None
     """Fragments that a graphics card shades over the pixels that the targets cover (:func:`bbfit.evaluation.scoring.score_shading`)."""
     shimmer: tuple[ShimmerScore, ...] = ()
@@ -137,6 +139,11 @@ class Report:
     def mean(self) -> Measures:
         """The means over the views (:func:`bbfit.evaluation.measures.mean_measures`)."""
         return mean_measures([view.measures for view in self.views])
+
+    @property
+    def antialiased(self) -> Measures | None:
+        """The means over the views of a mask that is drawn with alpha to coverage; ``None`` for other alpha modes."""
+        return _antialiased(self.views)
 
     @property
     def rings(self) -> tuple[RingScore, ...]:
@@ -151,6 +158,7 @@ class Report:
                 round(sum(view.elevation_degrees for view in ring) / len(ring), 3),
                 len(ring),
                 mean_measures([view.measures for view in ring]),
+                _antialiased(ring),
             )
             for ring in rings
         )
@@ -170,15 +178,14 @@ class Report:
             "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
             "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
             "shimmer": [{"width", "height", "tree", "ratio", "antialiased"}],
-            "rings": [{"elevation_degrees", "views", and the same measures}],
-            "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures}]}``
+            "rings": [{"elevation_degrees", "views", and the same measures, with "antialiased"}],
+            "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures, with "antialiased"}]}``
         """
-        return self.mean.to_json() | {
+        return _measures(self) | {
             "vertices": self.vertices.to_json(),
             "bytes": self.bytes.to_json(),
             "overdraw": self.overdraw,
             "shaded": self.shaded,
-            "antialiased": None if self.antialiased is None else self.antialiased.to_json(),
             "trunk": None if self.trunk is None else self.trunk.to_json(),
             "alpha": {"mode": self.alpha.kind, "cutoff": self.alpha.cutoff},
             "seconds": dict(self.seconds),
@@ -207,21 +214,36 @@ class Report:
             vertices, sizes = (Cost(content[name]["model"], content[name]["original"]) for name in ("vertices", "bytes"))
             alpha = AlphaMode(content["alpha"]["mode"], content["alpha"]["cutoff"])
             scores = tuple(
-                ViewScore(view["name"], view["azimuth_degrees"], view["elevation_degrees"], Measures.from_json(view))
+                ViewScore(
+                    view["name"],
+                    view["azimuth_degrees"],
+                    view["elevation_degrees"],
+                    Measures.from_json(view),
+                    None if view["antialiased"] is None else Measures.from_json(view["antialiased"]),
+                )
                 for view in content["views"]
             )
             afar = tuple(SizeScore(**size) for size in content["sizes"])
             shaded = content["shaded"]
-            antialiased = None if content["antialiased"] is None else Measures.from_json(content["antialiased"])
             trunk = None if content["trunk"] is None else TrunkScore.from_json(content["trunk"])
             shimmer = tuple(ShimmerScore(**size) for size in content["shimmer"])
-            report = Report(
-                scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, antialiased, shaded, shimmer, trunk
-            )
+            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, shaded, shimmer, trunk)
             if not scores:
                 raise ValueError("it has no views")
             check_record("report", report, Report)
             return report
+
+
+def _antialiased(views: Sequence[ViewScore]) -> Measures | None:
+    """The means of views with alpha to coverage, or ``None`` if there are none."""
+    measures = [view.antialiased for view in views if view.antialiased is not None]
+    return mean_measures(measures) if measures else None
+
+
+def _measures(scored: ViewScore | RingScore | Report) -> dict[str, Any]:
+    """The groups of measures, and those with alpha to coverage."""
+    measures = scored.mean if isinstance(scored, Report) else scored.measures
+    return measures.to_json() | {"antialiased": None if scored.antialiased is None else scored.antialiased.to_json()}
 
 
 def stage_seconds(path: str | Path) -> dict[str, float]:

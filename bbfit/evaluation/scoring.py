@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ from torch import Tensor
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.evaluation import metrics, thesis_scale
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
-from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale, mean_measures
+from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.report import Cost, Report, ShimmerScore, ViewScore
 from bbfit.evaluation.shimmer import score_shimmer
 from bbfit.evaluation.sizes import HALVINGS, score_sizes
@@ -94,38 +93,33 @@ def evaluate_model(
 ) -> Report:
     """Do what :func:`evaluate` does for a model whose polygons or file may already be computed."""
     started, original, on_progress = time.perf_counter(), original or OriginalTree(), on_progress or (lambda done, total: None)
-    models = [model] if model.cloud.alpha.kind != "mask" else [model, model.antialiased()]
-    total, scored = len(models) * len(views) + HALVINGS + 1 + (turned is not None), list[tuple[ViewScore, ...]]()
-    trunks, names, elevations = list[TrunkView | None](), views.names, view_angles(views.cameras)[:, 1].tolist()
+    smooth = model.antialiased().draw if model.cloud.alpha.kind == "mask" else None
+    total, trunks = len(views) + HALVINGS + 1 + (turned is not None), list[TrunkView | None]()
+    names, elevations = views.names, view_angles(views.cameras)[:, 1].tolist()
 
-    def drawn(each: ShippedModel, index: int) -> Tensor:
-        target, image = held_out(each.draw, views, index)
-        if each is model:
-            trunks.append(measure_trunk(names[index], elevations[index], target, image))
+    def drawn(index: int) -> Tensor:
+        target, image = held_out(model.draw, views, index)
+        trunks.append(measure_trunk(names[index], elevations[index], target, image))
         return image
 
-    for each in models:
-        before = len(scored) * len(views)
-        scored.append(
-            score_views(
-                partial(drawn, each),
-                views,
-                on_view=lambda done, _, before=before: on_progress(before + done, total),  # type: ignore[misc]
-            )
-        )
-    sizes = score_sizes(model.draw, views, on_size=lambda done, _: on_progress(len(models) * len(views) + done, total))
+    scores = score_views(
+        drawn,
+        views,
+        antialiased=None if smooth is None else lambda index: held_out(smooth, views, index)[1],
+        on_view=lambda done, _: on_progress(done, total),
+    )
+    sizes = score_sizes(model.draw, views, on_size=lambda done, _: on_progress(len(views) + done, total))
     shimmer: tuple[ShimmerScore, ...] = ()
     if turned is not None:
-        shimmer = score_shimmer(model.draw, turned, models[1].draw if len(models) > 1 else None)
+        shimmer = score_shimmer(model.draw, turned, smooth)
         on_progress(total, total)
     return Report(
-        views=scored[0],
+        views=scores,
         vertices=Cost(model.cards.vertex_count, original.vertices),
         bytes=Cost(len(model.glb), original.bytes),
         alpha=model.cloud.alpha,
         overdraw=model.overdraw,
         sizes=sizes,
-        antialiased=mean_measures([view.measures for view in scored[1]]) if len(models) > 1 else None,
         shaded=score_shading(model.cards, views),
         shimmer=shimmer,
         trunk=trunk_score(trunks),
@@ -145,12 +139,17 @@ def score_shading(cards: Cards, views: ViewSet) -> float | None:
 
 
 def score_views(
-    draw: Callable[[int], Tensor], views: ViewSet, *, on_view: Callable[[int, int], None] | None = None
+    draw: Callable[[int], Tensor],
+    views: ViewSet,
+    *,
+    antialiased: Callable[[int], Tensor] | None = None,
+    on_view: Callable[[int, int], None] | None = None,
 ) -> tuple[ViewScore, ...]:
     """Measure pictures of a tree, whatever drew them, against V held-out views of at least 11 x 11 pixels.
 
-    ``draw`` returns the picture of the view with a given index: premultiplied RGBA in [0, 1], [H, W, 4]. ``on_view`` is called after each
-    view with the number of finished views and V. Raises InputError if there are no views or they are too small.
+    ``draw`` returns the picture of the view with a given index: premultiplied RGBA in [0, 1], [H, W, 4]. ``antialiased`` does so for a mask
+    drawn with alpha to coverage. ``on_view`` is called after each view with the number of finished views and V. Raises InputError if there
+    are no views or they are too small.
     """
     if len(views) == 0:
         fail("views", "there is no held-out view to measure on", "give views with a test split")
@@ -159,7 +158,8 @@ def score_views(
     scores = []
     for index in range(len(views)):
         target = views.targets([index], torch.float64)[0]
-        scores.append(ViewScore(names[index], azimuths[index], elevations[index], measure(target, draw(index))))
+        smooth = None if antialiased is None else measure(target, antialiased(index))
+        scores.append(ViewScore(names[index], azimuths[index], elevations[index], measure(target, draw(index)), smooth))
         if on_view is not None:
             on_view(index + 1, len(views))
     return tuple(scores)

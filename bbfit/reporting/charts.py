@@ -39,6 +39,8 @@ class Chart:
 
 MEASURES = (("psnr", "PSNR, dB", max), ("ssim", "SSIM", max), ("flip", "FLIP", min))
 """Measures that are means over the backgrounds: name, title, and the function that gives the better of two values."""
+FEW = 24
+"""Most billboards that have numbers in the plan; the numbers of more would cover it."""
 # Hues of medium lightness, which contrast with white and with black.
 _HUES = ("#3b82c4", "#d9702b", "#3f9e4d", "#c94f4f", "#8f6bc1", "#a06a4e", "#d066a8", "#7d8590", "#a3a21f", "#2aa6b5")
 
@@ -110,10 +112,10 @@ def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
 
 
 def plan_chart(cloud: BillboardCloud) -> Chart:
-    """The rectangles of the billboards from above, numbered from 1, in meters, with azimuth 0 at the bottom.
+    """The rectangles of the billboards from above, in meters, with azimuth 0 at the bottom. Up to :data:`FEW` are numbered from 1.
 
-    Lower edges are thick; upright billboards are lines. ``plan-eye`` is a camera at azimuth 0. It orbits the center, at the marks ``x`` and
-    ``y``.
+    Lower edges are thick, unless there are more; upright billboards are lines. ``plan-eye`` is a camera at azimuth 0. It orbits the center,
+    at the marks ``x`` and ``y``.
     """
     from matplotlib.patches import Polygon
 
@@ -122,11 +124,14 @@ def plan_chart(cloud: BillboardCloud) -> Chart:
     quads = corners(cloud).cpu().numpy()
     middle = (quads.min((0, 1)) + quads.max((0, 1))) / 2 if len(cloud) else np.zeros(3)
     reach = float(np.linalg.norm((quads - middle)[..., [0, 2]], axis=-1).max()) if len(cloud) else 1.0
+    few = len(cloud) <= FEW
     for index, quad in enumerate(quads):
         flat, color = quad[:, [0, 2]], billboard_color(index)
-        axes.add_patch(Polygon(flat, facecolor=color, edgecolor=color, linewidth=1, alpha=0.22))
+        axes.add_patch(Polygon(flat, facecolor=color, edgecolor=color, linewidth=1, alpha=0.22 if few else 0.1))
         lowest = np.argsort(quad[:, 1], kind="stable")[:2]
-        axes.plot(*flat[lowest].T, color=color, linewidth=2.6, solid_capstyle="round")
+        axes.plot(*flat[lowest].T, color=color, linewidth=2.6 if few else 0.8, solid_capstyle="round")
+        if not few:
+            continue
         # The number is at the outer end of the lower edge, where lines do not cross.
         ends = flat[lowest] - middle[[0, 2]]
         end = ends[np.linalg.norm(ends, axis=-1).argmax()]

@@ -23,7 +23,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
 from bbfit.images import to_bytes, unpremultiply
 from bbfit.model_files import generator
-from bbfit.reporting.charts import MEASURES, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
+from bbfit.reporting.charts import FEW, MEASURES, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
 from bbfit.reporting.plots import magma, spread_views
 from bbfit.reporting.threejs import drawing_script, library_page
 from bbfit.views import ViewSet
@@ -92,6 +92,7 @@ def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunF
         sizes=Markup(sizes_chart(report.sizes).svg) if report.sizes else None,
         loss=Markup(loss_chart(facts.losses).svg),
         billboards=_billboards(cloud),
+        many=len(cloud) > FEW,
         library=library_page(),
         drawing=Markup(drawing_script()),
         glb=base64.b64encode(glb).decode(),

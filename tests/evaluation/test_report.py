@@ -19,7 +19,7 @@ def score(name: str, scale: float, sharpness: float | None = 1.0) -> ViewScore:
     over = Over(*(OverBackground((20 + step) * scale, 0.8, 0.1 + step / 10) for step in range(4)))
     colour = Colour((4.0 * scale, 5.0, 2.0, 10.0), (2.0, 3.0, 1.0, 8.0), (4.0, 4.0, 2.0, 9.0), (2.0, 2.0, 1.0, 6.0))
     measures = Measures(over, Rgba(0.1, 22 * scale, 0.7), ThesisScale(2e-5, 0.99999, 92 * scale, 17), colour, sharpness, 0.5)
-    return ViewScore(name, 12.0, 0.0, measures)
+    return ViewScore(name, 12.0, 0.0, measures, replace(measures, rgba=Rgba(0.05, 28 * scale, 0.8)))
 
 
 SIZES = (SizeScore(64, 48, 20.5, 1.01, 0.1), SizeScore(32, 24, 21.5, None, 0.09))
@@ -43,6 +43,7 @@ def test_means_are_plain_and_leave_out_what_is_undefined() -> None:
     assert mean.over.mean.psnr == pytest.approx(26.875) and mean.over.mean.flip == pytest.approx(0.25)  # of 20, 21, 22, 23 and 30 ... 34.5
     assert mean.over.mean.psnr == pytest.approx(sum(view.measures.over.mean.psnr for view in REPORT.views) / 2)
     assert mean.sharpness == 1 and mean.brightness == 0.5
+    assert REPORT.antialiased and REPORT.antialiased.rgba.psnr == pytest.approx(35)
     assert replace(REPORT, views=(score("b", 1, None),)).mean.sharpness is None
 
 
@@ -52,6 +53,9 @@ def test_rings_are_views_of_about_one_elevation() -> None:
     rings = replace(REPORT, views=views).rings
     assert [(ring.elevation_degrees, ring.views) for ring in rings] == [(0.0, 2), (pytest.approx(30.1), 2), (90.0, 1)]
     assert [ring.measures.over_white.psnr for ring in rings] == [70.0, 40.0, 80.0]
+    assert [ring.antialiased and ring.antialiased.rgba.psnr for ring in rings] == pytest.approx([98.0, 56.0, 112.0])
+    hard = replace(REPORT, views=tuple(replace(view, antialiased=None) for view in views))
+    assert hard.antialiased is None and {ring.antialiased for ring in hard.rings} == {None}
 
 
 def test_ratio_is_table_1s() -> None:
@@ -67,11 +71,11 @@ def test_schema() -> None:
         *MEASURES,
         "sharpness",
         "brightness",
+        "antialiased",
         "vertices",
         "bytes",
         "overdraw",
         "shaded",
-        "antialiased",
         "trunk",
         "alpha",
         "seconds",
@@ -80,8 +84,9 @@ def test_schema() -> None:
         "rings",
         "views",
     ]
-    assert list(content["views"][0]) == ["name", "azimuth_degrees", "elevation_degrees", *MEASURES, "sharpness", "brightness"]
-    assert list(content["rings"][0]) == ["elevation_degrees", "views", *MEASURES, "sharpness", "brightness"]
+    groups = [*MEASURES, "sharpness", "brightness", "antialiased"]
+    assert list(content["views"][0]) == ["name", "azimuth_degrees", "elevation_degrees", *groups]
+    assert list(content["rings"][0]) == ["elevation_degrees", "views", *groups]
     for part in (content, *content["views"], *content["rings"]):
         assert {group: set(part[group]) for group in MEASURES} == MEASURES
         assert part["over_white"] == part["over"]["white"] and all(set(each) == {"psnr", "ssim", "flip"} for each in part["over"].values())

@@ -17,9 +17,10 @@ from bbfit.checks import InputError
 from bbfit.evaluation import metrics
 from bbfit.evaluation.backgrounds import BACKGROUNDS
 from bbfit.evaluation.measures import Over, OverBackground, mean_measures
-from bbfit.evaluation.scoring import OriginalTree, evaluate, held_out, measure, view_angles
+from bbfit.evaluation.scoring import OriginalTree, evaluate, evaluate_model, held_out, measure, view_angles
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.geometry.orbit import Orbit
@@ -67,6 +68,17 @@ def test_nothing_drawn(views: ViewDataset) -> None:
     target = over_color(views.test.targets([2], torch.float64)[0]).numpy()
     assert report.views[2].measures.over_white.psnr == pytest.approx(metrics.psnr(target, np.ones_like(target)), abs=1e-9)
     json.dumps(report.to_json(), allow_nan=False)
+
+
+def test_a_mask_is_scored_with_hard_edges_and_with_alpha_to_coverage(views: ViewDataset) -> None:
+    cloud = crossing_billboards()
+    for kind in ("mask", "blend"):
+        model = shipped_model(replace(cloud, alpha=AlphaMode(kind)), None)
+        report = evaluate_model(model, views.test)
+        for index, view in enumerate(report.views):
+            assert view.measures == measure(*held_out(model.draw, views.test, index))
+            smooth = measure(*held_out(model.antialiased().draw, views.test, index)) if kind == "mask" else None
+            assert view.antialiased == smooth != view.measures
 
 
 def test_both_empty() -> None:

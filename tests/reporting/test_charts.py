@@ -14,7 +14,7 @@ from bbfit.evaluation.measures import Over, OverBackground
 from bbfit.evaluation.report import SizeScore, ViewScore
 from bbfit.evaluation.scoring import measure
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.reporting.charts import Chart, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
+from bbfit.reporting.charts import FEW, Chart, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
 
 HUES = {billboard_color(index) for index in range(10)}
 
@@ -79,6 +79,14 @@ def test_the_plan_turns_about_its_middle(known_cloud: BillboardCloud) -> None:
     # At azimuth 0 the camera is straight below the middle.
     assert float(eye[1]) == pytest.approx(chart.marks["x"], abs=1e-3) and float(eye[2]) > chart.marks["y"] + 100
     plan_chart(known_cloud.take([]))
+
+
+def test_the_plan_numbers_a_few_billboards_and_shows_many(known_cloud: BillboardCloud) -> None:
+    for count, numbered in ((FEW, True), (FEW + 1, False)):
+        many = known_cloud.take([0] * count)
+        svg = plan_chart(many).svg
+        assert (f">{count}</text>" in svg) == numbered
+        assert svg.count("stroke-linecap: round") == count
 
 
 def test_colors_are_the_pages(known_cloud: BillboardCloud) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -367,3 +368,17 @@ def test_every_kind_of_export_has_a_page(visit: Visit, views_folder: Path, tmp_p
     image, _ = visit(drawn, path=made.folder / "report.html")
     assert (image.min(-1) < 0.9).mean() > 0.01
     assert BillboardCloud.load(tmp_path / "cloud.safetensors").two_sided.all()
+
+
+def test_many_billboards_are_a_sheet_with_their_sizes_in_tooltips(visit: Visit, views_folder: Path, tmp_path: Path) -> None:
+    made = run(views_folder, tmp_path, RunConfig(fit=FitConfig(billboards=60, placement="even", texel_density=0.3, steps=1)))
+
+    def act(page: Page) -> None:
+        titles = page.evaluate("[...document.querySelectorAll('.textures figure')].map(figure => figure.title)")
+        assert len(titles) == 60 and all(
+            re.fullmatch(r"\d+\.\d x \d+\.\d m, \d+ x \d+ texels, \S+ % opaque(, leans \d+°)?", title) for title in titles
+        )
+        assert page.evaluate("document.getElementById('billboards').offsetHeight") < 1200  # 5,000 with 60 captions
+        assert page.evaluate("document.documentElement.scrollWidth") == 360
+
+    visit(act, path=made.folder / "report.html", width=360)
