@@ -25,6 +25,8 @@ _THEME = {"#000001": "--ink", "#70767e": "--faint", "#e4e7ea": "--grid", "#1f5f8
 _INK, _FAINT, _GRID, _ACCENT, _SOFT, _WORST = _THEME
 # Width in inches, of 72 units of the SVG each: that of a phone, so that pages on phones do not shrink the charts.
 _WIDTH = 5.4
+# Least distance between the elevations beside the lines of a chart, in points.
+_LABEL = 9.0
 
 
 @dataclass(frozen=True)
@@ -78,15 +80,14 @@ def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
         values = [float(getattr(view.measures.over.mean, name)) for view in views]
         angles = [view.azimuth_degrees for view in views]
         axes.axvline(0, color=_FAINT, linewidth=1, gid=f"cursor-{name}")
+        ends = list[tuple[float, int]]()
         if len(rings) <= len(views) / 4:
             for elevation, ring in rings.items():
                 # The circle is closed: the line continues beyond both ends.
                 around = [*((angles[i] - 360, values[i]) for i in ring[-1:]), *((angles[i], values[i]) for i in ring)]
                 around += [(angles[i] + 360, values[i]) for i in ring[:1]]
                 axes.plot(*zip(*around, strict=True), color=_SOFT, linewidth=1.5)
-                if len(rings) > 1:
-                    end = float(np.interp(365, *np.array(around).T))
-                    axes.annotate(f"{elevation}°", (365, end), (3, 0), textcoords="offset points", va="center", color=_FAINT, fontsize=8)
+                ends.append((float(np.interp(365, *np.array(around).T)), elevation))
         for index, (angle, value) in enumerate(zip(angles, values, strict=True)):
             bad = index == worst[name]
             axes.plot([angle], [value], "o", markersize=7 if bad else 5, color=_WORST if bad else _ACCENT, gid=f"{name}-{index}")
@@ -103,12 +104,27 @@ def azimuth_chart(views: Sequence[ViewScore]) -> Chart:
         axes.set_title(title, loc="left", fontsize=10, color=_INK, pad=9)
         axes.margins(y=0.3)
         _plain(axes)
+        if len(ends) > 1:
+            _label_ends(axes, ends)
     panels[-1].set_xlim(-5, 365)
     panels[-1].set_xticks(range(0, 361, 45), [f"{angle}°" for angle in range(0, 361, 45)])
     panels[-1].set_xlabel("azimuth that the view looks from")
     svg = _svg(figure, "azimuth")
     zero, one = (panels[-1].transData.transform((degree, 0))[0] * 72 / figure.dpi for degree in (0, 1))
     return Chart(svg, {"degree": float(one - zero)})
+
+
+def _label_ends(axes: Axes, ends: Sequence[tuple[float, int]]) -> None:
+    """Write elevations in degrees where the lines of rings end, (value, elevation) each, moved apart if they would overlap."""
+    low, high = axes.get_ylim()
+    points = axes.get_window_extent().height * 72 / axes.figure.dpi / (high - low)
+    ends, places = sorted(ends), list[float]()
+    for value, _ in ends:
+        places.append(max(value * points, places[-1] + _LABEL if places else -np.inf))
+    shift = float(np.mean([value * points - place for (value, _), place in zip(ends, places, strict=True)]))
+    for (value, elevation), place in zip(ends, places, strict=True):
+        offset = place + shift - value * points
+        axes.annotate(f"{elevation}°", (365, value), (3, offset), textcoords="offset points", va="center", color=_FAINT, fontsize=8)
 
 
 def plan_chart(cloud: BillboardCloud) -> Chart:
