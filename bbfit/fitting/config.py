@@ -106,8 +106,8 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
         "least_alpha": 0.08,
         "colors": "matched",
         "antialiased": False,
-        "sharpness_weight": 1.0,
-        "binarization_weight": 0.01,
+        "sharpness_weight": 0.2,
+        "binarization_weight": 0.0,
     },
     "hash": {
         "most_layers": 3.2,
@@ -203,10 +203,10 @@ class FitConfig:
     """Weight of 1 - SSIM, which preserves structure, beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: _Sharpness | None = None
     """Weight of the sharpness loss: the squared difference in mean contrast between neighboring pixels, at full resolution.
-    Preset: 4 (mask) or 1; thesis: 0."""
+    Preset: 4 (mask), 0.2 (blend) or 1 (hash); thesis: 0."""
     binarization_weight: _Binarization | None = None
     """Weight that pushes alpha to 0 or 1: of alpha * (1 - alpha), summed over texels, over a view's pixels, at full resolution.
-    Preset: 0.02 (mask), 0.01 (blend) or 0.03 (hash); thesis: 0."""
+    Preset: 0.02 (mask), 0.03 (hash) or 0 (blend); thesis: 0."""
     levels: Count | None = None
     """Number of resolutions, from coarse to fine; each doubles the sides of the one before. Steps are divided evenly among them.
     Preset: 4; thesis: 1."""
