@@ -110,7 +110,7 @@ def test_report_has_the_shimmer_of_both_drawings_of_a_mask(pairs: TurnedViews, t
     smooth = replace(mask, alpha=AlphaMode("mask", antialiased=True))
     expected = score_shimmer(lambda camera: render(mask, camera), pairs, lambda camera: render(smooth, camera))
     assert report.shimmer == expected and all(score.antialiased for score in expected)
-    assert seen[-1] == (12, 12) and [done for done, _ in seen] == sorted(done for done, _ in seen)
+    assert seen[-1] == (9, 9) and [done for done, _ in seen] == sorted(done for done, _ in seen)
     report.save(tmp_path / "metrics.json")
     assert Report.load(tmp_path / "metrics.json").shimmer == expected
     assert evaluate(mask, pairs.views).shimmer == ()

@@ -340,14 +340,15 @@ def test_unknown_device_is_refused(views: ViewDataset) -> None:
 
 @pytest.mark.parametrize("cutoff", [0.3, 0.5])
 def test_a_fit_for_mask_is_better_cut_off_than_one_for_blend(data_views: ViewDataset, cutoff: float) -> None:
-    """Over white, with hard edges, and it covers as much of other views as the tree does; it is drawn with texels that 8 bits hold."""
-    config = FitConfig(billboards=3, placement="even", placement_learning_rate=0, alpha_cutoff=cutoff, steps=100)
+    """Over white, with hard edges and the same weight of sharpness, and it covers as much of other views as the tree does; it is drawn
+    with texels that 8 bits hold."""
+    config = FitConfig(billboards=3, placement="even", placement_learning_rate=0, alpha_cutoff=cutoff, sharpness_weight=4, steps=100)
     masked, blended = (fit(data_views, dataclasses.replace(config, alpha=alpha)).cloud for alpha in ("mask", "blend"))
     assert masked.alpha == AlphaMode("mask", cutoff) and blended.alpha == AlphaMode("blend", cutoff)
     cut = dataclasses.replace(blended, alpha=masked.alpha)
     test = data_views.test
     gain = over_white(masked, test) - over_white(cut, test)
-    assert gain > 0.15  # measured: 0.22 and 0.29 dB
+    assert gain > 0.15  # measured: 0.22 and 0.28 dB
     covered = render_reference(masked, test.cameras)[..., 3].mean() / test.targets(range(len(test)))[..., 3].mean()
     assert abs(float(covered) - 1) < 0.04  # measured: 0.008 and 0.018
     assert torch.equal((masked.texels * 255).round() / 255, masked.texels)
