@@ -37,7 +37,7 @@ class ViewScore:
     def to_json(self) -> dict[str, Any]:
         """The name, the angles and the groups of measures in one dictionary."""
         angles = {"azimuth_degrees": self.azimuth_degrees, "elevation_degrees": self.elevation_degrees}
-        return {"name": self.name} | angles | _measures(self)
+        return {"name": self.name} | angles | _json(self.measures, self.antialiased)
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class RingScore:
 
     def to_json(self) -> dict[str, Any]:
         """The elevation, the number of views and the groups of measures in one dictionary."""
-        return {"elevation_degrees": self.elevation_degrees, "views": self.views} | _measures(self)
+        return {"elevation_degrees": self.elevation_degrees, "views": self.views} | _json(self.measures, self.antialiased)
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class Report:
             "rings": [{"elevation_degrees", "views", and the same measures, with "antialiased"}],
             "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures, with "antialiased"}]}``
         """
-        return _measures(self) | {
+        return _json(self.mean, self.antialiased) | {
             "vertices": self.vertices.to_json(),
             "bytes": self.bytes.to_json(),
             "overdraw": self.overdraw,
@@ -240,10 +240,9 @@ def _antialiased(views: Sequence[ViewScore]) -> Measures | None:
     return mean_measures(measures) if measures else None
 
 
-def _measures(scored: ViewScore | RingScore | Report) -> dict[str, Any]:
+def _json(measures: Measures, antialiased: Measures | None) -> dict[str, Any]:
     """The groups of measures, and those with alpha to coverage."""
-    measures = scored.mean if isinstance(scored, Report) else scored.measures
-    return measures.to_json() | {"antialiased": None if scored.antialiased is None else scored.antialiased.to_json()}
+    return measures.to_json() | {"antialiased": None if antialiased is None else antialiased.to_json()}
 
 
 def stage_seconds(path: str | Path) -> dict[str, float]:

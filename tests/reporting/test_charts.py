@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
@@ -100,3 +101,13 @@ def test_colors_are_the_pages(known_cloud: BillboardCloud) -> None:
     assert len(names) == len(set(names))
     again = [azimuth_chart(scores((20, 0.9, 0.1))), plan_chart(known_cloud)]
     assert [chart.svg for chart in again] == [chart.svg for chart in charts[:2]]
+
+
+def test_elevations_where_lines_end_together_do_not_overlap() -> None:
+    ends = [20.0, 20.01, 20.02, 23.0]
+    rings = [scores(*[(end, 0.9, 0.1)] * 6, elevation=20.0 * ring) for ring, end in enumerate(ends)]
+    svg = azimuth_chart([view for ring in rings for view in ring]).svg
+    labels = re.findall(r'<text style="font-size: 8px[^>]*? y="([\d.]+)"[^>]*>(\d+)°</text>', svg)[: len(ends)]  # those of PSNR
+    assert [int(elevation) for _, elevation in labels] == [0, 20, 40, 60]
+    places = [float(place) for place, _ in labels]
+    assert all(low - high > 8.9 for low, high in itertools.pairwise(places))  # a higher value is higher up
