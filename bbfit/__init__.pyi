@@ -32,6 +32,6 @@ from .trees.species import Species as Species
 from .trees.species import load_species as load_species
 from .trees.tree_writer import write_tree as write_tree
 from .viewing.server import view as view
-from .views import ViewDataset as ViewDataset
+from .views.dataset import ViewDataset as ViewDataset
 
 __version__: str

@@ -43,7 +43,7 @@ from bbfit.stages.results import original_tree
 from bbfit.stages.stage import OnProgress, Record, Stage, silent
 from bbfit.stages.trees import convert_stage, views_stage
 from bbfit.tree_files.tree_file import TreeFile
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 # The results of every system also depend on the versions of these algorithms.
 _VERSIONS = {name: VERSIONS[name] for name in ("fit", "export", "evaluate")}

@@ -8,18 +8,20 @@ frame).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from bbfit.checks import MissingFileError, check_range, fail
 from bbfit.files import read_json, write_json
 from bbfit.geometry.camera import Camera, camera_from_nerf, camera_to_nerf, pinhole_intrinsics
+from bbfit.geometry.light import Light
 from bbfit.inputs import LARGEST, InputLimits, reading
 
 _LIMITS = InputLimits()
@@ -27,6 +29,11 @@ TRAIN_FILE, TEST_FILE, SINGLE_FILE = "transforms_train.json", "transforms_test.j
 TURNED_FILE = "transforms_turned.json"
 """File beside the transforms with the cameras of second pictures of some held-out views, each turned by one degree around the tree. An
 entry ``turned_from`` names the ``file_path`` of its view in the file of test views."""
+LIT_TRAIN_FILE, LIT_TEST_FILE = "transforms_lights_train.json", "transforms_lights_test.json"
+"""Files beside the transforms with pictures of the same cameras under one light at a time, in the same split. Each frame has a ``light``:
+``sun_direction`` (towards the sun, in the axes of the file), ``sun_strength``, ``sun_color`` and ``ambient``, as in
+:class:`~bbfit.geometry.light.Light`, of which either ``sun_strength`` or ``ambient`` is 0. A frame of the sky may have an ``albedo_path``
+and a ``normal_path``. In the other files ``light`` is the light of the picture."""
 REQUEST_FILE = "views.json"
 """File beside the transforms in which ``bbfit views`` records its options and facts about the tree."""
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "ORTHOGRAPHIC")
@@ -77,16 +84,57 @@ def split_rings(counts: Sequence[int], seed: int) -> tuple[list[int], list[int]]
     return (sorted(set(range(begin)) - set(test)), test) if test else split_views(begin, seed)
 
 
-def write_transforms(folder: Path, camera: Camera, image_paths: list[str], train: list[int], test: list[int]) -> None:
+def write_transforms(
+    folder: Path, camera: Camera, image_paths: list[str], train: list[int], test: list[int], light: Light | None = None
+) -> None:
     """Write both transforms files for a batch of cameras and ``image_paths``, which are relative to ``folder`` and end in ``.png``.
 
-    The layout does not know orthographic cameras. Theirs have ``camera_model = "ORTHOGRAPHIC"`` and ``orthographic_extent_x`` in meters, as
-    well as intrinsics in pixels per meter.
+    ``light`` is that of all pictures, a batch of one, if it is known. The layout does not know orthographic cameras. Theirs have
+    ``camera_model = "ORTHOGRAPHIC"`` and ``orthographic_extent_x`` in meters, as well as intrinsics in pixels per meter.
     """
     header = _camera_header(camera)
     frames = _entries(camera, image_paths)
+    if light is not None:
+        frames = [entry | {"light": _light_entry(light)} for entry in frames]
     for name, indices in ((TRAIN_FILE, train), (TEST_FILE, test)):
         write_json(folder / name, header | {"frames": [frames[index] for index in indices]})
+
+
+@dataclass(frozen=True)
+class LitPaths:
+    """The pictures of one view under one light at a time, as paths relative to the folder of the views."""
+
+    ambient: str
+    """The picture under an even sky of strength 1."""
+    suns: list[str]
+    """The pictures under single suns of strength pi: a matte white surface that faces the sun is white."""
+    directions: Tensor
+    """Unit vectors towards those suns, Y up, one a row."""
+    albedo: str
+    """The diffuse color of the surfaces."""
+    normal: str
+    """The normals of the surfaces, as (normal + 1) / 2, in the axes of the file."""
+
+
+def write_lit(folder: Path, camera: Camera, lit: Sequence[LitPaths], train: Sequence[int], test: Sequence[int]) -> None:
+    """Write :data:`LIT_TRAIN_FILE` and :data:`LIT_TEST_FILE` for the views of :func:`write_transforms`."""
+    header, sky = _camera_header(camera), Light.of(torch.tensor([[0.0, 1.0, 0.0]]), 0.0, 1.0)
+    for name, indices in ((LIT_TRAIN_FILE, train), (LIT_TEST_FILE, test)):
+        frames = list[dict[str, Any]]()
+        for index in indices:
+            paths, each = lit[index], Light.of(lit[index].directions, math.pi, 0.0)
+            entries = _entries(camera[[index] * (1 + len(paths.suns))], [paths.ambient, *paths.suns])
+            entries[0] |= {"albedo_path": _reference(paths.albedo), "normal_path": _reference(paths.normal)}
+            lights = [sky, *(each[[number]] for number in range(len(each)))]
+            frames += [entry | {"light": _light_entry(light)} for entry, light in zip(entries, lights, strict=True)]
+        write_json(folder / name, header | {"frames": frames})
+
+
+def _light_entry(light: Light) -> dict[str, Any]:
+    """The entry of a light, a batch of one, in the file's axes."""
+    strength, (x, y, z) = light.sun_strengths.item(), light.sun_directions[0].tolist()
+    sun = {"sun_direction": [x, -z, y], "sun_strength": strength, "sun_color": light.sun_colors[0].tolist()}
+    return (sun if strength else {"sun_strength": 0.0}) | {"ambient": light.ambients.item()}
 
 
 def write_turned(folder: Path, camera: Camera, image_paths: list[str], views: list[str]) -> None:
@@ -136,6 +184,10 @@ class Frame:
     """Z-up world, OpenGL camera axes, 4 x 4."""
     header: dict[str, Any]
     """The file's entries with the frame's own ones over them."""
+    light: Light | None = None
+    """The light, a batch of one, if the file has it."""
+    passes: Mapping[str, Path] = field(default_factory=dict)
+    """The pictures ``albedo`` and ``normal`` of the frame, if the file has them."""
 
 
 def read_frames(folder: Path, limits: InputLimits = _LIMITS) -> tuple[list[Frame], list[Frame] | None]:
@@ -154,6 +206,27 @@ def read_frames(folder: Path, limits: InputLimits = _LIMITS) -> tuple[list[Frame
             test = [frame for frame in train if frame.header["file_path"] in held_out]
             return [frame for frame in train if frame.header["file_path"] not in held_out], test
     raise MissingFileError(f"views: {folder} has no {TRAIN_FILE} or {SINGLE_FILE}; give a folder that bbfit views wrote")
+
+
+def read_lit(folder: Path, limits: InputLimits = _LIMITS) -> tuple[list[Frame], list[Frame]] | None:
+    """The frames of :data:`LIT_TRAIN_FILE` and :data:`LIT_TEST_FILE`, all with a light. ``None`` if neither file exists.
+
+    Raises ``InputError`` if a file is damaged or missing, a frame has no light or two, and the errors of :func:`read_frames`.
+    """
+    paths = [folder / name for name in (LIT_TRAIN_FILE, LIT_TEST_FILE)]
+    if not any(path.is_file() for path in paths):
+        return None
+    for path in paths:
+        if not path.is_file():
+            raise MissingFileError(f"views: {path} does not exist; render the views anew, or remove the other transforms_lights file")
+    train, test = (_read_file(path, limits)[0] for path in paths)
+    for path, frames in zip(paths, (train, test), strict=True):
+        for number, frame in enumerate(frames):
+            if frame.light is None or bool(frame.light.sun_strengths > 0) == bool(frame.light.ambients > 0):
+                fail(
+                    "views", f"frame {number} of {path} has not exactly one light", "give each either a sun_strength or an ambient above 0"
+                )
+    return train, test
 
 
 def read_turned(folder: Path, test: Sequence[Frame], limits: InputLimits = _LIMITS) -> list[tuple[int, Frame]]:
@@ -193,9 +266,32 @@ def _read_file(path: Path, limits: InputLimits) -> tuple[list[Frame], set[str]]:
                 ending = "" if Path(reference).suffix.lower() in _PICTURES else ".png"
                 known[reference] = limits.referenced("views", path, reference + ending, path.parent)
             own = {key: entry[key] for key in ("file_path", "turned_from", *_HEADER) if key in entry}
-            frames.append(Frame(known[reference], matrix, header | own))
+            passes = {
+                name: limits.referenced("views", path, f"{entry[key]}.png", path.parent)
+                for name in ("albedo", "normal")
+                if isinstance(entry.get(key := f"{name}_path"), str)
+            }
+            light = _light(entry["light"]) if "light" in entry else None
+            if "light" in entry and light is None:
+                fail("views", f"frame {index} of {path} has no usable light", "give a direction, strengths and a color")
+            frames.append(Frame(known[reference], matrix, header | own, light, passes))
         held_out = content.get("test_filenames")
         return frames, {name for name in held_out if isinstance(name, str)} if isinstance(held_out, list) else set()
+
+
+def _light(entry: Any) -> Light | None:
+    """The light of a frame, or ``None`` for what is none. A sun may have no color, which is white, and a sky no sun."""
+    if not isinstance(entry, dict):
+        return None
+    try:
+        strength, ambient = float(entry.get("sun_strength", 0)), float(entry.get("ambient", 0))
+        x, y, z = map(float, entry.get("sun_direction", () if strength else (0, 0, 1)))
+        red, green, blue = map(float, entry.get("sun_color", (1, 1, 1)))
+        if not max(abs(x), abs(y), abs(z), strength, ambient, red, green, blue) <= LARGEST:
+            return None
+        return Light.of(torch.tensor([[x, z, -y]], dtype=torch.float64), strength, ambient, (red, green, blue))
+    except (TypeError, ValueError, OverflowError):
+        return None
 
 
 def _matrix(value: Any) -> list[list[float]] | None:

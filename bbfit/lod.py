@@ -24,7 +24,7 @@ from bbfit.stages.results import export_config
 from bbfit.stages.stage import OnProgress, Record, Stage, silent
 from bbfit.stages.trees import convert_stage, views_stage
 from bbfit.tree_files.tree_file import TreeFile
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 ORIGINAL = "original.glb"
 """The file of the converted tree."""

@@ -40,7 +40,7 @@ from bbfit.stages.trees import GROW_OUTPUTS, grow_stage, views_stage
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.species import Species, load_species
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from bbfit.checks import check_file
 VERSIONS: Mapping[str, int] = {
     "grow": 1,
     "convert": 1,
-    "views": 4,
+    "views": 5,
     "budget": 10,
     "fit": 19,
     "export": 7,

@@ -52,7 +52,7 @@ from bbfit.fitting.steps import Stepper
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import write_png
 from bbfit.operators.adam.fused import AdamFused, rest_after
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 TREES = {"quaking_aspen": 0, "weeping_willow": 0}

@@ -11,7 +11,7 @@ from bbfit.geometry.orbit import Orbit
 from bbfit.images import to_bytes, unpremultiply, write_png
 from bbfit.layout import write_transforms
 from bbfit.rendering.dispatch import render
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 
 def crossing_billboards(count: int = 2) -> BillboardCloud:

@@ -21,7 +21,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.outputs import WRITTEN_FILE
 from bbfit.pipeline import RunConfig, RunResult, run
 from bbfit.stages.billboards import fit_stage
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 VIEWS = Path(__file__).resolve().parents[1] / "data" / "views"
 FIT = FitConfig(placement="even", steps=6, views_per_step=1)

@@ -24,7 +24,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.pipeline import RunConfig
 from bbfit.rivals.config import SYSTEMS, CompareConfig
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
 STAGES = RunConfig(views=ViewsConfig(count=8, size=64, samples=2, denoise=False), fit=FitConfig(steps=40, placement="even"))

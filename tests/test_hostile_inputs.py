@@ -35,7 +35,7 @@ from bbfit.sweep.grid import Grid
 from bbfit.sweep.results import Results
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.species import load_species
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 
 @pytest.fixture(autouse=True)

@@ -16,7 +16,7 @@ from bbfit.fitting.loop import fit
 from bbfit.fitting.requirements import check_device
 from bbfit.images import write_png
 from bbfit.pipeline import RunConfig, run
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 

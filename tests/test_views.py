@@ -22,7 +22,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, write_png
 from bbfit.layout import TURNED_FILE, write_turned
 from bbfit.operators.drawing.reference import render_reference
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 
 @pytest.fixture

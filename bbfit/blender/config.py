@@ -55,6 +55,9 @@ class ViewsConfig:
     """Angle of the sun above the horizon in degrees."""
     ambient_strength: _Strength = 1.0
     """Strength of the ambient light: at 1, without sun, an open white matte surface is exactly white. It scales a panorama too."""
+    suns: Annotated[int, Range(0, 64)] = 0
+    """Number of other suns under which each training camera sees the tree, one at a time, for billboards that take a program's light.
+    Held-out cameras see it under four further suns. With 0 there is only the baked light."""
     hdri: Path | None = None
     """Panorama (.hdr or .exr) that lights the tree in place of even white; set the sun's strength to 0 if it includes a sun."""
     render_device: Device = field(default="cpu", metadata=EXECUTION)
@@ -73,6 +76,8 @@ class ViewsConfig:
         check_fields(self)
         if self.count < len(self.rings):
             fail("count", f"expected at least one view for each of {len(self.rings)} rings, got {self.count}")
+        if self.suns and self.hdri is not None:
+            fail("suns", "a panorama takes the place of the sky, so billboards cannot take another", "leave out --hdri, or set --suns 0")
 
     @property
     def rings(self) -> tuple[float, ...]:

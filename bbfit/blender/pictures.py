@@ -19,6 +19,7 @@ from bbfit.blender.processes import BlenderPool, require_bpy
 from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputError, check_range, fail
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, camera_to_nerf
+from bbfit.geometry.light import direction
 from bbfit.images import read_rgba
 from bbfit.outputs import claimed_folder
 from bbfit.tree_files.tree_file import TreeFile
@@ -28,7 +29,7 @@ PICTURES_FILE = "pictures.json"
 FILTER_REACH = 2.0
 """How far, in pixels, the filter of Cycles spreads a surface beyond its outline. The Blackman-Harris filter reaches 1.5 pixels."""
 # The options of views that explicit cameras replace.
-_UNUSED = ("count", "size", "elevations", "fov_degrees", "orthographic", "axis", "turned")
+_UNUSED = ("count", "size", "elevations", "fov_degrees", "orthographic", "axis", "turned", "suns")
 # The largest difference in pixels between a camera's intrinsics and those that Blender can represent.
 _INTRINSICS_TOLERANCE = 1e-6
 
@@ -138,21 +139,21 @@ def tree_settings(tree: TreeFile) -> dict[str, Any]:
     return {"tree": str(tree.path.resolve()), "files": [str(file.resolve()) for file in tree.files]}
 
 
-def worker_settings(tree: TreeFile, config: ViewsConfig, size: int, count: int) -> dict[str, Any]:
-    """The worker's settings for ``count`` pictures of ``size`` x ``size`` pixels."""
-    azimuth, elevation = math.radians(config.sun_azimuth), math.radians(config.sun_elevation)
-    across = math.cos(elevation)
+def worker_settings(tree: TreeFile, config: ViewsConfig, size: int, count: int, *, suns: int = 0) -> dict[str, Any]:
+    """The worker's settings for ``count`` pictures of ``size`` x ``size`` pixels. With pictures under single lights, ``suns`` is the
+    largest number of a view's suns."""
+    x, y, z = direction(config.sun_azimuth, config.sun_elevation).tolist()
     return {
         **tree_settings(tree),
         "size": size,
         "samples": config.samples,
         "denoise": config.denoise,
-        # Azimuth as in Orbit, whose +Z is Blender's -Y.
-        "sun_direction": [across * math.sin(azimuth), -across * math.cos(azimuth), math.sin(elevation)],
+        "sun_direction": [x, -z, y],  # Z up
         "sun_strength": config.sun_strength,
         "ambient_strength": config.ambient_strength,
         "hdri": None if config.hdri is None else str(Path(config.hdri).resolve()),
         "device": config.render_device,
+        "suns": suns,
         "threads": max(1, (os.cpu_count() or 1) // max(1, min(config.render_workers, count))),
     }
 

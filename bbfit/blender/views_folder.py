@@ -12,13 +12,28 @@ import torch
 from numpy.typing import NDArray
 
 from bbfit.blender.config import ViewsConfig
+from bbfit.blender.lit_pictures import LitPictures, lit_pictures
 from bbfit.blender.pictures import FILTER_REACH, clip_distances, frames, is_intact, to_y_up, vertical_axis, worker_settings
 from bbfit.blender.processes import BlenderError, BlenderPool, require_bpy
 from bbfit.blender.request import ViewsRequest
 from bbfit.checks import fail
 from bbfit.files import remove_parts
 from bbfit.geometry.camera import Camera
-from bbfit.layout import REQUEST_FILE, SINGLE_FILE, TEST_FILE, TRAIN_FILE, TURNED_FILE, split_rings, write_transforms, write_turned
+from bbfit.geometry.light import Light, direction
+from bbfit.layout import (
+    LIT_TEST_FILE,
+    LIT_TRAIN_FILE,
+    REQUEST_FILE,
+    SINGLE_FILE,
+    TEST_FILE,
+    TRAIN_FILE,
+    TURNED_FILE,
+    LitPaths,
+    split_rings,
+    write_lit,
+    write_transforms,
+    write_turned,
+)
 from bbfit.outputs import Written, claimed_folder, output_folder
 from bbfit.tree_files.tree_file import TreeFile
 
@@ -85,9 +100,11 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
     train, test = split_rings(config.orbit.ring_counts, config.seed)
     turned = _spread(test, config.turned)
     turned_paths = [path.with_stem(f"turned_{path.stem}") for path in paths]
-    missing = [index for index, path in enumerate(paths) if not is_intact(path, config.size)]
+    lit = lit_pictures(config, paths, test)
+    of_view = [[path, *(lit[index].paths if lit else ())] for index, path in enumerate(paths)]
+    missing = [index for index, files in enumerate(of_view) if not all(is_intact(path, config.size) for path in files)]
     missing_turned = [index for index in turned if not is_intact(turned_paths[index], config.size)]
-    transforms = [TRAIN_FILE, TEST_FILE, *([TURNED_FILE] if turned else [])]
+    transforms = [TRAIN_FILE, TEST_FILE, *([TURNED_FILE] if turned else []), *([LIT_TRAIN_FILE, LIT_TEST_FILE] if lit else [])]
     total, left = config.count + len(turned), len(missing) + len(missing_turned)
     if earlier and earlier.complete and not left and all((out / name).is_file() for name in transforms):
         report(total, total)
@@ -95,7 +112,8 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
 
     started, spent = time.monotonic(), earlier.seconds if earlier else 0.0
     require_bpy()
-    with BlenderPool(worker_settings(tree, config, config.size, left)) as pool:
+    suns = max((len(each.suns) for each in lit), default=0)
+    with BlenderPool(worker_settings(tree, config, config.size, left, suns=suns)) as pool:
         measured = pool.load()
         points = to_y_up(measured["payload"])
         camera, target, distance = _cameras(points, config)
@@ -108,7 +126,7 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
         )
         output_folder("out", images)
         remove_parts(images)
-        pictures = [*(paths[index] for index in missing), *(turned_paths[index] for index in missing_turned)]
+        pictures = [*(path for index in missing for path in of_view[index]), *(turned_paths[index] for index in missing_turned)]
         written, files = Written(out), [REQUEST_FILE, *transforms, *(f"images/{path.name}" for path in pictures)]
         if earlier:
             written.adopt("views", written.digests([name for name in files if (out / name).is_file()]))
@@ -126,14 +144,31 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
         on_done(finished)
         clips = [clip_distances(points, camera.position[0])] * config.count
         neighbors = camera.turned(_TURN, target)
-        requests = frames(camera, paths, missing, clips, config.seed) + frames(neighbors, turned_paths, missing_turned, clips, config.seed)
-        pool.render(requests, config.render_workers, finished, on_done)
+        own = frames(camera, paths, missing, clips, config.seed)
+        second = frames(neighbors, turned_paths, missing_turned, clips, config.seed)
+        if lit:  # a view and its second picture have the same lights, and so the same noise
+            own = [frame | {"lights": lit[frame["frame"]].request()} for frame in own]
+            second = [frame | {"lights": lit[frame["frame"]].request(only_light=True)} for frame in second]
+        pool.render(own + second, config.render_workers, finished, on_done)
     names, turned_names = ([f"images/{path.name}" for path in each] for each in (paths, turned_paths))
     if turned:
         write_turned(out, neighbors[turned], [turned_names[index] for index in turned], [names[index] for index in turned])
-    write_transforms(out, camera, names, train, test)
+    if lit:
+        write_lit(out, camera, [_relative(each, out) for each in lit], train, test)
+    write_transforms(out, camera, names, train, test, _baked_light(config))
     save(complete=True)
     written.finish("views", written.digests([REQUEST_FILE, *transforms, "images/*.png"]))
+
+
+def _relative(lit: LitPictures, out: Path) -> LitPaths:
+    ambient, *suns, albedo, normal = (path.relative_to(out).as_posix() for path in lit.paths)
+    return LitPaths(ambient, suns, torch.tensor(lit.suns, dtype=torch.float64), albedo, normal)
+
+
+def _baked_light(config: ViewsConfig) -> Light | None:
+    """The light of the views' own pictures; a panorama is none."""
+    sun = direction(config.sun_azimuth, config.sun_elevation)
+    return None if config.hdri is not None else Light.of(sun[None], config.sun_strength, config.ambient_strength)
 
 
 def _spread(indices: Sequence[int], count: int) -> list[int]:

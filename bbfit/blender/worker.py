@@ -41,7 +41,7 @@ def import_beside(name: str) -> ModuleType:
     return module
 
 
-SCENE = import_beside("worker_scene")
+SCENE, LIGHTS = import_beside("worker_scene"), import_beside("worker_lights")
 
 
 def main() -> NoReturn:
@@ -69,7 +69,7 @@ def main() -> NoReturn:
         prepare(settings, answer)
         while True:
             frame = requests.get()
-            render(frame)
+            render(frame, settings)
             answer("done", frame=frame["frame"])
     except SCENE.InputRefused as error:
         answer("refused", reason=error.args)
@@ -120,6 +120,8 @@ def prepare(settings: dict[str, Any], answer: Any) -> None:
     points, facts = SCENE.open_tree(settings["tree"], settings["files"])
     add_light(settings)
     set_up_cycles(settings)
+    if settings["suns"]:
+        LIGHTS.set_up(settings)
     camera = bpy.data.objects.new("bbfit camera", bpy.data.cameras.new("bbfit camera"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
@@ -127,7 +129,7 @@ def prepare(settings: dict[str, Any], answer: Any) -> None:
 
 
 def add_light(settings: dict[str, Any]) -> None:
-    """Add ambient light, which is uniform white or a panorama, and a sun."""
+    """Add ambient light, which is uniform white or a panorama, and a sun, unless ``worker_lights.py`` adds suns."""
     import bpy
     from mathutils import Vector
 
@@ -142,7 +144,7 @@ def add_light(settings: dict[str, Any]) -> None:
         panorama = tree.nodes.new("ShaderNodeTexEnvironment")
         panorama.image = load_panorama(settings["hdri"])
         tree.links.new(panorama.outputs["Color"], background.inputs["Color"])
-    if settings["sun_strength"] > 0:
+    if settings["sun_strength"] > 0 and not settings.get("suns"):
         lamp = bpy.data.lights.new("bbfit sun", "SUN")
         lamp.energy = settings["sun_strength"]
         sun = bpy.data.objects.new("bbfit sun", lamp)
@@ -212,8 +214,8 @@ def use_device(name: str) -> None:
     scene.cycles.device = "GPU"
 
 
-def render(frame: dict[str, Any]) -> None:
-    """Render one picture under a temporary name, then rename it."""
+def render(frame: dict[str, Any], settings: dict[str, Any]) -> None:
+    """Render one picture, and those under single lights that belong to it, under temporary names, then rename them."""
     import bpy
     from mathutils import Matrix
 
@@ -229,11 +231,18 @@ def render(frame: dict[str, Any]) -> None:
     scene.cycles.seed = frame["seed"]
     part = path.with_name(f".bbfit-{path.stem}.part")
     scene.render.filepath = str(part).replace("{", "{{").replace("}", "}}")  # Blender would replace {names}
+    parts = LIGHTS.aim(frame["lights"], path, settings) if frame.get("lights") else {}
     try:
         bpy.ops.render.render(write_still=True)
     except RuntimeError as error:
         reason = " ".join(str(error).split()).removeprefix("Error: ")
         raise SCENE.InputRefused("views", f"{path} could not be rendered ({reason})", RESUME_HINT) from error
+    for written, final in {**parts, str(part): str(path)}.items():
+        keep(Path(written), Path(final))
+
+
+def keep(part: Path, path: Path) -> None:
+    """Give a finished picture its name."""
     try:
         picture = part.read_bytes()
         if not picture.endswith(b"IEND\xaeB`\x82"):

@@ -15,7 +15,7 @@ from bbfit.checks import fail
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig, Placement, ResolvedFit
 from bbfit.tree_files.tree_file import TreeFile
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128)
 """Numbers of billboards to try, in addition to the largest number that the limit of vertices allows, up to the last number."""

@@ -13,7 +13,7 @@ from bbfit.fitting.loop import FitResult, fit
 from bbfit.fitting.palette import palettized
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.glb import split_glb
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 # The most steps of a fit that is repeated with fewer texels, the factor on its learning rate, the fraction of the limit that it aims at,
 # and the most repetitions.

@@ -21,7 +21,8 @@ from bbfit.fitting.requirements import check_cameras, check_device
 from bbfit.fitting.search import QUICK, find_placement
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.tree_files.tree_file import TreeFile
-from bbfit.views import ViewDataset, ViewSet
+from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 
 # The length of a short fit and of its search, if the configuration asks for no shorter ones. The search is at lower resolutions than the
 # levels, of which an even placement, without a search, has as many as any fit. Shorter fits would favor few billboards.

@@ -204,7 +204,7 @@ def evaluate_command(
     from bbfit.reporting.tables import report_table
     from bbfit.stages.results import original_tree
     from bbfit.tree_files.tree_file import TreeFile
-    from bbfit.views import ViewDataset
+    from bbfit.views.dataset import ViewDataset
 
     export.check()
     out = check_output_file("out", out or cloud.with_name("metrics.json"))

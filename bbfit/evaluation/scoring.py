@@ -24,7 +24,8 @@ from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.cards import CardRenderer
-from bbfit.views import TurnedViews, ViewSet
+from bbfit.views.dataset import TurnedViews
+from bbfit.views.view_set import ViewSet
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
 from bbfit.evaluation.report import ShimmerScore
 from bbfit.evaluation.sizes import shrunk
 from bbfit.geometry.camera import Camera
-from bbfit.views import TurnedViews
+from bbfit.views.dataset import TurnedViews
 
 SIDES = (512, 256, 128, 64, 32)
 """Longer sides of the pictures in pixels; those longer than the views' are left out."""

@@ -9,7 +9,7 @@ from bbfit.evaluation.metrics import silhouette_distance
 from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.model import shipped_model
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 # Errors are a little larger between the training views than in them: for four clouds of an acer by up to 11 % in the worst held-out view.
 _MARGIN = 1.15

@@ -14,7 +14,7 @@ from bbfit.evaluation import metrics
 from bbfit.evaluation.backgrounds import mean_psnr
 from bbfit.evaluation.report import SizeScore
 from bbfit.geometry.camera import Camera
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 HALVINGS = 4
 """How many times an evaluation halves the views' size."""

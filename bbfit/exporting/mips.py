@@ -15,6 +15,7 @@ from scipy import optimize, sparse
 
 from bbfit.checks import check_range
 from bbfit.geometry.cards import Atlas
+from bbfit.images import linear_to_srgb, srgb_to_linear
 
 # Number of samples of alpha along a texel's side. Castano uses four, which give a single opaque texel a coverage of 0.75 texels; the true
 # value is 0.614, and eight samples give 0.625.
@@ -107,16 +108,6 @@ def coverage(alpha: NDArray[np.uint8], cutoff: float, rectangle: NDArray[np.floa
         np.count_nonzero(values >= least) for lines in _filtered(block, top, bottom) for values in _filtered(lines.T, left, right)
     )
     return reached / int((last - first).prod())
-
-
-def srgb_to_linear(value: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Display-referred sRGB to linear light, both in [0, 1] (IEC 61966-2-1)."""
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-
-
-def linear_to_srgb(value: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Linear light to display-referred sRGB, both in [0, 1] (IEC 61966-2-1)."""
-    return np.where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
 
 
 def _linear(color: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 # Least cosine between a billboard's normal and a view. More oblique views do not determine the extent of a billboard well.
 _OBLIQUE = math.cos(math.radians(60))

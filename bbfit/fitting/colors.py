@@ -12,7 +12,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, unpremultiply
 from bbfit.operators.config import Backend
 from bbfit.rendering.dispatch import render
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 # Most views to compare. Texels are clamped to [0, 1], and layers hide each other, so one round of factors is not exact.
 _VIEWS, _ROUNDS = 24, 3

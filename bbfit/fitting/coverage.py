@@ -12,7 +12,7 @@ from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.config import Backend
 from bbfit.rendering.dispatch import render
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 # Most views to compare, largest shift of alpha, iterations of the bisection, and Gauss-Newton steps.
 _VIEWS, _MAX_SHIFT, _BISECTIONS, _GAUSS_NEWTON_STEPS = 24, 0.3, 8, 2

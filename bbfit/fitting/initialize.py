@@ -13,7 +13,7 @@ from bbfit.fitting.bounds import facing_view_bounds, silhouette_bounds
 from bbfit.fitting.config import EVEN, FitConfig
 from bbfit.geometry.camera import Camera, convergence_point
 from bbfit.geometry.cloud import BillboardCloud, even_upright
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 # Distance between the rectangles of a pair, as a fraction of their half width: "a very small distance" (thesis, section 6.4).
 PAIR_GAP = 2e-3

@@ -14,7 +14,7 @@ from torch.nn.functional import grid_sample, interpolate
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, unpremultiply
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 LEAST_SIDE = 16
 """Least side of the pictures of a level, in pixels. Coarser levels are skipped."""

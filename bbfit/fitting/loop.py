@@ -37,7 +37,7 @@ from bbfit.inputs import reading
 from bbfit.provenance import cache_key
 from bbfit.scratch import named_in_utf8
 from bbfit.tree_files.tree_file import TreeFile
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 # Prefixes of the tensors of two clouds in a checkpoint.
 _START, _PLACEMENT = "start.", "found."

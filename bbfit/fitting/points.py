@@ -14,7 +14,7 @@ from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.fitting.visibility import pixels_of
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, convergence_point
 from bbfit.tree_files.tree_file import TreeFile
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 COUNT = 20_000
 """Default number of points."""

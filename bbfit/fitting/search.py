@@ -21,7 +21,7 @@ from bbfit.fitting.trunk import trunk_points
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.image_loss.reference import pixel_loss_reference
 from bbfit.rendering.dispatch import render
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 SIDE = 64
 """Approximate side of the pictures that the search renders, in pixels."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from bbfit.fitting.clusters import Planes
 from bbfit.fitting.config import TRUNK_PLANES
 from bbfit.geometry.camera import Camera
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 STEEPEST_DEGREES = 30.0
 """Largest angle between a camera's direction and the horizon for which the trunk below the crown is looked for."""

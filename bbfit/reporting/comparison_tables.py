@@ -19,7 +19,7 @@ from bbfit.files import write_bytes
 from bbfit.images import encode_png, over_color, premultiply, read_rgba, to_bytes
 from bbfit.reporting.plots import FAINT, INK, PAPER, picture_font, spread_views, write_figure
 from bbfit.reporting.sweep_tables import markdown
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 # Tiles of the picture: side in pixels, tiles per row, size of the text.
 _TILE, _COLUMNS, _TEXT = 340, 5, 13

@@ -26,7 +26,7 @@ from bbfit.model_files import generator
 from bbfit.reporting.charts import FEW, MEASURES, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
 from bbfit.reporting.plots import magma, spread_views
 from bbfit.reporting.threejs import drawing_script, library_page
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 # The most held-out views with pictures, besides the worst ones, and the largest width of a picture in pixels.
 _MAX_VIEWS, _MAX_WIDTH = 36, 512

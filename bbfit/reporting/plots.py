@@ -21,7 +21,7 @@ from bbfit.exporting.lod import LodLevel
 from bbfit.exporting.model import ShippedModel
 from bbfit.files import write_bytes
 from bbfit.images import encode_png, over_color, to_bytes
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -27,7 +27,7 @@ from bbfit.rivals.mesh_charts import unfold
 from bbfit.rivals.mesh_hull import hull_surface
 from bbfit.rivals.mesh_rays import RayCaster, pixel_rays
 from bbfit.rivals.mesh_silhouettes import Surface, boundary_gradient
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 DRAW_GRID = 4
 """Samples along a pixel's side when a mesh is drawn: 16 a pixel, at the centers of a regular grid's cells."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bbfit.checks import fail
 from bbfit.geometry.camera import Camera, convergence_point
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 COARSE, FINE = 40, 64
 """Cells along the longest side of the grids that find the tree and carve its surface."""

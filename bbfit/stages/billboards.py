@@ -21,7 +21,7 @@ from bbfit.inputs import reading
 from bbfit.reporting.plots import Cost, loss_plot, pareto_plot
 from bbfit.stages.stage import OnProgress, Stage
 from bbfit.tree_files.tree_file import TreeFile
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 BUDGET_OUTPUTS = ("pareto.json", "pareto.png")
 FIT_OUTPUTS = ("cloud.safetensors", "loss.csv", "loss.png")

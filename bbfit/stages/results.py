@@ -20,7 +20,7 @@ from bbfit.reporting.html import RunFacts, report_page
 from bbfit.reporting.plots import comparison_picture
 from bbfit.stages.stage import OnProgress, Stage
 from bbfit.tree_files.tree_file import TreeFile
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 EVALUATE_OUTPUTS = ("metrics.json", "comparison.png")
 REPORT_OUTPUTS = ("report.html",)

@@ -32,7 +32,7 @@ from bbfit.sweep.results import Results
 from bbfit.sweep.tasks import Outcome, Task, Workers, fit_tree, prepare_tree
 from bbfit.tree_files.tree_file import MESH_SUFFIXES, TreeFile
 from bbfit.trees.species import load_species
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 TABLES = ("table.csv", "table.md", "table.png")
 """The files that compare the runs of a sweep."""

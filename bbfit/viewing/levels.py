@@ -10,7 +10,7 @@ from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import LodConfig
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 # Textures are halved for far trees while their shortest side has this many texels, and at most so often.
 _MIN_SIDE, _MAX_HALVINGS = 24, 4

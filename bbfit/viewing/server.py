@@ -28,7 +28,7 @@ from bbfit.viewing.levels import ViewerLevel, field_levels, largest_scale
 from bbfit.viewing.models import ModelCache, ModelOptions
 from bbfit.viewing.originals import MAX_BYTES
 from bbfit.viewing.viewed import ViewedTree, open_results
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 # Connections that are open at a time, and seconds for which one may wait for the other side.
 _MAX_CONNECTIONS, _TIMEOUT = 64, 10

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "data"

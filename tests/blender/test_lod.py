@@ -25,7 +25,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.glb import split_glb
 from bbfit.lod import LodLevel, LodResult, build_lod
 from bbfit.pipeline import RunConfig
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 TREE = Path(__file__).resolve().parents[2] / "data" / "tree.glb"
 SMALL = RunConfig(views=ViewsConfig(count=12, size=64, samples=4), fit=FitConfig(steps=20, candidates=1, refinement_rounds=0, restarts=1))

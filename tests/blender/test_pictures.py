@@ -15,7 +15,7 @@ from bbfit.blender.views_folder import render_views
 from bbfit.files import read_json
 from bbfit.images import read_rgba
 from bbfit.tree_files.tree_file import UP_AXES
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 from .conftest import FORMATS, SMALL, box, run_in_blender, thing
 

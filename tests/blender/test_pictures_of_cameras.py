@@ -16,7 +16,7 @@ from bbfit.checks import InputError
 from bbfit.files import read_json, write_json
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinhole_intrinsics
 from bbfit.images import read_rgba
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 from .conftest import SMALL, box
 

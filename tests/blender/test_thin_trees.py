@@ -21,7 +21,7 @@ from bbfit.lod import build_lod
 from bbfit.pipeline import RunConfig, run
 from bbfit.trees.growth import grow
 from bbfit.trees.tree_writer import write_tree
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 TREE = Path(__file__).resolve().parents[2] / "data" / "tree.glb"
 FAST = {"count": 8, "size": 32, "samples": 4, "denoise": False, "turned": 0}

@@ -18,7 +18,7 @@ from bbfit.evaluation.scoring import view_angles
 from bbfit.evaluation.shimmer import score_shimmer
 from bbfit.images import read_rgba
 from bbfit.layout import TURNED_FILE
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 from .conftest import SMALL
 

@@ -14,7 +14,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import FitResult, fit
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 EXPORT = ExportConfig(outline="rectangle")
 

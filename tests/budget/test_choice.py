@@ -29,7 +29,7 @@ from bbfit.fitting.search import QUICK as QUICK_SEARCH
 from bbfit.fitting.search import find_placement
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.tree_files.tree_file import TreeFile
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 LUCK = 0.15
 """What two short fits may differ by for no reason, in dB."""

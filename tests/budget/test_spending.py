@@ -12,7 +12,7 @@ from bbfit.budget.spending import has_all_texels, spent, texel_gain, texels_with
 from bbfit.budget.trials import Trial, Trials
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 
 def trial(count: int, texels: int, pictures: int, bare: int = 0, psnr: float = 20.0, most: int | None = None, two: bool = False) -> Trial:

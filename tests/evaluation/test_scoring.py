@@ -25,7 +25,7 @@ from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.geometry.orbit import Orbit
 from bbfit.images import over_color
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 
 @pytest.fixture(scope="module")

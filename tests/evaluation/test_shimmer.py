@@ -25,7 +25,8 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.orbit import Orbit
 from bbfit.images import over_color, unpremultiply
 from bbfit.rendering.dispatch import render
-from bbfit.views import TurnedViews, ViewSet
+from bbfit.views.dataset import TurnedViews
+from bbfit.views.view_set import ViewSet
 
 AXIS = torch.tensor([0.0, 1.5, 0.0], dtype=torch.float64)
 

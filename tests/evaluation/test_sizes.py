@@ -18,7 +18,8 @@ from bbfit.evaluation.sizes import score_sizes, shrunk
 from bbfit.geometry.camera import Camera
 from bbfit.images import over_color
 from bbfit.rendering.dispatch import render
-from bbfit.views import ViewDataset, ViewSet
+from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,9 @@ from torch.nn import functional
 
 from bbfit.checks import InputError
 from bbfit.exporting.atlas import pack_atlas
-from bbfit.exporting.mips import coverage, linear_to_srgb, mip_chain, plain_chain, srgb_to_linear
+from bbfit.exporting.mips import coverage, mip_chain, plain_chain
 from bbfit.geometry.cards import Atlas
+from bbfit.images import linear_to_srgb, srgb_to_linear
 
 WHOLE = np.array([[0.0, 0.0], [1.0, 1.0]])
 

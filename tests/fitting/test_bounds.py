@@ -16,7 +16,8 @@ from bbfit.geometry.camera import Camera, convergence_point
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.homography import texel_to_pixel
 from bbfit.operators.drawing.reference import render_reference
-from bbfit.views import ViewDataset, ViewSet
+from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply
 from bbfit.rendering.dispatch import render
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 
 def speckled(alpha: AlphaMode) -> BillboardCloud:

@@ -16,7 +16,7 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.rendering.dispatch import render
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 COUNT = 3
 

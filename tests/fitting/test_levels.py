@@ -17,7 +17,8 @@ from bbfit.geometry.camera import Camera, pinhole_intrinsics
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.images import premultiply
 from bbfit.operators.drawing.reference import render_reference
-from bbfit.views import ViewDataset, ViewSet
+from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 
 
 def viewset(pictures: Tensor, cameras: Camera | None = None) -> ViewSet:

@@ -36,7 +36,8 @@ from bbfit.images import over_color
 from bbfit.operators.drawing.reference import render_reference
 from bbfit.stages.billboards import fit_stage
 from bbfit.stages.stage import Record
-from bbfit.views import ViewDataset, ViewSet
+from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 
 
 @pytest.fixture(scope="module")

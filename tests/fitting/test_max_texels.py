@@ -13,7 +13,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import bounded, sized, start_cloud
 from bbfit.fitting.loop import fit, resolution_levels
 from bbfit.geometry.cloud import TENSORS, BillboardCloud, even_upright
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 EVEN = [
     {"placement": "even", "bounds": bounds, "sides": sides}

@@ -17,7 +17,8 @@ from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.operators.drawing.reference import render_reference
 from bbfit.operators.image_loss.reference import pixel_loss_reference
 from bbfit.tree_files.tree_file import TreeFile
-from bbfit.views import ViewDataset, ViewSet
+from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 

@@ -22,7 +22,8 @@ from bbfit.fitting.visibility import pixels_of
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.orbit import Orbit
 from bbfit.tree_files.tree_file import TreeFile
-from bbfit.views import ViewDataset, ViewSet
+from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 
 PLY_OF_POINTS = """ply
 format ascii 1.0

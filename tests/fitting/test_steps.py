@@ -21,7 +21,8 @@ from bbfit.operators.drawing.fused import schedule
 from bbfit.operators.drawing.projection import project
 from bbfit.operators.drawing.reference import render_reference
 from bbfit.operators.image_loss.reference import image_loss_reference
-from bbfit.views import ViewDataset, ViewSet
+from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 
 pytestmark = pytest.mark.usefixtures("poison")
 STEPPERS = pytest.mark.parametrize("backend", ["reference", "fused"])

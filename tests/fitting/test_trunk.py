@@ -14,7 +14,7 @@ from bbfit.fitting.search import Effort, find_placement
 from bbfit.fitting.trunk import crossed_planes, is_level, trunk_parts, trunk_points, trunk_top
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.orbit import Orbit
-from bbfit.views import ViewSet
+from bbfit.views.view_set import ViewSet
 
 RADIUS, CROWN_AT = 0.3, 1.5
 SIZE = 64

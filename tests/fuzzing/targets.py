@@ -48,7 +48,7 @@ from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.species import figures_file, known_species, load_species
 from bbfit.viewing.viewed import open_results
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 from .hostile import changed_bytes, changed_words, documents, dumped, hostile
 

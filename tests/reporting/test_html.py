@@ -195,7 +195,7 @@ def test_pictures_are_the_views_and_the_renders(visit: Visit, result: RunResult)
         return page.evaluate("JSON.parse(document.getElementById('data').textContent).views.map(view => [view.name, ...view.pictures])")
 
     from bbfit.evaluation.scoring import held_out
-    from bbfit.views import ViewDataset
+    from bbfit.views.dataset import ViewDataset
 
     views = ViewDataset.load(Path(json.loads((result.folder / "run.json").read_text())["source"])).test
     for name, *uris in visit(act):

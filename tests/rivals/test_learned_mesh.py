@@ -28,7 +28,7 @@ from bbfit.rivals.mesh_charts import unfold
 from bbfit.rivals.mesh_hull import hull_surface
 from bbfit.rivals.mesh_rays import RayCaster, pixel_rays
 from bbfit.rivals.mesh_silhouettes import Surface, boundary_gradient
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 
 def quad(cloud: BillboardCloud) -> LearnedMesh:

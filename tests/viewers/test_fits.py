@@ -23,7 +23,7 @@ from bbfit.fitting.loop import fit
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
 from bbfit.rendering.cards import draw_cards
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 # What a viewer may differ by, in dB: from bbfit's own render, and in its score.
 LEAST, SCORE = 33.0, 0.3

@@ -12,7 +12,7 @@ from bbfit.evaluation.silhouettes import worst_silhouette
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.viewing.levels import ViewerLevel, field_levels, largest_scale
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 
 def test_a_cloud_takes_over_where_its_error_is_a_pixel(views_folder: Path, known_cloud: BillboardCloud) -> None:

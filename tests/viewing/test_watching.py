@@ -16,7 +16,7 @@ from bbfit.fitting.loop import Step, fit
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.viewing.server import Viewer
 from bbfit.viewing.watching import Watch, WatchedRun, preview
-from bbfit.views import ViewDataset
+from bbfit.views.dataset import ViewDataset
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 

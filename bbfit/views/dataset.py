@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -16,112 +15,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bbfit.blender.request import ViewsRequest
-from bbfit.checks import InputTypeError, MissingFileError, check_folder, check_shape, fail
+from bbfit.checks import MissingFileError, check_folder, fail
 from bbfit.geometry.camera import Camera
-from bbfit.images import picture_header, premultiply, read_rgba, to_bytes
+from bbfit.geometry.light import Light
+from bbfit.images import picture_header, read_rgba
 from bbfit.inputs import InputLimits
-from bbfit.layout import REQUEST_FILE, Frame, cameras_of, read_frames, read_turned, split_views
+from bbfit.layout import REQUEST_FILE, Frame, cameras_of, read_frames, read_lit, read_turned, split_views
+from bbfit.views.lit import LitViews
+from bbfit.views.view_set import ViewSet
 
 _LIMITS = InputLimits()
 CACHE_BYTES = 3 << 29
 """Most bytes of decoded pictures that a dataset keeps in memory; it drops the least recently used ones first."""
-
-
 LEAST_PIXELS = 11
 """Least width and height of a picture: that of the window of the structural similarity."""
-
-
-@dataclass(frozen=True)
-class ViewSet:
-    """V pictures of one size with their cameras."""
-
-    paths: tuple[Path, ...]
-    """The pictures' files, V of them; for pictures from arrays, names without a file."""
-    cameras: Camera
-    """V cameras, float64."""
-    read: Callable[[Path], Tensor] = field(repr=False, compare=False)
-    """Returns the picture of a path, uint8 [H, W, 4], straight alpha; it may be called from several threads."""
-
-    @staticmethod
-    def from_arrays(images: NDArray[Any] | Tensor, cameras: Camera) -> ViewSet:
-        """Views from straight-alpha RGBA pictures, [V, H, W, 4], with V cameras, which are named 0000, 0001 and so on.
-
-        Pictures are uint8, or floats in [0, 1], which are rounded to 8 bits. Other shapes, types and values raise ``InputError``.
-        """
-        pictures = torch.as_tensor(images).detach().cpu()
-        cameras = cameras.batch().to(torch.float64).to("cpu")
-        check_shape("images", tuple(pictures.shape), (len(cameras), cameras.height, cameras.width, 4))
-        if pictures.is_floating_point():
-            if not bool(((pictures >= 0) & (pictures <= 1)).all()):
-                fail("images", "floats are not all in [0, 1]", "divide 8-bit values by 255, or give uint8")
-            pictures = torch.from_numpy(to_bytes(pictures))
-        if pictures.dtype != torch.uint8:
-            raise InputTypeError(f"images: expected uint8 or floats, got {pictures.dtype}")
-        paths = [Path(f"{index:04}.png") for index in range(len(pictures))]
-        return ViewSet(tuple(paths), cameras, dict(zip(paths, pictures, strict=True)).__getitem__)
-
-    def __len__(self) -> int:
-        return len(self.paths)
-
-    @property
-    def names(self) -> list[str]:
-        """File names without folder and ending."""
-        return [path.stem for path in self.paths]
-
-    def take(self, indices: Sequence[int]) -> ViewSet:
-        """Some of the views, which share the pictures in memory."""
-        return ViewSet(tuple(self.paths[index] for index in indices), self.cameras[list(indices)], self.read)
-
-    def image(self, index: int) -> Tensor:
-        """One picture, uint8 [H, W, 4], straight alpha. Do not write to it: it may be cached.
-
-        Raises ``MissingFileError`` or ``InputError`` if the file is missing, damaged, without alpha or not of the others' size, or fully
-        transparent in views from elsewhere.
-        """
-        path = self.paths[index]
-        picture = self.read(path)
-        expected = (self.cameras.height, self.cameras.width)
-        if tuple(picture.shape[:2]) != expected:
-            fail("views", f"{path} is {picture.shape[1]}x{picture.shape[0]}, others {expected[1]}x{expected[0]}", "make them equal")
-        return picture
-
-    def images(self, indices: Sequence[int]) -> Tensor:
-        """Several pictures, uint8 [B, H, W, 4], straight alpha."""
-        return torch.stack([self.image(i) for i in indices])
-
-    def targets(self, indices: Sequence[int], dtype: torch.dtype = torch.float32) -> Tensor:
-        """Several pictures as the renderer would draw them: premultiplied RGBA in [0, 1], [B, H, W, 4]."""
-        return premultiply(self.images(indices).to(dtype) / 255)
-
-    @property
-    def fingerprint(self) -> str:
-        """SHA-256 over the cameras and the pictures' pixels: equal for equal views, wherever they lie and however they were packed."""
-        digest = sha256(repr((self.cameras.width, self.cameras.height, self.cameras.orthographic)).encode())
-        digest.update(self.cameras.world_to_camera.numpy().tobytes() + self.cameras.intrinsics.numpy().tobytes())
-        pictures = dict[Path, bytes]()  # several views may show one picture
-        for index, path in enumerate(self.paths):
-            if path not in pictures:
-                pictures[path] = sha256(self.image(index).numpy().tobytes()).digest()
-            digest.update(pictures[path])
-        return digest.hexdigest()
-
-    def shows(self, index: int) -> bool:
-        """Whether a picture has a pixel that is not fully transparent. Raises the errors of :meth:`image`."""
-        return bool(self.image(index)[..., 3].any())
-
-    def check(self, *, may_be_empty: bool = False) -> None:
-        """Decode every picture once, so that a bad one is reported before long work begins.
-
-        Raises the errors of :meth:`image`, and ``InputError`` if all pictures are fully transparent, unless they may be.
-        """
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # each thread keeps memory of its own
-            shown = list(pool.map(self.shows, {path: index for index, path in enumerate(self.paths)}.values()))
-        if not any(shown) and not may_be_empty:
-            fail(
-                "views",
-                f"none of {len(self)} training pictures shows anything of the tree",
-                "it is thinner than their pixels or its materials are transparent; give a larger --size or more --samples, or mend them",
-            )
 
 
 @dataclass(frozen=True)
@@ -152,6 +59,10 @@ class ViewDataset:
     turned: TurnedViews | None = None
     """Some of the held-out views with a second picture of each (``ViewsConfig.turned``), for the score of shimmer; ``None`` for views
     without."""
+    lit_train: LitViews | None = None
+    """The training cameras under one light at a time (``ViewsConfig.suns``); ``None`` for views without."""
+    lit_test: LitViews | None = None
+    """The held-out cameras under lights that no training camera saw."""
 
     @staticmethod
     def load(folder: str | Path, *, seed: int = 0, cache_bytes: int = CACHE_BYTES, limits: InputLimits = _LIMITS) -> ViewDataset:
@@ -183,8 +94,10 @@ class ViewDataset:
             train, test = [train[i] for i in train_indices], [train[i] for i in test_indices]
         if not train or not test:
             fail("views", f"{folder} has {len(train)} training and {len(test or [])} test views", "at least one of each is needed")
-        pairs = read_turned(folder, test, limits)
-        width, height = _common_size([*train, *test, *(frame for _, frame in pairs)], limits)
+        pairs, lit = read_turned(folder, test, limits), read_lit(folder, limits)
+        lit_frames = [frame for frames in lit or () for frame in frames]
+        pictures = [frame.image for frame in [*train, *test, *(frame for _, frame in pairs), *lit_frames]]
+        width, height = _common_size([*pictures, *(path for frame in lit_frames for path in frame.passes.values())], limits)
         _check_size("views", f"pictures in {folder}", width, height)
 
         request = ViewsRequest.load(folder / REQUEST_FILE) if (folder / REQUEST_FILE).is_file() else None
@@ -198,10 +111,15 @@ class ViewDataset:
             return picture
 
         def view_set(frames: list[Frame]) -> ViewSet:
-            return ViewSet(tuple(frame.image for frame in frames), cameras_of(frames, width, height), read)
+            lights = [frame.light for frame in frames if frame.light is not None]
+            light = Light.joined(lights) if len(lights) == len(frames) else None
+            return ViewSet(tuple(frame.image for frame in frames), cameras_of(frames, width, height), read, light)
+
+        def lit_views(frames: list[Frame]) -> LitViews:
+            return _lit_views(frames, folder, view_set)
 
         turned = TurnedViews(view_set([test[index] for index, _ in pairs]), view_set([frame for _, frame in pairs])) if pairs else None
-        return ViewDataset(folder, view_set(train), view_set(test), request, turned)
+        return ViewDataset(folder, view_set(train), view_set(test), request, turned, *(map(lit_views, lit) if lit else ()))
 
     @staticmethod
     def from_arrays(images: NDArray[Any] | Tensor, cameras: Camera, *, test: Sequence[int] | None = None, seed: int = 0) -> ViewDataset:
@@ -260,10 +178,32 @@ def _check_size(name: str, pictures: str, width: int, height: int) -> None:
         fail(name, f"{pictures} have {width}x{height} pixels", f"give at least {LEAST_PIXELS}x{LEAST_PIXELS}")
 
 
-def _common_size(frames: list[Frame], limits: InputLimits) -> tuple[int, int]:
+def _lit_views(frames: list[Frame], folder: Path, view_set: Callable[[list[Frame]], ViewSet]) -> LitViews:
+    """Match the pictures under single suns with those of the same cameras under the sky."""
+    skies = [frame for frame in frames if frame.light is not None and float(frame.light.ambients) > 0]
+    suns = [frame for frame in frames if frame not in skies]
+    places = {_camera_key(frame): place for place, frame in enumerate(skies)}
+    for frame in suns:
+        if _camera_key(frame) not in places:
+            fail("views", f"{frame.image} has no picture of the same camera under the sky", "add one, or take it out of the file")
+    if not suns:
+        fail("views", f"{folder} has a transforms_lights file without a picture under a sun", "render the views anew")
+    passes = []
+    for name in ("albedo", "normal"):
+        paths = [frame.passes.get(name) for frame in skies]
+        known = [replace(frame, image=path) for frame, path in zip(skies, paths, strict=True) if path is not None]
+        passes.append(view_set(known) if len(known) == len(skies) else None)
+    return LitViews(view_set(skies), view_set(suns), tuple(places[_camera_key(frame)] for frame in suns), *passes)
+
+
+def _camera_key(frame: Frame) -> str:
+    return repr((frame.camera_to_world, {name: value for name, value in frame.header.items() if name not in ("file_path", "turned_from")}))
+
+
+def _common_size(paths: list[Path], limits: InputLimits) -> tuple[int, int]:
     """Width and height that all pictures share; only headers are read."""
     first: tuple[Path, tuple[int, int]] | None = None
-    for path in dict.fromkeys(frame.image for frame in frames):
+    for path in dict.fromkeys(paths):
         if not path.is_file():
             raise MissingFileError(f"views: {path} does not exist; render the views anew or take it out of the transforms file")
         header = picture_header("views", path, limits)

@@ -1,0 +1,1 @@
+"""Views of a tree: pictures, cameras, lights, and their split."""

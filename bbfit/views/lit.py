@@ -1,0 +1,89 @@
+"""Views under any sun and sky, from pictures under one light at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bbfit.checks import check_range
+from bbfit.geometry.light import Light
+from bbfit.images import sum_of_lights
+from bbfit.views.view_set import ViewSet
+
+
+@dataclass(frozen=True)
+class LitViews:
+    """V cameras that see the tree under an even sky, and E pictures in which one of them sees it under a single sun.
+
+    Light adds up, in linear light, so a weighted sum of two of them is the picture under both (Debevec et al. 2000, "Acquiring the
+    Reflectance Field of a Human Face", section 3.3). The pictures have 8 bits; the sums are rounded to 8 bits again.
+    """
+
+    skies: ViewSet
+    """V pictures under the sky alone."""
+    suns: ViewSet
+    """E pictures under one sun alone; their ``light`` is that of the pictures."""
+    cameras: tuple[int, ...]
+    """Index of the sky's picture with the camera of each sun's picture, E of them."""
+    albedo: ViewSet | None = None
+    """V pictures of the diffuse color of the surfaces, if there are any."""
+    normal: ViewSet | None = None
+    """V pictures of the normals of the surfaces, as (normal + 1) / 2 in a Z-up world, if there are any."""
+
+    def __len__(self) -> int:
+        return len(self.suns)
+
+    @property
+    def directions(self) -> Tensor:
+        """Unit vectors towards the sun of each picture, Y up, float64 [E, 3]."""
+        assert self.suns.light is not None
+        return self.suns.light.sun_directions
+
+    def under(self, sun_strength: float, ambient: float) -> ViewSet:
+        """The E views under their sun and the sky, of strengths as in :class:`~bbfit.geometry.light.Light`, each at least 0."""
+        check_range("sun_strength", sun_strength, 0, 1e6)
+        check_range("ambient", ambient, 0, 1e6)
+        of_sun, of_sky = self.suns.light, self.skies.light
+        assert of_sun is not None and of_sky is not None
+        parts = {
+            self.suns.paths[index]: (
+                self.skies.paths[camera],
+                ambient / float(of_sky.ambients[camera]),
+                sun_strength / float(of_sun.sun_strengths[index]),
+            )
+            for index, camera in enumerate(self.cameras)
+        }
+
+        def read(path: Path) -> Tensor:
+            sky, sky_factor, sun_factor = parts[path]
+            pictures = [self.skies.read(sky).numpy(), self.suns.read(path).numpy()]
+            return torch.from_numpy(sum_of_lights(pictures, [sky_factor, sun_factor]))
+
+        colors, ones = of_sun.sun_colors, torch.ones(len(self), dtype=torch.float64)
+        light = Light(of_sun.sun_directions, sun_strength * ones, colors, ambient * ones)
+        return ViewSet(self.suns.paths, self.suns.cameras, read, light)
+
+    def take(self, chosen: Sequence[int]) -> LitViews:
+        """The part of some of the V cameras."""
+        places = {camera: place for place, camera in enumerate(chosen)}
+        kept = [index for index, camera in enumerate(self.cameras) if camera in places]
+        passes = [views and views.take(chosen) for views in (self.albedo, self.normal)]
+        return LitViews(self.skies.take(chosen), self.suns.take(kept), tuple(places[self.cameras[index]] for index in kept), *passes)
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over all pictures, cameras and lights."""
+        parts = [self.skies, self.suns, *(views for views in (self.albedo, self.normal) if views is not None)]
+        digest = sha256(repr((self.cameras, [len(part) for part in parts])).encode())
+        for part in parts:
+            digest.update(part.fingerprint.encode())
+        for light in (self.skies.light, self.suns.light):
+            assert light is not None
+            for value in vars(light).values():
+                digest.update(value.numpy().tobytes())
+        return digest.hexdigest()
