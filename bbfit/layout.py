@@ -116,8 +116,8 @@ class LitPaths:
     """The normals of the surfaces, as (normal + 1) / 2, in the axes of the file."""
 
 
-def write_lit(folder: Path, camera: Camera, lit: Sequence[LitPaths], train: Sequence[int], test: Sequence[int]) -> None:
-    """Write :data:`LIT_TRAIN_FILE` and :data:`LIT_TEST_FILE` for the views of :func:`write_transforms`."""
+def write_lit(folder: Path, camera: Camera, lit: Mapping[int, LitPaths], train: Sequence[int], test: Sequence[int]) -> None:
+    """Write :data:`LIT_TRAIN_FILE` and :data:`LIT_TEST_FILE` for some views of a batch of cameras: the keys of ``lit``, which are split."""
     header, sky = _camera_header(camera), Light.of(torch.tensor([[0.0, 1.0, 0.0]]), 0.0, 1.0)
     for name, indices in ((LIT_TRAIN_FILE, train), (LIT_TEST_FILE, test)):
         frames = list[dict[str, Any]]()

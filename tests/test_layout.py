@@ -13,8 +13,9 @@ import torch
 
 from bbfit.checks import InputError, MissingFileError
 from bbfit.geometry.camera import Camera, camera_from_nerf
+from bbfit.geometry.light import Light
 from bbfit.geometry.orbit import Orbit
-from bbfit.layout import cameras_of, read_frames, split_rings, split_views, write_transforms
+from bbfit.layout import LitPaths, cameras_of, read_frames, read_lit, split_rings, split_views, write_lit, write_transforms
 
 POSE = [[1.0, 0, 0, 0], [0, 0, -1, -22], [0, 1, 0, 5], [0, 0, 0, 1]]
 
@@ -186,3 +187,70 @@ def test_shared_views(shared: Path) -> None:
         assert all(frame.image.is_file() for frame in train + test)
         camera = cameras_of(train, 512, 512)
         assert camera.intrinsics[0, 0, 0].item() == pytest.approx(256 / math.tan(math.radians(20)))
+
+
+def lit_paths(index: int, directions: torch.Tensor) -> LitPaths:
+    suns = [f"images/{index}_sun{number}.png" for number in range(len(directions))]
+    return LitPaths(f"images/{index}_ambient.png", suns, directions, f"images/{index}_albedo.png", f"images/{index}_normal.png")
+
+
+def test_lights_round_trip(tmp_path: Path) -> None:
+    """Directions are in the file's Z-up axes, the sky and each sun have frames of their own, and passes belong to the sky."""
+    camera, directions = orbit(40.0), torch.tensor([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]]).double()
+    write_lit(tmp_path, camera, {index: lit_paths(index, directions) for index in (0, 2, 5)}, [0, 2], [5])
+    first = json.loads((tmp_path / "transforms_lights_train.json").read_text())["frames"]
+    assert first[0]["light"] == {"sun_strength": 0.0, "ambient": 1.0} and first[0]["albedo_path"] == "./images/0_albedo"
+    assert first[1]["light"] == pytest.approx(
+        {"sun_direction": [0.0, -0.8, 0.6], "sun_strength": math.pi, "sun_color": [1.0, 1.0, 1.0], "ambient": 0.0}
+    )
+    read = read_lit(tmp_path)
+    assert read is not None and [len(frames) for frames in read] == [6, 3]
+    assert read[0][3].passes == {"albedo": tmp_path / "images/2_albedo.png", "normal": tmp_path / "images/2_normal.png"}
+    for frame, sun in zip(read[0][4:], directions, strict=True):
+        assert frame.light is not None and not frame.passes
+        torch.testing.assert_close(frame.light.sun_directions[0], sun)
+    torch.testing.assert_close(cameras_of(read[1], 30, 20).world_to_camera, camera.world_to_camera[[5, 5, 5]])
+
+
+def test_light_of_all_pictures_is_in_every_frame(tmp_path: Path) -> None:
+    write_transforms(
+        tmp_path, orbit(40.0), [f"images/{i}.png" for i in range(6)], [0, 1, 2], [3, 4, 5], Light.of(torch.eye(3)[:1], 2.5, 1.0)
+    )
+    for frames in read_frames(tmp_path):
+        assert frames is not None
+        assert [(frame.light and frame.light.sun_directions.tolist()) for frame in frames] == [[[1.0, 0.0, 0.0]]] * 3
+
+
+@pytest.mark.parametrize(
+    "light",
+    [
+        5,
+        {"sun_strength": 1.0, "ambient": 0.0},
+        {"sun_direction": [0, 0], "sun_strength": 1.0},
+        {"sun_direction": [0, 0, 0], "sun_strength": 1.0},
+        {"sun_direction": [0, 0, 1e300], "sun_strength": 1.0},
+        {"sun_direction": [0, 0, 1], "sun_strength": -1.0},
+        {"sun_direction": [0, 0, 1], "sun_strength": math.nan},
+        {"sun_direction": [0, 0, 1], "sun_strength": "1e"},
+        {"sun_direction": [0, 0, 1], "sun_strength": 1.0, "sun_color": [1, 1]},
+        {"sun_direction": [0, 0, 1], "sun_strength": 1.0, "sun_color": [1, 1, -1]},
+    ],
+)
+def test_light_that_is_none_is_refused(tmp_path: Path, light: Any) -> None:
+    write(tmp_path, frames=[{"file_path": "r_0", "transform_matrix": POSE, "light": light}])
+    with pytest.raises(InputError, match=r"frame 0 of .* has no usable light; give a direction, strengths and a color"):
+        read_frames(tmp_path)
+
+
+def test_lit_frames_have_one_light_each(tmp_path: Path) -> None:
+    """A frame without a light, with a sun and a sky, or with neither is refused, and so is one file without the other."""
+    frame = {"file_path": "r_0", "transform_matrix": POSE}
+    sun = {"sun_direction": [0, 0, 1], "sun_strength": 1.0}
+    for light in ({}, {"light": sun | {"ambient": 1.0}}, {"light": {"ambient": 0.0}}):
+        for name in ("train", "test"):
+            write(tmp_path, name=f"transforms_lights_{name}.json", frames=[frame | light])
+        with pytest.raises(InputError, match=r"frame 0 of .*transforms_lights_train.json has not exactly one light"):
+            read_lit(tmp_path)
+    (tmp_path / "transforms_lights_test.json").unlink()
+    with pytest.raises(MissingFileError, match=r"transforms_lights_test.json does not exist"):
+        read_lit(tmp_path)

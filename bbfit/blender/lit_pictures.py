@@ -13,8 +13,8 @@ from torch import Tensor
 from bbfit.blender.config import ViewsConfig
 from bbfit.geometry.light import direction, sky
 
-HELD_OUT_SUNS = 4
-"""Number of suns under which every held-out camera sees the tree; no training camera does."""
+HELD_OUT_SUNS, HELD_OUT_CAMERAS = 4, 8
+"""Number of suns that no training camera sees the tree under, and of held-out cameras that see it under each of them."""
 # The held-out suns are turned against the others.
 _TURN = 100.0
 
@@ -57,34 +57,47 @@ class LitPictures:
         """All pictures but the view's own."""
         return [self.ambient, *self.of_suns, self.albedo, self.normal]
 
-    def request(self, *, only_light: bool = False) -> dict[str, Any]:
-        """What the worker needs to render them; ``only_light``: the view's own picture in the same light, and no other."""
-        paths = [None] * len(self.paths) if only_light else [str(path.resolve()) for path in self.paths]
-        suns = [[x, -z, y] for x, y, z in self.suns]
-        return {"suns": suns, "ambient": paths[0], "of_suns": paths[1:-2], "albedo": paths[-2], "normal": paths[-1]}
+    def request(self, *, alone: bool = False) -> dict[str, Any]:
+        """What the worker needs to render them; ``alone``: the view's own picture only, with the same noise."""
+        if alone:
+            return light_request(self.suns)
+        ambient, *of_suns, albedo, normal = (str(path.resolve()) for path in self.paths)
+        return light_request(self.suns) | {"ambient": ambient, "of_suns": of_suns, "albedo": albedo, "normal": normal}
 
     def _beside(self, kind: str) -> Path:
         return self.picture.with_stem(f"{self.picture.stem}_{kind}")
 
 
-def lit_pictures(config: ViewsConfig, pictures: Sequence[Path], test: Sequence[int]) -> list[LitPictures]:
-    """The lit pictures of each view, or nothing if there are none.
+def light_request(suns: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
+    """The worker's request for a view's own picture, from the sky and the first of some suns."""
+    return {"suns": [[x, -z, y] for x, y, z in suns], "ambient": None, "of_suns": [], "albedo": None, "normal": None}  # Z up
 
-    Training cameras share suns that are spread over the whole sky, ``config.suns`` for each, in random order. Held-out cameras have
-    :data:`HELD_OUT_SUNS` others, the same for all.
+
+def own_suns(config: ViewsConfig) -> list[tuple[float, float, float]]:
+    """The sun of the views' own pictures, if there is one."""
+    return [_rounded(direction(config.sun_azimuth, config.sun_elevation))] if config.sun_strength else []
+
+
+def lit_pictures(config: ViewsConfig, pictures: Sequence[Path], train: Sequence[int], test: Sequence[int]) -> dict[int, LitPictures]:
+    """The lit pictures by the indices of their views; nothing if there are none.
+
+    Training cameras share suns that are spread over the whole sky, ``config.suns`` for each, in random order. Some held-out cameras, spread
+    evenly, have :data:`HELD_OUT_SUNS` others, the same for all of them.
     """
     if not config.suns:
-        return []
-    held_out, count = set(test), (len(pictures) - len(test)) * config.suns
-    order = np.random.default_rng(config.seed).permutation(count)
-    own = [_rounded(direction(config.sun_azimuth, config.sun_elevation))] if config.sun_strength else []
-    training = [_rounded(sun) for sun in sky(count)[order]]
+        return {}
+    directions = sky(len(train) * config.suns)[np.random.default_rng(config.seed).permutation(len(train) * config.suns)]
+    seen = [_rounded(sun) for sun in directions]
     unseen = [_rounded(sun) for sun in sky(HELD_OUT_SUNS, _TURN)]
-    result = []
-    for index, picture in enumerate(pictures):
-        suns = unseen if index in held_out else [training.pop() for _ in range(config.suns)]
-        result.append(LitPictures((*own, *suns), picture))
-    return result
+    suns = {index: seen[place * config.suns :][: config.suns] for place, index in enumerate(train)}
+    suns |= dict.fromkeys(spread(test, HELD_OUT_CAMERAS), unseen)
+    return {index: LitPictures((*own_suns(config), *suns[index]), pictures[index]) for index in sorted(suns)}
+
+
+def spread(indices: Sequence[int], count: int) -> list[int]:
+    """At most ``count`` of the indices, evenly spread over them."""
+    count = min(count, len(indices))
+    return [indices[(2 * number + 1) * len(indices) // (2 * count)] for number in range(count)]
 
 
 def _rounded(vector: Tensor) -> tuple[float, float, float]:

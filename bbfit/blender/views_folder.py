@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.lit_pictures import LitPictures, lit_pictures
+from bbfit.blender.lit_pictures import LitPictures, light_request, lit_pictures, own_suns, spread
 from bbfit.blender.pictures import FILTER_REACH, clip_distances, frames, is_intact, to_y_up, vertical_axis, worker_settings
 from bbfit.blender.processes import BlenderError, BlenderPool, require_bpy
 from bbfit.blender.request import ViewsRequest
@@ -98,10 +99,10 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
     images = out / "images"
     paths = [images / f"{index:04}.png" for index in range(config.count)]
     train, test = split_rings(config.orbit.ring_counts, config.seed)
-    turned = _spread(test, config.turned)
+    turned = spread(test, config.turned)
     turned_paths = [path.with_stem(f"turned_{path.stem}") for path in paths]
-    lit = lit_pictures(config, paths, test)
-    of_view = [[path, *(lit[index].paths if lit else ())] for index, path in enumerate(paths)]
+    lit = lit_pictures(config, paths, train, test)
+    of_view = [[path, *(lit[index].paths if index in lit else ())] for index, path in enumerate(paths)]
     missing = [index for index, files in enumerate(of_view) if not all(is_intact(path, config.size) for path in files)]
     missing_turned = [index for index in turned if not is_intact(turned_paths[index], config.size)]
     transforms = [TRAIN_FILE, TEST_FILE, *([TURNED_FILE] if turned else []), *([LIT_TRAIN_FILE, LIT_TEST_FILE] if lit else [])]
@@ -112,7 +113,7 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
 
     started, spent = time.monotonic(), earlier.seconds if earlier else 0.0
     require_bpy()
-    suns = max((len(each.suns) for each in lit), default=0)
+    suns = max((len(each.suns) for each in lit.values()), default=0)
     with BlenderPool(worker_settings(tree, config, config.size, left, suns=suns)) as pool:
         measured = pool.load()
         points = to_y_up(measured["payload"])
@@ -146,18 +147,25 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
         neighbors = camera.turned(_TURN, target)
         own = frames(camera, paths, missing, clips, config.seed)
         second = frames(neighbors, turned_paths, missing_turned, clips, config.seed)
-        if lit:  # a view and its second picture have the same lights, and so the same noise
-            own = [frame | {"lights": lit[frame["frame"]].request()} for frame in own]
-            second = [frame | {"lights": lit[frame["frame"]].request(only_light=True)} for frame in second]
+        if lit:
+            own = [frame | {"lights": _light(frame, lit, config, alone=False)} for frame in own]
+            second = [frame | {"lights": _light(frame, lit, config, alone=True)} for frame in second]
         pool.render(own + second, config.render_workers, finished, on_done)
     names, turned_names = ([f"images/{path.name}" for path in each] for each in (paths, turned_paths))
     if turned:
         write_turned(out, neighbors[turned], [turned_names[index] for index in turned], [names[index] for index in turned])
     if lit:
-        write_lit(out, camera, [_relative(each, out) for each in lit], train, test)
+        paths_of = {index: _relative(each, out) for index, each in lit.items()}
+        write_lit(out, camera, paths_of, train, [index for index in test if index in lit])
     write_transforms(out, camera, names, train, test, _baked_light(config))
     save(complete=True)
     written.finish("views", written.digests([REQUEST_FILE, *transforms, "images/*.png"]))
+
+
+def _light(frame: dict[str, Any], lit: dict[int, LitPictures], config: ViewsConfig, *, alone: bool) -> dict[str, Any]:
+    """The lights of a frame. A view and its second picture have the same, and so the same noise."""
+    each = lit.get(frame["frame"])
+    return light_request(own_suns(config)) if each is None else each.request(alone=alone)
 
 
 def _relative(lit: LitPictures, out: Path) -> LitPaths:
@@ -169,12 +177,6 @@ def _baked_light(config: ViewsConfig) -> Light | None:
     """The light of the views' own pictures; a panorama is none."""
     sun = direction(config.sun_azimuth, config.sun_elevation)
     return None if config.hdri is not None else Light.of(sun[None], config.sun_strength, config.ambient_strength)
-
-
-def _spread(indices: Sequence[int], count: int) -> list[int]:
-    """At most ``count`` of the indices, evenly spread over them."""
-    count = min(count, len(indices))
-    return [indices[(2 * number + 1) * len(indices) // (2 * count)] for number in range(count)]
 
 
 def _earlier(out: Path, request: ViewsRequest) -> ViewsRequest | None:

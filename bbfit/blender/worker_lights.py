@@ -48,13 +48,14 @@ def aim(lights: dict[str, Any], path: Path, settings: dict[str, Any]) -> dict[st
             sun.rotation_euler = Vector(lights["suns"][number]).to_track_quat("Z", "Y").to_euler()
     graph = _Graph(path, settings["denoise"])
     ambient = graph.light(_AMBIENT)
-    suns = [graph.light(f"sun{number}") for number in range(len(lights["suns"]))]
+    has_sun = settings["sun_strength"] > 0
+    suns = [graph.light(f"sun{number}") for number in range(max(int(has_sun), len(lights["of_suns"])))]
     own = graph.scaled(ambient, settings["ambient_strength"])
-    if settings["sun_strength"] > 0:
+    if has_sun:
         own = graph.sum(own, graph.scaled(suns[0], settings["sun_strength"] / _UNIT_SUN))
     graph.picture(own)
     graph.file(ambient, lights["ambient"])
-    for sun, name in zip(suns, lights["of_suns"], strict=True):
+    for sun, name in zip(suns, lights["of_suns"], strict=False):
         graph.file(sun, name)
     graph.file(graph.render.outputs["DiffCol"], lights["albedo"])
     if lights["normal"]:

@@ -5,20 +5,24 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bbfit.checks import InputError, check_choice, check_count, check_file, check_shape, fail
 from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.light import Light
 from bbfit.inputs import LARGEST, reading
 from bbfit.scratch import named_in_utf8
 
-FORMAT = "bbfit billboard cloud 1"
+FORMAT, FORMAT_WITH_MAPS = "bbfit billboard cloud 1", "bbfit billboard cloud 2"
 TENSORS = ("centers", "rights", "ups", "half_extents", "texture_sizes", "two_sided", "texels")
-"""Names of a cloud's tensors."""
+"""Names of the tensors that every cloud has."""
+# Prefix of the names of a light's tensors in a file.
+_LIGHT = "light."
 _EXPECTED = "expected a file written by bbfit fit"
 _UNIT_TOLERANCE = 1e-3
 
@@ -51,6 +55,13 @@ class BillboardCloud:
     """Straight-alpha display-referred RGBA in [0, 1], [P, 4]: per billboard its front texture row by row, then its back texture if any."""
     alpha: AlphaMode = field(default_factory=AlphaMode)
     """The alpha mode of renders, scores and exports."""
+    surface: Tensor | None = None
+    """Maps of a cloud that takes the light of a program, [P, 4] in [0, 1]; ``None`` if the light is baked into the texels' color.
+    Channels 0 and 1 are the components of the normal along right and up, as (n + 1) / 2; the third points to the viewer's side. Channel 2
+    is occlusion, the share of the sky that lights the texel (1 in the open). Channel 3 is translucency, the share of the light that
+    passes through. The texels' color is then base color, the reflectance, as display-referred sRGB."""
+    light: Light | None = None
+    """The light, a batch of one, in which a cloud with maps is drawn unless another is given; ``None`` for other clouds."""
 
     def __post_init__(self) -> None:
         check_shape("centers", tuple(self.centers.shape), (None, 3))
@@ -64,6 +75,11 @@ class BillboardCloud:
             fail("texture_sizes", f"expected int64 values of at least 1, got {self.texture_sizes.dtype}")
         check_choice("two_sided's dtype", self.two_sided.dtype, (torch.bool,))
         check_shape("texels", tuple(self.texels.shape), (sum(self._texel_counts), 4))
+        if (self.surface is None) != (self.light is None):
+            fail("light", "expected one exactly if there is a surface")
+        if self.surface is not None and self.light is not None:
+            check_shape("surface", tuple(self.surface.shape), (len(self.texels), 4))
+            check_shape("light", (len(self.light),), (1,))
 
     def __len__(self) -> int:
         return self.centers.shape[0]
@@ -89,15 +105,21 @@ class BillboardCloud:
         area = float((4 * self.half_extents.prod(-1) * (1 + self.two_sided.long())).sum())
         return math.sqrt(len(self.texels) / area) if len(self) else 0.0
 
-    def textures(self) -> list[Tensor]:
-        """The textures as views into ``texels``, N tensors of [S, h, w, 4]; S = 1 or 2 (front, back)."""
-        parts = self.texels.split(self._texel_counts)
+    @property
+    def _tensors(self) -> dict[str, Any]:
+        """All tensors by name."""
+        return {name: getattr(self, name) for name in TENSORS} | ({} if self.surface is None else {"surface": self.surface})
+
+    def textures(self, values: Tensor | None = None) -> list[Tensor]:
+        """The textures as views into ``texels``, or into other values of the texels, [P, 4]: N tensors of [S, h, w, 4]; S = 1 or 2 (front,
+        back)."""
+        parts = (self.texels if values is None else values).split(self._texel_counts)
         sizes, sides = self.texture_sizes.tolist(), self.two_sided.tolist()
         return [part.reshape(1 + two, h, w, 4) for part, (h, w), two in zip(parts, sizes, sides, strict=True)]
 
     def to(self, target: torch.device | torch.dtype | str) -> BillboardCloud:
         """Move to a device, or convert the floating-point tensors to a dtype."""
-        moved = {name: getattr(self, name) for name in TENSORS}
+        moved = self._tensors
         for name, tensor in moved.items():
             if not isinstance(target, torch.dtype) or tensor.is_floating_point():
                 moved[name] = tensor.to(target)
@@ -107,16 +129,24 @@ class BillboardCloud:
         """The same rectangles with other texels, [P, 4]."""
         return replace(self, texels=texels)
 
+    def baked(self, texels: Tensor) -> BillboardCloud:
+        """The same rectangles without maps, with texels, [P, 4], that contain the light."""
+        return replace(self, texels=texels, surface=None, light=None)
+
     def without_textures(self) -> BillboardCloud:
-        """The same rectangles with transparent texels, which take no memory; do not write to them."""
-        return self.with_texels(self.texels.new_zeros(1, 4).expand(len(self.texels), 4))
+        """The same rectangles with transparent texels, which take no memory, and no maps; do not write to them."""
+        return self.baked(self.texels.new_zeros(1, 4).expand(len(self.texels), 4))
 
     def take(self, kept: Iterable[int]) -> BillboardCloud:
         """Some of the billboards, in the given order."""
-        kept, textures = list(kept), self.textures()
-        texels = [textures[n].reshape(-1, 4) for n in kept]
-        others = {name: getattr(self, name)[kept] for name in TENSORS if name != "texels"}
-        return replace(self, **others, texels=torch.cat(texels) if texels else self.texels[:0])
+        kept, taken = list(kept), dict[str, Any]()
+        for name, tensor in self._tensors.items():
+            if name in ("texels", "surface"):
+                textures = self.textures(tensor)
+                taken[name] = torch.cat([textures[n].reshape(-1, 4) for n in kept]) if kept else tensor[:0]
+            else:
+                taken[name] = tensor[kept]
+        return replace(self, **taken)
 
     def parts(self, count: int) -> list[BillboardCloud]:
         """The billboards in ``count`` clouds of equal numbers."""
@@ -125,9 +155,9 @@ class BillboardCloud:
 
     @staticmethod
     def joined(clouds: Sequence[BillboardCloud]) -> BillboardCloud:
-        """The billboards of several clouds in one, with the alpha mode of the first."""
-        tensors = {name: torch.cat([getattr(cloud, name) for cloud in clouds]) for name in TENSORS}
-        return BillboardCloud(**tensors, alpha=clouds[0].alpha)
+        """The billboards of several clouds in one, with the alpha mode and the light of the first; all have maps or none has."""
+        tensors: dict[str, Any] = {name: torch.cat([cloud._tensors[name] for cloud in clouds]) for name in clouds[0]._tensors}
+        return replace(clouds[0], **tensors)
 
     def check(self) -> None:
         """Require what every finished cloud is: of floats, within a sane distance of the origin, of unit axes, and of texels in [0, 1].
@@ -136,8 +166,11 @@ class BillboardCloud:
         """
         self.check_rectangles()
         check_choice("texels's dtype", self.texels.dtype, (self.centers.dtype,))
-        if not ((self.texels >= 0) & (self.texels <= 1)).all():  # NaN is neither
-            fail("texels", "expected values in [0, 1]")
+        for name, values in {"texels": self.texels, "surface": self.surface}.items():
+            if values is not None and not ((values >= 0) & (values <= 1)).all():  # NaN is neither
+                fail(name, "expected values in [0, 1]")
+        if self.surface is not None:
+            check_choice("surface's dtype", self.surface.dtype, (self.centers.dtype,))
 
     def check_rectangles(self) -> None:
         """The part of :meth:`check` that does not look at the texels."""
@@ -161,9 +194,11 @@ class BillboardCloud:
         from bbfit.files import write_tensors
 
         self.check()
-        tensors = {name: getattr(self, name).detach().cpu().clone(memory_format=torch.contiguous_format) for name in TENSORS}
+        tensors = self._tensors | {f"{_LIGHT}{name}": value for name, value in (vars(self.light) if self.light else {}).items()}
+        tensors = {name: value.detach().cpu().clone(memory_format=torch.contiguous_format) for name, value in tensors.items()}
         alpha = json.dumps({"kind": self.alpha.kind, "cutoff": self.alpha.cutoff})
-        write_tensors(path, tensors, {"format": f"{FORMAT} {alpha}"})  # in one entry, because the order of several is not defined
+        form = FORMAT if self.surface is None else FORMAT_WITH_MAPS
+        write_tensors(path, tensors, {"format": f"{form} {alpha}"})  # in one entry, because the order of several is not defined
 
     @staticmethod
     def load(path: str | Path) -> BillboardCloud:
@@ -184,11 +219,15 @@ class BillboardCloud:
         with reading("cloud", path, _EXPECTED):
             with named_in_utf8(path) as named, safe_open(named, framework="pt") as file:
                 form = (file.metadata() or {}).get("format", "")
-                if form != FORMAT and not form.startswith(f"{FORMAT} "):
+                kind = next((kind for kind in (FORMAT, FORMAT_WITH_MAPS) if form == kind or form.startswith(f"{kind} ")), None)
+                if kind is None:
                     fail("cloud", f"{path} is not a billboard cloud", _EXPECTED)
-                tensors = {name: file.get_tensor(name) for name in TENSORS}
+                has_maps = kind == FORMAT_WITH_MAPS
+                tensors = {name: file.get_tensor(name) for name in (*TENSORS, *(("surface",) if has_maps else ()))}
+                of_light = {entry.name: file.get_tensor(f"{_LIGHT}{entry.name}") for entry in fields(Light)} if has_maps else {}
             try:
-                cloud = BillboardCloud(**tensors, alpha=AlphaMode(**json.loads(form[len(FORMAT) :] or "{}")))
+                light = Light(**of_light) if has_maps else None
+                cloud = BillboardCloud(**tensors, alpha=AlphaMode(**json.loads(form[len(kind) :] or "{}")), light=light)
                 cloud.check()
             except InputError as error:
                 fail("cloud", f"{path} is damaged ({error})", _EXPECTED)

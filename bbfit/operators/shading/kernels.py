@@ -1,0 +1,145 @@
+"""Warp kernels that shade texels, and their derivative; one source for the CPU and CUDA.
+
+**Forward.** With the normal n = (x, y, z) of a texel, z = sqrt(1 - x^2 - y^2), the direction l towards the sun in the texture's axes,
+c = n . l, base color B in linear light, occlusion o, translucency t, sun s and sky a,
+
+    E = s ((1 - t) max(c, 0) + t max(-c, 0)) + a o,    color = encode(B E).
+
+**Backward.** For the derivative g of the loss in the color of a channel, and e = encode'(B E),
+
+    dL/dB = g e E,    dL/dE = g e B,    dL/do = sum a dL/dE,    dL/dt = sum s (max(-c, 0) - max(c, 0)) dL/dE,
+    dL/dc = sum s dL/dE (1 - t if c > 0, else -t).
+
+z depends on x and y: dc/dx = l_x - l_z x / z, and the same for y; where z is at its least value, dc/dx = l_x. Normals outside the unit
+disk are scaled onto it by r = 1 / sqrt(x^2 + y^2): then the derivative in the unscaled (x, y) is r times the part of the derivative in the
+scaled (x, y) that is perpendicular to it.
+"""
+
+# mypy: ignore-errors
+# ruff: noqa: UP018 - float(0) declares a variable of a kernel, 0 a constant.
+
+from __future__ import annotations
+
+import warp as wp
+
+from bbfit.operators.launching import FLAGS
+from bbfit.operators.shading.reference import LEAST_Z_SQUARED as LEAST_VALUE
+
+LEAST_Z_SQUARED = wp.constant(LEAST_VALUE)
+Texels = wp.array(dtype=wp.vec4)
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
+
+
+@wp.func
+def decoded(value: float) -> float:
+    """Display-referred sRGB to linear light."""
+    return wp.where(value > 0.04045, wp.pow((value + 0.055) / 1.055, 2.4), value / 12.92)
+
+
+@wp.func
+def decoded_slope(value: float) -> float:
+    """Derivative of :func:`decoded`."""
+    return wp.where(value > 0.04045, 2.4 / 1.055 * wp.pow((value + 0.055) / 1.055, 1.4), 1.0 / 12.92)
+
+
+@wp.func
+def encoded(value: float) -> float:
+    """Linear light to display-referred sRGB."""
+    return wp.where(value > 0.0031308, 1.055 * wp.pow(value, 1.0 / 2.4) - 0.055, 12.92 * value)
+
+
+@wp.func
+def encoded_slope(value: float) -> float:
+    """Derivative of :func:`encoded`."""
+    return wp.where(value > 0.0031308, 1.055 / 2.4 * wp.pow(value, 1.0 / 2.4 - 1.0), 12.92)
+
+
+@wp.func
+def tangent_normal(surface: wp.vec4) -> wp.vec4:
+    """The normal of a texel, and the factor that scaled x and y into the unit disk."""
+    x = 2.0 * surface[0] - 1.0
+    y = 2.0 * surface[1] - 1.0
+    inside = 1.0 / wp.sqrt(wp.max(x * x + y * y, 1.0))
+    x *= inside
+    y *= inside
+    return wp.vec4(x, y, wp.sqrt(wp.max(1.0 - x * x - y * y, LEAST_Z_SQUARED)), inside)
+
+
+@wp.kernel
+def shade(
+    first: int,
+    run: int,
+    strengths: wp.vec4,
+    texels: Texels,
+    surface: Texels,
+    texture: wp.array(dtype=wp.int32),
+    suns: wp.array(dtype=wp.vec3),
+    shaded: Texels,
+):
+    """Shade texels; launched over runs of ``run`` texels, from run ``first`` on."""
+    tid, _ = wp.tid()
+    begin = (first + tid) * run
+    for i in range(begin, wp.min(begin + run, texels.shape[0])):
+        maps = surface[i]
+        n = tangent_normal(maps)
+        sun = suns[texture[i]]
+        c = n[0] * sun[0] + n[1] * sun[1] + n[2] * sun[2]
+        of_sun = (1.0 - maps[3]) * wp.max(c, 0.0) + maps[3] * wp.max(-c, 0.0)
+        base = texels[i]
+        color = wp.vec4()
+        for k in range(3):
+            light = strengths[k] * of_sun + strengths[3] * maps[2]
+            color[k] = wp.min(encoded(decoded(base[k]) * light), 1.0)
+        color[3] = base[3]
+        shaded[i] = color
+
+
+@wp.kernel
+def differentiate(
+    first: int,
+    run: int,
+    strengths: wp.vec4,
+    texels: Texels,
+    surface: Texels,
+    texture: wp.array(dtype=wp.int32),
+    suns: wp.array(dtype=wp.vec3),
+    gradient: Texels,
+    of_texels: Texels,
+    of_surface: Texels,
+):
+    """Add the derivative in texels and surface, given that in the shaded texels; launched as :func:`shade`."""
+    tid, _ = wp.tid()
+    begin = (first + tid) * run
+    for i in range(begin, wp.min(begin + run, texels.shape[0])):
+        g = gradient[i]
+        if wp.dot(g, g) != 0.0:
+            maps = surface[i]
+            n = tangent_normal(maps)
+            sun = suns[texture[i]]
+            c = n[0] * sun[0] + n[1] * sun[1] + n[2] * sun[2]
+            lit = wp.max(c, 0.0)
+            through = wp.max(-c, 0.0)
+            of_sun = (1.0 - maps[3]) * lit + maps[3] * through
+            base = texels[i]
+            color = wp.vec4()
+            from_sun = float(0.0)
+            from_sky = float(0.0)
+            for k in range(3):
+                light = strengths[k] * of_sun + strengths[3] * maps[2]
+                linear = decoded(base[k])
+                slope = g[k] * encoded_slope(linear * light)
+                color[k] = slope * light * decoded_slope(base[k])
+                from_sun += slope * linear * strengths[k]
+                from_sky += slope * linear * strengths[3]
+            color[3] = g[3]
+            of_texels[i] += color
+            of_cosine = from_sun * wp.where(c > 0.0, 1.0 - maps[3], -maps[3])
+            free = wp.where(1.0 - n[0] * n[0] - n[1] * n[1] > LEAST_Z_SQUARED, 1.0, 0.0)
+            across = of_cosine * (sun[0] - free * sun[2] * n[0] / n[2])
+            up = of_cosine * (sun[1] - free * sun[2] * n[1] / n[2])
+            if n[3] < 1.0:
+                along = across * n[0] + up * n[1]
+                across = n[3] * (across - along * n[0])
+                up = n[3] * (up - along * n[1])
+            of_surface[i] += wp.vec4(2.0 * across, 2.0 * up, from_sky, from_sun * (through - lit))
