@@ -198,20 +198,21 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
     A picture of at most :data:`PALETTE` colors, alpha included, gets a palette (PNG 1.2, section 4.1.2), which needs a quarter to a half of
     the bytes.
     """
-    if image.shape[2] == 4 and len(palette := distinct(image)) <= PALETTE:
-        return _with_palette(image, palette)
+    opaque = image if image.shape[2] == 4 else np.pad(image, ((0, 0), (0, 0), (0, 1)), constant_values=255)
+    if len(palette := distinct(opaque)) <= PALETTE:
+        return _with_palette(opaque, palette, "RGBA" if image.shape[2] == 4 else "RGB")
     code = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
     done, data = cv2.imencode(".png", cv2.cvtColor(image, code), [cv2.IMWRITE_PNG_COMPRESSION, 9])
     assert done
     return data.tobytes()
 
 
-def _with_palette(image: NDArray[np.uint8], palette: NDArray[np.uint8]) -> bytes:
+def _with_palette(image: NDArray[np.uint8], palette: NDArray[np.uint8], mode: str) -> bytes:
     """Encode a picture whose colors are those of a palette in the order of :func:`distinct`."""
     order = np.ascontiguousarray(image[..., ::-1]).view(">u4")[..., 0]
     places = np.searchsorted(np.ascontiguousarray(palette[:, ::-1]).view(">u4")[:, 0], order).astype(np.uint8)
     picture, file = Image.fromarray(places), io.BytesIO()
-    picture.putpalette(palette.tobytes(), "RGBA")
+    picture.putpalette(np.ascontiguousarray(palette[:, : len(mode)]).tobytes(), mode)
     picture.save(file, "PNG", optimize=True)
     return file.getvalue()
 

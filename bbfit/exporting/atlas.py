@@ -16,9 +16,11 @@ from bbfit.images import PALETTE, bleed_color, distinct
 
 # Side of the blocks in which graphics cards compress textures, in texels.
 BLOCK = 4
+# What lies in the gaps between cells of a surface: the plane's own normal, in the open.
+_PLAIN = (128, 128, 255, 255)
 
 
-def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
+def pack_atlas(textures: list[NDArray[np.uint8]], padding: int, surfaces: list[NDArray[np.uint8]] | None = None) -> Atlas:
     """Pack R >= 1 straight-alpha textures, uint8 [h, w, 4] each, without resampling or rotating them.
 
     Each texture gets a cell that is at least ``padding`` >= 1 texels larger on every side, which the fade to transparent at a billboard's
@@ -26,6 +28,8 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
     of a mip level up to log2(n) mixes two textures. Alpha is 0 outside the textures; transparent texels have the color of a neighbor
     (:func:`fill_cell`). If that makes more than 256 colors of fewer visible ones, the transparent texels' colors are rounded, so that the
     atlas fits into the palette of a PNG.
+
+    ``surfaces`` are further channels of each texture, uint8 [h, w, 4], packed in the same way; their padding repeats their rims.
     """
     sizes = np.array([texture.shape[1::-1] for texture in textures], dtype=np.int64)
     unit = max(BLOCK, 1 << (padding.bit_length() - 1))
@@ -38,7 +42,14 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int) -> Atlas:
         (x, y), (w, h) = place.tolist(), cell.tolist()
         image[y : y + h, x : x + w] = fill_cell(texture, padding, w, h)
     image[image[..., 3] == 0, :3] = _within_palette(image)
-    return Atlas(image, places * unit + padding, sizes)
+    surface = None
+    if surfaces is not None:
+        surface = np.full((height, width, 4), _PLAIN, np.uint8)
+        for part, place, cell in zip(surfaces, places * unit, cells * unit, strict=True):
+            (x, y), (w, h), (rows, columns) = place.tolist(), cell.tolist(), part.shape[:2]
+            rims = (padding, h - rows - padding), (padding, w - columns - padding), (0, 0)
+            surface[y : y + h, x : x + w] = np.pad(part, rims, "edge")
+    return Atlas(image, places * unit + padding, sizes, surface)
 
 
 @lru_cache(maxsize=64)  # one model is packed for its size in bytes, for its GLB and for its OBJ

@@ -15,10 +15,11 @@ from bbfit.exporting.config import ktx2_missing
 _WEBP_SIDE = 16383
 
 
-def encode_ktx2(levels: list[NDArray[np.uint8]]) -> bytes:
+def encode_ktx2(levels: list[NDArray[np.uint8]], *, srgb: bool = True) -> bytes:
     """Encode mip levels as KTX 2.0 in Basis Universal's ETC1S with BasisLZ, for glTF's extension ``KHR_texture_basisu``.
 
-    The levels are straight-alpha display-referred sRGB, uint8 [h, w, 4] each. The sides of the first are multiples of 4. Each further level
+    The levels are straight-alpha display-referred sRGB, uint8 [h, w, 4] each, or, with ``srgb`` false, data that are no colors, such as
+    normals, uint8 [h, w, 3]. The sides of the first are multiples of 4. Each further level
     has half the sides of the one before, rounded down, at least 1; the last need not be 1 x 1. Raises InputError for levels of other sizes,
     or if the package alktx2 is missing. One release of alktx2 gives the same bytes for the same levels, with any number of threads.
 
@@ -37,22 +38,23 @@ def encode_ktx2(levels: list[NDArray[np.uint8]]) -> bytes:
     if height % BLOCK or width % BLOCK:
         fail("levels", f"sides must be multiples of {BLOCK}, got {width} x {height}")
     for number, level in enumerate(levels):
-        check_shape(f"levels[{number}]", level.shape, (max(1, height >> number), max(1, width >> number), 4))
+        check_shape(f"levels[{number}]", level.shape, (max(1, height >> number), max(1, width >> number), 4 if srgb else 3))
     import alktx2
 
-    raw = [(level.tobytes(), level.shape[1], level.shape[0]) for level in levels]
-    return alktx2.encode_raw_mips_to_ktx2(raw, codec="etc1s", quality=100, effort=3, srgb=True)
+    opaque = [level if srgb else np.pad(level, ((0, 0), (0, 0), (0, 1)), constant_values=255) for level in levels]
+    raw = [(level.tobytes(), level.shape[1], level.shape[0]) for level in opaque]
+    return alktx2.encode_raw_mips_to_ktx2(raw, codec="etc1s", quality=100, effort=3, srgb=srgb)
 
 
 def encode_webp(image: NDArray[np.uint8], lossless: bool = True) -> bytes:
-    """Encode straight RGBA, uint8 [h, w, 4], as WebP; transparent texels keep their color, because filtering uses it.
+    """Encode straight RGBA, uint8 [h, w, 4], or RGB as WebP; transparent texels keep their color, because filtering uses it.
 
     ``lossless`` keeps each texel. Otherwise alpha is exact, and color has quality 90 of 100 at half its resolution. Raises InputError for a
     picture of more than 16,383 texels per side.
     """
     from PIL import Image
 
-    check_shape("image", image.shape, (None, None, 4))
+    check_shape("image", image.shape, (None, None, image.shape[-1] if image.shape[-1] in (3, 4) else 4))
     if max(image.shape) > _WEBP_SIDE:
         fail("image", f"WebP has at most {_WEBP_SIDE} texels a side, got {image.shape[1]} x {image.shape[0]}", "write it as PNG")
     file = io.BytesIO()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.encoders import encode_ktx2, encode_webp
 from bbfit.exporting.splitting import centered
-from bbfit.geometry.cards import Card, Cards
+from bbfit.geometry.cards import Card, Cards, texture_axes
 from bbfit.glb import joined_glb, split_glb
 from bbfit.images import encode_png
 from bbfit.model_files import glb_of_scene
@@ -20,11 +20,16 @@ _SAMPLER = {"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071
 _WITH_MIPS = _SAMPLER | {"minFilter": 9987}  # trilinear
 # Component types of glTF, and the largest index of 16 bits (65,535 would restart a primitive; glTF 2.0, section 3.7.2.1).
 _UNSIGNED_SHORT, _UNSIGNED_INT, _LARGEST_SHORT = 5123, 5125, 65_534
+# The name under which trimesh writes tangents.
+_TANGENT = "_TANGENT"
 _EXTENSIONS = {"webp": ("EXT_texture_webp", "image/webp"), "ktx2": ("KHR_texture_basisu", "image/ktx2")}
 
 
 def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
     """A GLB file with one mesh for the cards that show both sides, one for those with back-face culling, and one per card with an origin.
+
+    Cards with maps have a matte material (``KHR_materials_specular`` with the factor 0) with textures of base color, normals and occlusion,
+    and tangents.
 
     The node of a card with an origin is at that origin, and two vertices that no triangle uses center the mesh's bounds on it: programs
     sort blended meshes by one or the other. The sampler uses mip levels if the file includes them (``ktx2``) or if the options let
@@ -46,7 +51,8 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
             metallicFactor=0.0,
             roughnessFactor=1.0,
         )
-        points, uvs, normals = (np.concatenate(parts) for parts in zip(*map(_vertices, chosen), strict=True))
+        vertices = list(map(_vertices, chosen))
+        points, uvs, normals = (np.concatenate(parts) for parts in zip(*vertices, strict=True))
         first = np.cumsum([0, *(len(card.corners) for card in chosen)])
         mesh = trimesh.Trimesh(
             points,
@@ -56,11 +62,16 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
             visual=trimesh.visual.TextureVisuals(uv=np.stack([uvs[:, 0], 1 - uvs[:, 1]], -1), material=material),
             process=False,
         )
+        if cards.atlas.surface is not None:
+            mesh.vertex_attributes[_TANGENT] = np.concatenate(
+                [_tangents(card, len(part[0])) for card, part in zip(chosen, vertices, strict=True)]
+            )
         origin = chosen[0].origin
         place = None if origin is None else trimesh.transformations.translation_matrix(origin)
         scene.add_geometry(mesh, node_name=name, geom_name=name, transform=place)
     # Without light nothing reads normals, which are a third of a vertex.
-    glb = glb_of_scene(scene, lambda tree: _complete(tree, cards, resolved), normals=resolved.material != "unlit")
+    lit = cards.atlas.surface is not None or resolved.material != "unlit"
+    glb = glb_of_scene(scene, lambda tree: _complete(tree, cards, resolved), normals=lit)
     tree, views = split_glb(glb)
     return joined_glb(tree, _with_pictures(tree, _with_short_indices(tree, views), cards, resolved))
 
@@ -73,6 +84,14 @@ def _vertices(card: Card) -> tuple[NDArray[np.float64], NDArray[np.float64], NDA
         points = centered(card) - card.origin
         uvs = np.concatenate([card.uvs, card.uvs[:1].repeat(len(points) - len(card.uvs), 0)])
     return points, uvs, np.tile(card.normal, (len(points), 1))
+
+
+def _tangents(card: Card, count: int) -> NDArray[np.float32]:
+    """The tangents of a card's vertices, [count, 4]: glTF's bitangent, ``cross(normal, tangent) * w``, points up along the texture."""
+    assert card.tangent is not None
+    right, up, normal = texture_axes(card)
+    handed = np.sign(np.cross(normal, right) @ up)
+    return np.tile(np.append(right, handed).astype(np.float32), (count, 1))
 
 
 def _meshes(cards: Cards) -> dict[str, list[Card]]:
@@ -91,16 +110,23 @@ def _complete(tree: dict[str, Any], cards: Cards, config: ResolvedExport) -> Non
     # trimesh lists the picture once per material.
     assert len({image["bufferView"] for image in tree["images"]}) == 1
     tree["images"] = [{"bufferView": tree["images"][0]["bufferView"]}]
-    tree["textures"] = [{"sampler": 0, "name": "atlas"}]
+    tree["textures"] = [{"sampler": 0, "name": name} for name in _pictures(cards)]
     tree["samplers"] = [_WITH_MIPS if config.textures == "ktx2" or config.mipmapped(cards.alpha) else _SAMPLER]
     used = set(tree.get("extensionsUsed", ()))
     for material in tree["materials"]:
         material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
-        if config.material == "unlit":
-            used.add("KHR_materials_unlit")
+        if cards.atlas.surface is not None:
+            material |= {"normalTexture": {"index": 1}, "occlusionTexture": {"index": 2}}
+            material["extensions"] = {"KHR_materials_specular": {"specularFactor": 0.0}}
+        elif config.material == "unlit":
             material["extensions"] = {"KHR_materials_unlit": {}}
+        used |= set(material.get("extensions", ()))
         if cards.alpha.kind == "hash":
             material["extras"] = {"alphaMode": "HASH"}
+    for mesh in tree["meshes"]:
+        for attributes in (primitive["attributes"] for primitive in mesh["primitives"]):
+            if _TANGENT in attributes:
+                attributes["TANGENT"] = attributes.pop(_TANGENT)  # trimesh writes attributes of its own choice only
     if used:
         tree["extensionsUsed"] = sorted(used)
 
@@ -118,27 +144,38 @@ def _with_short_indices(tree: dict[str, Any], views: list[bytes]) -> list[bytes]
     return views
 
 
+def _pictures(cards: Cards) -> dict[str, tuple[list[NDArray[np.uint8]], bool]]:
+    """The pictures by name: their mip levels, or level 0 alone, uint8 [h, w, C], and whether they are colors."""
+    pictures = {"atlas": (list(cards.chain or [cards.atlas.image]), True)}
+    if cards.atlas.surface is not None:
+        levels = cards.surface_chain or [cards.atlas.surface]
+        pictures["normals"] = [np.ascontiguousarray(level[..., :3]) for level in levels], False
+        pictures["occlusion"] = [np.ascontiguousarray(level[..., 3:].repeat(3, -1)) for level in levels], False
+    return pictures
+
+
 def _with_pictures(tree: dict[str, Any], views: list[bytes], cards: Cards, config: ResolvedExport) -> list[bytes]:
     """The contents of the buffer views, with the pictures added; the JSON gets the references to them."""
-    pictures = {"image/png": encode_png(cards.atlas.image)}
-    if config.textures in _EXTENSIONS:
-        extension, kind = _EXTENSIONS[config.textures]
-        pictures = pictures if config.fallback else {}
-        if config.textures == "webp":
-            pictures[kind] = encode_webp(cards.atlas.image)
-        else:
-            pictures[kind] = encode_ktx2(list(cards.chain or [cards.atlas.image]))
+    extension, kind = _EXTENSIONS.get(config.textures, ("", ""))
+    images, encoded = list[tuple[str, str]](), list[bytes]()
+    for texture, (name, (levels, is_color)) in zip(tree["textures"], _pictures(cards).items(), strict=True):
+        if not extension or config.fallback:
+            texture["source"] = len(images)
+            images.append((name, "image/png"))
+            encoded.append(encode_png(levels[0]))
+        if extension:
+            texture["extensions"] = {extension: {"source": len(images)}}
+            images.append((name, kind))
+            encoded.append(encode_webp(levels[0]) if config.textures == "webp" else encode_ktx2(levels, srgb=is_color))
+    if extension:
         tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), extension})
-        tree["textures"][0]["extensions"] = {extension: {"source": len(pictures) - 1}}
         if not config.fallback:
             tree["extensionsRequired"] = [extension]
-    if "image/png" in pictures:
-        tree["textures"][0]["source"] = 0
     at, views = tree["images"][0]["bufferView"], list(views)
-    places = [at, *range(len(views), len(views) + len(pictures) - 1)]
+    places = [at, *range(len(views), len(views) + len(images) - 1)]
     tree["bufferViews"] += [{} for _ in places[1:]]
     views += [b""] * (len(places) - 1)
-    for place, content in zip(places, pictures.values(), strict=True):
+    for place, content in zip(places, encoded, strict=True):
         views[place] = content
-    tree["images"] = [{"bufferView": place, "mimeType": kind, "name": "atlas"} for place, kind in zip(places, pictures, strict=True)]
+    tree["images"] = [{"bufferView": place, "mimeType": mime, "name": name} for place, (name, mime) in zip(places, images, strict=True)]
     return views

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bbfit.checks import fail
 from bbfit.exporting.atlas import palettized_picture
-from bbfit.exporting.mips import mip_chain
+from bbfit.exporting.mips import mip_chain, surface_chain
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Atlas, Cards
@@ -60,7 +60,8 @@ def with_mips(cards: Cards) -> Cards:
 
     This takes some seconds for textures of a million texels.
     """
-    return replace(cards, chain=tuple(matched_chain(cards, _chain(cards), _around(cards))))
+    surface = None if cards.atlas.surface is None else tuple(surface_chain(cards.atlas.surface, cards.atlas.image[..., 3]))
+    return replace(cards, chain=tuple(matched_chain(cards, _chain(cards), _around(cards))), surface_chain=surface)
 
 
 def reduced(cards: Cards, halvings: int) -> Cards:
@@ -82,7 +83,10 @@ def reduced(cards: Cards, halvings: int) -> Cards:
     image = np.concatenate([image[..., :3], *_scaled([image[..., 3:]], np.array([factor]))], -1)
     if len(distinct(cards.atlas.image)) <= PALETTE:
         image = palettized_picture(image, cards.alpha)
-    atlas = Atlas(image, cards.atlas.corners >> halvings, -(-cards.atlas.sizes >> halvings))
+    surface = cards.atlas.surface
+    if surface is not None:
+        surface = surface_chain(surface, cards.atlas.image[..., 3])[halvings]
+    atlas = Atlas(image, cards.atlas.corners >> halvings, -(-cards.atlas.sizes >> halvings), surface)
     return replace(cards, atlas=atlas)
 
 

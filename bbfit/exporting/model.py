@@ -13,7 +13,7 @@ from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import overdraw, with_hulls
 from bbfit.exporting.mip_matching import reduced, with_mips
-from bbfit.exporting.mips import plain_chain
+from bbfit.exporting.mips import plain_chain, surface_chain
 from bbfit.exporting.obj import mtl_bytes, obj_bytes
 from bbfit.exporting.outlines import with_pieces
 from bbfit.exporting.splitting import split
@@ -22,6 +22,7 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.light import Light
 from bbfit.images import encode_png
 from bbfit.model_files import check_model_path
 from bbfit.rendering.cards import CardRenderer
@@ -60,7 +61,10 @@ class ShippedModel:
             cards = with_pieces(cards, self.config.pieces, self.config.corners, cards.outlined_alpha)
         if self.config.has_mips:
             return with_mips(cards)
-        return replace(cards, chain=tuple(plain_chain(cards.atlas.image))) if self.config.mipmapped(cards.alpha) else cards
+        if not self.config.mipmapped(cards.alpha):
+            return cards
+        surface = None if cards.atlas.surface is None else tuple(surface_chain(cards.atlas.surface, None))
+        return replace(cards, chain=tuple(plain_chain(cards.atlas.image)), surface_chain=surface)
 
     @cached_property
     def _renderer(self) -> CardRenderer:
@@ -76,14 +80,15 @@ class ShippedModel:
         """Share of the polygons' area that is shaded although nothing is visible there, in [0, 1]."""
         return overdraw(self.cards, self.cards.visible_alpha)
 
-    def draw(self, camera: Camera) -> Tensor:
+    def draw(self, camera: Camera, light: Light | None = None) -> Tensor:
         """Draw what the files show: premultiplied RGBA over nothing in [0, 1], [H, W, 4], or [V, H, W, 4] for a batch of cameras.
 
-        Without mip levels the polygons show what the cloud's renderer shows, but for the rounding of textures to 8 bits; the renderer is
-        faster and draws them. Trimmed outlines cut off nothing visible.
+        ``light`` is for a cloud with maps: that of each view, or one for all; by default the cloud's own. Without mip levels and maps the
+        polygons show what the cloud's renderer shows, but for the rounding of textures to 8 bits; the renderer is faster and draws them.
+        Trimmed outlines cut off nothing visible.
         """
-        if self.config.has_mips or self.halvings or self.config.mipmapped(self.cloud.alpha):
-            return self._renderer.draw(camera)
+        if self.cloud.surface is not None or self.config.has_mips or self.halvings or self.config.mipmapped(self.cloud.alpha):
+            return self._renderer.draw(camera, light)
         return render(self.cloud, camera.to(self.cloud.texels.device))
 
     def antialiased(self) -> ShippedModel:

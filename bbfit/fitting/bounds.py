@@ -98,7 +98,7 @@ def trimmed(cloud: BillboardCloud) -> BillboardCloud:
     visible = [n for n, texture in enumerate(cloud.textures()) if (texture[..., 3] >= _VISIBLE).any()]
     if len(visible) < len(cloud):
         cloud = cloud.take(visible or [0])
-    parts, middles, texels, sizes = [], [], [], []
+    parts, middles, sizes, crops = [], [], [], []
     for texture in cloud.textures():
         mask = (texture[..., 3].amax(0) >= _VISIBLE).numpy().astype(np.uint8)
         x, y, width, height = cv2.boundingRect(mask)
@@ -107,14 +107,19 @@ def trimmed(cloud: BillboardCloud) -> BillboardCloud:
         parts.append([(right - left) / mask.shape[1], (bottom - top) / mask.shape[0]])
         middles.append([(left + right) / mask.shape[1] - 1, 1 - (top + bottom) / mask.shape[0]])
         sizes.append([bottom - top, right - left])
-        texels.append(texture[:, top:bottom, left:right].reshape(-1, 4))
+        crops.append((slice(None), slice(top, bottom), slice(left, right)))
+
+    def cropped(values: Tensor) -> Tensor:
+        return torch.cat([texture[crop].reshape(-1, 4) for texture, crop in zip(cloud.textures(values), crops, strict=True)])
+
     middle = torch.tensor(middles, dtype=cloud.centers.dtype) * cloud.half_extents
     return replace(
         cloud,
         centers=cloud.centers + middle[:, :1] * cloud.rights + middle[:, 1:] * cloud.ups,
         half_extents=cloud.half_extents * torch.tensor(parts, dtype=cloud.half_extents.dtype),
         texture_sizes=torch.tensor(sizes),
-        texels=torch.cat(texels),
+        texels=cropped(cloud.texels),
+        surface=None if cloud.surface is None else cropped(cloud.surface),
     )
 
 

@@ -17,6 +17,7 @@ Orientation = Literal["any", "upright", "free"]
 Bounds = Literal["viewport", "thesis", "silhouette"]
 Schedule = Literal["cosine", "growth"]
 Colors = Literal["views", "matched", "joint"]
+Lighting = Literal["baked", "maps"]
 _Binarization = Annotated[float, Range(0, 10)]
 _Density = Annotated[float, Range(0, 16, open_low=True)]
 _Rate = Annotated[float, Range(0, 10, open_low=True)]
@@ -146,6 +147,11 @@ class FitConfig:
     most_layers: _Layers | None = None
     """How many billboards may lie before each other, on average over the rectangle around the tree, when the fit chooses their number.
     More layers look better, and a graphics card shades all of them. Preset: 1.85 (mask) or 3.2."""
+    light: Lighting = "baked"
+    """baked: colors contain the light of the views. maps: base color, normals and occlusion, which take the light of a program; they need
+    views under many lights (views --suns)."""
+    map_steps: Count = 150
+    """Steps of the optimizer for maps, after those for placement and alpha."""
     placement: Placement | None = None
     """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
     A search compares clusterings of points on the mesh or, without a mesh, in the visual hull of the views.

@@ -22,10 +22,11 @@ from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.coverage import matched_coverage
 from bbfit.fitting.initialize import bounded, pixels_per_meter, random_textures, sized, start_cloud, tree_radius
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
+from bbfit.fitting.maps import fit_maps
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.palette import palettized
 from bbfit.fitting.points import COUNT, hull_points, mesh_points
-from bbfit.fitting.requirements import check_cameras, check_device
+from bbfit.fitting.requirements import check_cameras, check_device, check_lights
 from bbfit.fitting.search import find_placement
 from bbfit.fitting.steps import BLEND, HARDEST, Stepper
 from bbfit.fitting.visibility import visible_points
@@ -151,6 +152,7 @@ def fit(
     started = time.perf_counter()
     views.train.check()
     check_cameras(views.train.cameras, config, mesh=tree is not None)
+    check_lights(views, config)
     tree_file = None if tree is None or config.placement == "even" else TreeFile.open(tree)
     key = cache_key("fit", *fit_inputs(views, config, tree_file))
     checkpoint = Path(checkpoint) if checkpoint is not None else None
@@ -203,6 +205,8 @@ def fit(
     # No view determines the colors of transparent texels, but filtering shows them.
     bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
+    if config.light == "maps":
+        fitted = fit_maps(trimmed(fitted), views, config)
     if config.colors != "joint":
         fitted = matched_colors(smoothed_colors(fitted), views.train, config.backend)
     fitted = palettized(fitted, config.palette)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from bbfit.fitting.config import TRANSPARENT_COLORS
 from bbfit.geometry.alpha import AlphaMode
@@ -19,14 +22,20 @@ _VISIBLE = 0.5 / 255
 _SAMPLE, _ITERATIONS, _SEED = 40_000, 12, 0
 # Of a mask's alpha, differences count within so much of the cutoff, where edges are.
 _EDGE = 0.25
+# Steps from the darkest to the brightest occlusion.
+_OCCLUSIONS = 63
 
 
 def palettized(cloud: BillboardCloud, count: int) -> BillboardCloud:
     """Give the texels of a cloud few different values of color and alpha, so that a palette of ``count`` colors holds them.
 
-    With 0 the cloud is returned as it is. The values are those of :func:`few_colors`. All texels are rounded to 8 bits.
+    With 0 the cloud is returned as it is. The values are those of :func:`few_colors`. All texels are rounded to 8 bits. Maps get few
+    values too (:func:`few_surfaces`), so that palettes hold normals and occlusion.
     """
-    return cloud.with_texels(few_colors(cloud.texels, cloud.alpha, count)) if count else cloud
+    if not count:
+        return cloud
+    surface = None if cloud.surface is None else few_surfaces(cloud.surface, cloud.texels[:, 3] >= _VISIBLE, count)
+    return replace(cloud, texels=few_colors(cloud.texels, cloud.alpha, count), surface=surface)
 
 
 def few_colors(texels: Tensor, alpha: AlphaMode, count: int) -> Tensor:
@@ -43,16 +52,38 @@ def few_colors(texels: Tensor, alpha: AlphaMode, count: int) -> Tensor:
         return rounded
     straight = texels[visible].detach().cpu().float()
     seen = _seen(straight, alpha)
-    generator = np.random.default_rng(_SEED)
-    sample = seen[generator.permutation(len(seen))[:_SAMPLE]]
-    most = min(count - TRANSPARENT_COLORS, len(np.unique(sample, axis=0)))
-    means, _ = kmeans2(sample, most, iter=1, minit="++", rng=generator)
-    for _ in range(_ITERATIONS):
-        means = _means(torch.from_numpy(sample), vq(sample, means)[0], torch.from_numpy(means)).numpy()
+    means = _clustered(seen, count - TRANSPARENT_COLORS)
     labels = vq(seen, means)[0]
-    palette = unpremultiply(_means(premultiply(straight), labels, torch.zeros(most, 4)))
+    palette = unpremultiply(_means(premultiply(straight), labels, torch.zeros(len(means), 4)))
     palette = (palette * 255).round().clamp(min=torch.tensor([0.0, 0.0, 0.0, 1.0])) / 255
     return rounded.index_copy(0, visible.to(texels.device), palette[labels].to(texels))
+
+
+def few_surfaces(surface: Tensor, visible: Tensor, count: int) -> Tensor:
+    """Round maps, [P, 4], so that the pictures of their normals and of their occlusion have few colors and compress well.
+
+    Normals get ``count`` - 1 different values, which leaves one to the gaps of an atlas: the means of clusters by k-means of those of the
+    texels that are ``visible``, [P]. Occlusion is rounded to 6 bits.
+    """
+    occlusion = (surface[:, 2:3] * _OCCLUSIONS).round() / _OCCLUSIONS
+    if not bool(visible.any()):
+        return torch.cat([surface[:, :2], occlusion, surface[:, 3:]], 1)
+    x, y = (2 * surface[:, :2] - 1).unbind(-1)
+    normals = torch.stack([x, y, (1 - x * x - y * y).clamp_min(0).sqrt()], -1).float().numpy()
+    means = torch.from_numpy(_clustered(normals[visible.numpy()], count - 1))
+    across = (normalize(means, dim=-1)[:, :2] + 1) / 2
+    chosen = across[torch.from_numpy(vq(normals, means.numpy())[0]).long()]
+    return torch.cat([chosen.clamp(0, 1).to(surface), occlusion, surface[:, 3:]], 1)
+
+
+def _clustered(points: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+    """The means of at most ``count`` clusters of points, [P, C], from a sample of them."""
+    generator = np.random.default_rng(_SEED)
+    sample = points[generator.permutation(len(points))[:_SAMPLE]]
+    means, _ = kmeans2(sample, min(count, len(np.unique(sample, axis=0))), iter=1, minit="++", rng=generator)
+    for _ in range(_ITERATIONS):
+        means = _means(torch.from_numpy(sample), vq(sample, means)[0], torch.from_numpy(means)).numpy()
+    return means
 
 
 def _means(points: Tensor, labels: NDArray[np.int32], otherwise: Tensor) -> Tensor:

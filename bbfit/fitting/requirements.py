@@ -7,6 +7,7 @@ import torch
 from bbfit.checks import InputError, fail
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.camera import Camera, convergence_point
+from bbfit.views.dataset import ViewDataset
 
 # The devices of the kernels.
 _KERNEL_DEVICES = ("cpu", "cuda")
@@ -23,6 +24,12 @@ def check_device(config: FitConfig) -> torch.device:
     if config.backend != "reference" and device.type not in _KERNEL_DEVICES:
         fail("device", f"the kernels do not run on {name!r}", "use cpu, cuda, or --backend reference")
     return device
+
+
+def check_lights(views: ViewDataset, config: FitConfig) -> None:
+    """Require that views show the tree under enough lights for a configuration."""
+    if config.light == "maps" and (views.lit_train is None or views.train.light is None):
+        fail("light", "maps need views under many lights, and these have one", "render views with --suns 1, or fit with --light baked")
 
 
 def check_cameras(cameras: Camera, config: FitConfig, *, mesh: bool, hint: str = "") -> None:

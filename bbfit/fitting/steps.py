@@ -43,7 +43,7 @@ class Stepper:
     ) -> None:
         self._cloud, self._movement, self._betas = cloud.without_textures(), movement, (config.beta1, config.beta2)
         self._binarization = config.binarization_weight / (targets.cameras.width * targets.cameras.height)
-        self._pass: Any = _pass_of(config)(self._cloud, targets, config, movement, groups)
+        self._pass: Any = pass_of(config)(self._cloud, targets, config, movement, groups)
         self._begin, self.steps = self._pass.adam.padded(cloud.texels), 0
 
     @cached_property
@@ -91,7 +91,8 @@ class Stepper:
             self._movement.restore(tensors)
 
 
-def _pass_of(config: ResolvedFit) -> type[ReferencePass] | type[FusedPass]:
+def pass_of(config: ResolvedFit) -> type[ReferencePass] | type[FusedPass]:
+    """The operators of a configuration's backend."""
     if config.backend == "reference":
         from bbfit.fitting.reference_pass import ReferencePass
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.light import Light
 
 MASK_RIM = 0.5
 """Share of a mask's cutoff from which outlines contain alpha. Programs that draw smooth edges (alpha to coverage) show half a pixel
@@ -24,6 +25,8 @@ class Atlas:
     """Column and row of the top-left texel of each texture, [R, 2]."""
     sizes: NDArray[np.int64]
     """Width and height of each texture in texels, [R, 2]."""
+    surface: NDArray[np.uint8] | None = None
+    """Normals in the axes of each texture, as (n + 1) / 2, and occlusion, [H, W, 4]. ``None`` if colors contain the light."""
 
     @property
     def used(self) -> float:
@@ -46,6 +49,9 @@ class Card:
     """Whether only the front is drawn, the side that the normal points to; otherwise both sides show the same."""
     rectangle: int
     """Index of its texture in the atlas."""
+    tangent: NDArray[np.float64] | None = None
+    """For cards that take light: the unit vector from the texture's left to its right, [3]. The normals of a texture have the axes
+    ``tangent``, up along the texture, and ``normal``."""
     origin: NDArray[np.float64] | None = None
     """Point in meters by which programs sort the card if it is blended, [3]; such a card gets its own node."""
 
@@ -69,6 +75,10 @@ class Cards:
     chain: tuple[NDArray[np.uint8], ...] | None = None
     """Mip levels of the files, straight RGBA, from level 0 to 1 x 1 texel. Without them level 0 is filtered bilinearly at every
     distance."""
+    surface_chain: tuple[NDArray[np.uint8], ...] | None = None
+    """The same of ``atlas.surface``."""
+    light: Light | None = None
+    """The light in which cards with a surface are drawn unless another is given, a batch of one."""
 
     @property
     def vertex_count(self) -> int:
@@ -88,3 +98,12 @@ class Cards:
     def with_cards(self, cards: list[Card]) -> Cards:
         """Other cards with the same textures."""
         return replace(self, cards=tuple(cards))
+
+
+def texture_axes(card: Card) -> NDArray[np.float64]:
+    """The axes of the normals in a card's texture: its tangent, up along the texture, and its normal, [3, 3]; NaN without a tangent."""
+    if card.tangent is None:
+        return np.full((3, 3), np.nan)
+    slopes = np.linalg.pinv(card.uvs - card.uvs.mean(0)) @ (card.corners - card.corners.mean(0))
+    up = np.cross(card.normal, card.tangent)
+    return np.stack([card.tangent, up * np.sign(-slopes[1] @ up), card.normal])  # v grows downwards

@@ -55,6 +55,10 @@ class Light:
         """The lights with these indices, a batch."""
         return Light(*(value[indices] for value in vars(self).values()))
 
+    def to(self, device: torch.device | str) -> Light:
+        """Move to a device."""
+        return Light(*(value.to(device) for value in vars(self).values()))
+
     @staticmethod
     def of(sun_directions: Tensor, sun_strength: float, ambient: float, sun_color: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Light:
         """Lights of equal strengths from different directions, [L, 3], which need not be unit vectors."""

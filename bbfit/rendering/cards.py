@@ -7,6 +7,7 @@ differences between neighboring pixels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,13 +15,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from bbfit.checks import fail
 from bbfit.geometry.camera import Camera
-from bbfit.geometry.cards import Card, Cards
+from bbfit.geometry.cards import Card, Cards, texture_axes
+from bbfit.geometry.light import Light
 from bbfit.geometry.polygons import area, sides
 from bbfit.operators.drawing.compositing import composite_fragments, coverage, opacity, thresholds
 from bbfit.operators.drawing.reference import EDGE_ON
+from bbfit.operators.shading.reference import decode, encode
 
 # Distance outside a polygon, as a share of the atlas, at which a pixel's center still counts as inside, so that rounding opens no seams.
 _SLACK = 1e-9
@@ -43,6 +47,8 @@ class Sheets:
     """[S, 3]."""
     centers: Tensor
     """Mean of the corners, [S, 3]."""
+    axes: Tensor
+    """Axes of the normals in a texture, in the world: right, up, and towards the visible side, [S, 3, 3]. NaN for cards without maps."""
     culled: Tensor
     """Whether only the front is drawn, bool [S]."""
     first: Tensor
@@ -93,7 +99,7 @@ class MipChain:
     """In texels, int64 [L]."""
 
 
-def draw_cards(cards: Cards, camera: Camera) -> Tensor:
+def draw_cards(cards: Cards, camera: Camera, light: Light | None = None) -> Tensor:
     """Draw cards on the CPU as a graphics card does, with one sample per pixel: premultiplied RGBA in [0, 1], float32 [H, W, 4] for one
     camera and [V, H, W, 4] for a batch.
 
@@ -106,6 +112,8 @@ def draw_cards(cards: Cards, camera: Camera) -> Tensor:
     interpolated (LINEAR_MIPMAP_LINEAR), straight color and alpha separately, and the result is tested or blended. Beyond its border the
     atlas is clamped.
 
+    Cards with maps are shaded after filtering, per pixel, as graphics cards do (:mod:`bbfit.operators.shading` shades texels instead).
+
     A pixel shows a card if its center lies in the polygon. Layers are ordered by depth in every pixel, as in
     :func:`~bbfit.operators.drawing.compositing.composite`. A plane shows nothing edge-on and behind the camera.
 
@@ -116,13 +124,15 @@ def draw_cards(cards: Cards, camera: Camera) -> Tensor:
         at every distance (sampler LINEAR).
     camera
         One camera or V cameras.
+    light
+        For cards with maps: the light of each view, or one for all. Default: ``cards.light``.
 
     Raises
     ------
     InputError
         If a level is not uint8 or not half as large as the level before, rounded down.
     """
-    return CardRenderer(cards).draw(camera)
+    return CardRenderer(cards).draw(camera, light)
 
 
 class CardRenderer:
@@ -130,13 +140,19 @@ class CardRenderer:
 
     def __init__(self, cards: Cards) -> None:
         self._cards, self._sheets = cards, sheets_of(cards)
-        self._levels = joined([cards.atlas.image] if cards.chain is None else cards.chain, cards.atlas.image.shape)
+        self._levels = _levels(cards)
 
-    def draw(self, camera: Camera) -> Tensor:
+    def draw(self, camera: Camera, light: Light | None = None) -> Tensor:
         """See :func:`draw_cards`."""
-        cameras = camera.batch()
+        cameras, light = camera.batch(), self._cards.light if light is None else light
+        if light is not None and self._cards.atlas.surface is None:
+            fail("light", "the light of these cards is in their textures", "leave it out")
         with torch.no_grad():
-            image = torch.stack([_view(self._cards, self._sheets, self._levels, cameras[index]) for index in range(len(cameras))])
+            pictures = []
+            for index in range(len(cameras)):
+                own = None if light is None else light[[index if len(light) > 1 else 0]]
+                pictures.append(_view(self._cards, self._sheets, self._levels, cameras[index], own))
+            image = torch.stack(pictures)
         return image if camera.batched else image[0]
 
     def fragments(self, camera: Camera) -> int:
@@ -146,6 +162,15 @@ class CardRenderer:
         prevents them. The further pixels of 2 x 2 blocks that only serve derivatives are left out.
         """
         return len(hits(self._cards, self._sheets, camera).x)
+
+
+def _levels(cards: Cards) -> MipChain:
+    """The levels of the atlas; those of its surface are channels 4 to 7."""
+    chain: Sequence[NDArray[np.uint8]] = [cards.atlas.image] if cards.chain is None else cards.chain
+    if cards.atlas.surface is not None:
+        surfaces = [cards.atlas.surface] if cards.surface_chain is None else cards.surface_chain
+        chain = [np.concatenate(level, -1) for level in zip(chain, surfaces, strict=True)]
+    return joined(chain, (*cards.atlas.image.shape[:2], chain[0].shape[2]))
 
 
 def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> MipChain:
@@ -186,6 +211,7 @@ def sheets_of(cards: Cards) -> Sheets:
         torch.from_numpy(np.array([to_world for _, to_world in planes], np.float64).reshape(-1, 4, 3)),
         _rows([one.normal for one in ones], 3),
         _rows([np.concatenate([card.corners for card in own]).mean(0) for own, _ in planes], 3),
+        torch.from_numpy(np.array([texture_axes(one) for one in ones], np.float64).reshape(-1, 3, 3)),
         torch.tensor([one.culled for one in ones], dtype=torch.bool),
         torch.tensor([int(starts[one.rectangle]) for one in ones], dtype=torch.int64),
         torch.tensor(of_piece, dtype=torch.int64),
@@ -271,11 +297,13 @@ def _bilinear(levels: MipChain, uv: Tensor, level: Tensor) -> Tensor:
     return upper + (lower - upper) * y
 
 
-def _view(cards: Cards, sheets: Sheets, levels: MipChain, camera: Camera) -> Tensor:
-    """Picture of a single camera, [H, W, 4]."""
+def _view(cards: Cards, sheets: Sheets, levels: MipChain, camera: Camera, light: Light | None) -> Tensor:
+    """Picture of a single camera in a light, a batch of one, [H, W, 4]."""
     met = hits(cards, sheets, camera)
     straight = filtered(levels, met.uv, met.detail) / 255
     colors, alphas = straight[:, :3], straight[:, 3]
+    if light is not None:
+        colors = _lit(colors, straight[:, 4:], sheets.axes[met.sheet], light)
     if cards.alpha.kind == "hash":
         alphas = (alphas >= thresholds(met.x, met.y, sheets.first[met.sheet])).to(alphas)
     elif cards.alpha.antialiased:
@@ -286,6 +314,17 @@ def _view(cards: Cards, sheets: Sheets, levels: MipChain, camera: Camera) -> Ten
     shown, pixels, count = alphas > 0, met.y * camera.width + met.x, camera.height * camera.width
     image = composite_fragments(colors[shown], alphas[shown], met.depth[shown], pixels[shown], count, nested=cards.alpha.antialiased)
     return image.unflatten(0, (camera.height, camera.width))
+
+
+def _lit(colors: Tensor, maps: Tensor, axes: Tensor, light: Light) -> Tensor:
+    """Shade base colors of fragments, [M, 3], given their filtered normals and occlusion, [M, 4], and the axes of the normals, [M, 3, 3].
+
+    The formula is that of :func:`~bbfit.operators.shading.reference.shade_reference`.
+    """
+    normals = normalize(2 * maps[:, :3] - 1, dim=-1)
+    cosine = (normals * (axes @ light.sun_directions[0]).float()).sum(-1, keepdim=True).clamp_min(0)
+    sun = (light.sun_colors[0] * light.sun_strengths / math.pi).float()
+    return encode(decode(colors) * (cosine * sun + float(light.ambients) * maps[:, 3:])).clamp_max(1)
 
 
 def _beside(met: Hits) -> list[Tensor]:

@@ -63,6 +63,20 @@ class ViewSet:
         light = None if self.light is None else self.light[list(indices)]
         return ViewSet(tuple(self.paths[index] for index in indices), self.cameras[list(indices)], self.read, light)
 
+    @staticmethod
+    def joined(sets: Sequence[ViewSet]) -> ViewSet:
+        """The views of several sets, whose pictures have one size and different paths, in one; the light is known if that of all is."""
+        first = sets[0].cameras
+        transforms, intrinsics = (torch.cat([getattr(each.cameras, name) for each in sets]) for name in ("world_to_camera", "intrinsics"))
+        readers = {path: each.read for each in sets for path in each.paths}
+        lights = [each.light for each in sets if each.light is not None]
+        return ViewSet(
+            tuple(path for each in sets for path in each.paths),
+            Camera(transforms, intrinsics, first.width, first.height, first.orthographic),
+            lambda path: readers[path](path),
+            Light.joined(lights) if len(lights) == len(sets) else None,
+        )
+
     def image(self, index: int) -> Tensor:
         """One picture, uint8 [H, W, 4], straight alpha. Do not write to it: it may be cached.
 

@@ -1,0 +1,194 @@
+"""Maps of a finished fit: base color, normals and occlusion, from views under many lights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from bbfit.fitting.config import ResolvedFit
+from bbfit.fitting.levels import Targets
+from bbfit.fitting.steps import BLEND, pass_of
+from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.light import Light
+from bbfit.images import bleed_color
+from bbfit.operators.config import Backend
+from bbfit.operators.shading.reference import TextureLight, decode, shade_reference, texture_lights
+from bbfit.rendering.dispatch import render
+from bbfit.views.dataset import ViewDataset
+from bbfit.views.lit import LitViews
+from bbfit.views.view_set import ViewSet
+
+SUNNY = (1.8 * math.pi, 0.4)
+"""Strengths of the sun and of the sky on a sunny day: a white surface that faces the sun has 1.8 and 0.4 times the radiance of white."""
+_LEARNING_RATE = 0.025
+# Exposures in a step.
+_BATCH = 4
+# Most cameras whose passes are baked onto the billboards to start from.
+_BAKED = 24
+# The least weight of a texel in those views, in pixels, for which they determine its maps.
+_LEAST_WEIGHT = 1e-3
+# Distance of unit vectors up to which two suns are the same.
+_SAME_SUN = 1e-3
+# Vector of the maps of a texel that no view shows: its normal is the plane's, and nothing hides the sky.
+_PLAIN = (0.5, 0.5, 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class _Shaded:
+    """Texels in the light of a view, as a pass differentiates them."""
+
+    texels: Tensor
+    gradient: Tensor
+    occupied: Tensor | None
+
+
+def fit_maps(
+    cloud: BillboardCloud, views: ViewDataset, config: ResolvedFit, on_step: Callable[[int, float], None] | None = None
+) -> BillboardCloud:
+    """Fit maps to the training views under many lights, for a cloud whose placement and alpha are fitted.
+
+    Each step draws some exposures: training views under their baked light, or under another of their suns on a sunny day (:data:`SUNNY`).
+    Texels are shaded in that light and drawn, and Adam takes the gradient of the loss in the maps. Placement and alpha stay as they are.
+    The start is :func:`baked_maps`.
+
+    ``views`` have ``lit_train`` and the light of their own pictures. ``on_step`` is called with the number of each step, from 1, and its
+    loss. Returns the cloud with its maps; ``light`` is that of the views' own pictures.
+    """
+    assert views.lit_train is not None and views.train.light is not None
+    sunny = views.lit_train.under(*SUNNY)
+    exposures = ViewSet.joined([views.train, sunny.take(_other_suns(views.lit_train, views.train.light))])
+    assert exposures.light is not None
+    device = cloud.texels.device
+    texels, surface = baked_maps(cloud, views.lit_train, config.backend)
+    shader = _reference_shading if config.backend == "reference" else _fused_shading()
+    alpha = BLEND if config.alpha != "mask" else AlphaMode("mask", config.alpha_cutoff, math.inf, config.antialiased)
+    passes: Any = pass_of(config)(cloud.without_textures(), Targets.at(exposures, 0), config, None, 1)
+    base, maps = (passes.adam.start(passes.adam.padded(values)) for values in (texels, surface))
+    lights = [_padded(light, len(base.texels)) for light in texture_lights(cloud, exposures.cameras, exposures.light)]
+    gradient = torch.zeros_like(base.texels)
+    for step in range(config.map_steps):
+        rate = _LEARNING_RATE * 0.5 * (1 + math.cos(math.pi * step / config.map_steps))
+        total = 0.0
+        for index in _sample(len(exposures), step, config.seed):
+            shaded = _Shaded(shader[0](base.texels, maps.texels, lights[index]), gradient.zero_(), getattr(base, "occupied", None))
+            total += float(passes.differentiate(shaded, [index], alpha, False)[0]) / _BATCH
+            gradient[:, 3] = 0  # alpha is not to change
+            shader[1](base.texels, maps.texels, lights[index], gradient, base.gradient, maps.gradient)
+        maps.gradient[:, 3] = 0  # nor translucency
+        for state in (base, maps):
+            state.update(step + 1, rate, (config.beta1, config.beta2))
+        if on_step is not None:
+            on_step(step + 1, total)
+    count = len(cloud.texels)
+    fitted = replace(cloud, texels=base.texels[:count], surface=maps.texels[:count], light=views.train.light[[0]].to(device))
+    return bled(fitted.to("cpu"))
+
+
+def bled(cloud: BillboardCloud) -> BillboardCloud:
+    """Give the transparent texels of a cloud with maps the maps of the nearest opaque ones, because filtering shows them."""
+    assert cloud.surface is not None
+    maps = torch.cat([cloud.surface[:, :3], cloud.texels[:, 3:]], 1)
+    sides = [bleed_color(side).reshape(-1, 4) for texture in cloud.textures(maps) for side in texture]
+    color = [bleed_color(side).reshape(-1, 4) for texture in cloud.textures() for side in texture]
+    return replace(cloud, texels=torch.cat(color), surface=torch.cat([torch.cat(sides)[:, :3], cloud.surface[:, 3:]], 1))
+
+
+def baked_maps(cloud: BillboardCloud, lit: LitViews, backend: Backend = "auto") -> tuple[Tensor, Tensor]:
+    """Texels and maps, [P, 4] each, as the means of what views show of the surfaces, weighted by the weight of each texel in each pixel.
+
+    Base color and normals are those of the passes that Blender renders. A normal turns with the side that a view sees. Occlusion is the
+    radiance under the sky alone over the base color. Without passes, base color is that of the texels, and normals are the planes'. This is
+    what bakers of impostors do, on the planes of the cloud. At most 24 of the cameras count, evenly spaced.
+    """
+    plain = torch.tensor(_PLAIN, dtype=cloud.texels.dtype, device=cloud.texels.device).repeat(len(cloud.texels), 1)
+    if lit.albedo is None or lit.normal is None:
+        return cloud.texels, plain
+    chosen = [index * len(lit.skies) // _BAKED for index in range(_BAKED)] if len(lit.skies) > _BAKED else list(range(len(lit.skies)))
+    cameras = lit.skies.cameras[chosen].to(cloud.texels.dtype).to(cloud.texels.device)
+    color, light, normal = (torch.zeros_like(cloud.texels[:, :3]) for _ in range(3))
+    billboard = torch.repeat_interleave(cloud.texture_sizes.prod(-1) * (1 + cloud.two_sided.long()))
+    rights, ups, normals = (axes[billboard] for axes in (cloud.rights, cloud.ups, cloud.normals))
+    for number, index in enumerate(chosen):
+        albedo, sky, facing = (part.images([index])[0].to(cloud.texels) / 255 for part in (lit.albedo, lit.skies, lit.normal))
+        alpha = albedo[..., 3:]
+        weigh = _weights(cloud, cameras[number], backend)
+        color += weigh(albedo[..., :3] * alpha)
+        radiance, reflectance = (decode(picture[..., :3]).mean(-1, keepdim=True) for picture in (sky, albedo))
+        light += weigh(torch.cat([torch.ones_like(alpha), radiance, reflectance], -1) * alpha)
+        x, y, z = (2 * facing[..., :3] - 1).unbind(-1)
+        world = weigh(torch.stack([x, z, -y], -1) * alpha)
+        along = (world * normals).sum(-1)
+        side = torch.where(cloud.two_sided, 1.0, _side(cloud, cameras[number]))[billboard]
+        normal += torch.stack([(world * rights).sum(-1), (world * ups).sum(-1), side * along], -1)
+    seen = light[:, :1] > _LEAST_WEIGHT
+    base = torch.where(seen, color / light[:, :1].clamp_min(_LEAST_WEIGHT), cloud.texels[:, :3]).clamp(0, 1)
+    tangent = normalize(normal, dim=-1)
+    across = torch.where(tangent[:, 2:] < 0, normalize(tangent[:, :2], dim=-1), tangent[:, :2])
+    occlusion = light[:, 1:2] / light[:, 2:].clamp_min(1e-4)
+    maps = torch.cat([(across + 1) / 2, occlusion, torch.zeros_like(occlusion)], -1).clamp(0, 1)
+    return torch.cat([base, cloud.texels[:, 3:]], 1), torch.where(seen, maps, plain)
+
+
+def _weights(cloud: BillboardCloud, camera: Camera, backend: Backend) -> Callable[[Tensor], Tensor]:
+    """The function that sums a picture, [H, W, 3], over its pixels with the weight of each texel in each pixel, [P, 3]."""
+    texels = cloud.texels.detach().clone().requires_grad_()
+    with torch.enable_grad():
+        image = render(cloud.with_texels(texels), camera, backend=backend)
+
+    def weigh(picture: Tensor) -> Tensor:
+        values = torch.cat([picture, torch.zeros_like(picture[..., :1])], -1)
+        return torch.autograd.grad(image, texels, values, retain_graph=True)[0][:, :3]
+
+    return weigh
+
+
+def _side(cloud: BillboardCloud, camera: Camera) -> Tensor:
+    """1 for each billboard whose front a camera sees, -1 for the others, [N]."""
+    towards = -camera.forward if camera.orthographic else camera.position - cloud.centers
+    return torch.where((towards * cloud.normals).sum(-1) >= 0, 1.0, -1.0).to(cloud.texels)
+
+
+def _other_suns(lit: LitViews, baked: Light) -> list[int]:
+    """The pictures under another sun than that of the views' own pictures, or all if there are none."""
+    other = torch.nonzero((lit.directions - baked.sun_directions[0]).norm(dim=-1) > _SAME_SUN)[:, 0].tolist()
+    return other or list(range(len(lit)))
+
+
+def _sample(count: int, step: int, seed: int) -> list[int]:
+    """The exposures, out of ``count``, of a step: all of them in random order, then again."""
+    batch = min(_BATCH, count)
+    batches = count // batch
+    return np.random.default_rng([seed, step // batches, 1]).permutation(count)[step % batches * batch :][:batch].tolist()
+
+
+def _padded(light: TextureLight, count: int) -> TextureLight:
+    """The light for as many texels as an optimizer has, which may be more than a cloud has."""
+    texture = light.texture.new_zeros(count)
+    texture[: len(light.texture)] = light.texture
+    return replace(light, texture=texture)
+
+
+def _fused_shading() -> tuple[Callable[..., Tensor], Callable[..., None]]:
+    from bbfit.operators.shading.fused import pull_back, shaded  # Warp takes a while to start
+
+    return shaded, pull_back
+
+
+def _pull_back_reference(
+    texels: Tensor, surface: Tensor, light: TextureLight, gradient: Tensor, of_texels: Tensor, of_surface: Tensor
+) -> None:
+    leaves = texels.detach().requires_grad_(), surface.detach().requires_grad_()
+    for total, part in zip((of_texels, of_surface), torch.autograd.grad(shade_reference(*leaves, light), leaves, gradient), strict=True):
+        total += part
+
+
+_reference_shading = (shade_reference, _pull_back_reference)
