@@ -84,9 +84,23 @@ function describe(material) {
   return { name, type, alphaTest, transparent, side: SIDES[side], map: picture };
 }
 
+// A sun and an even sky as bbfit has them (docs/engines.md).
+const sun = new THREE.DirectionalLight();
+const sky = new THREE.AmbientLight();
+
+function illuminate({ direction, strength, color, ambient }) {
+  sun.position.set(...direction);
+  sun.color.setRGB(...color);
+  sun.intensity = strength;
+  sky.intensity = Math.PI * ambient;
+  scene.add(sun, sun.target, sky);
+  scene.updateMatrixWorld(true);
+}
+
 // Draws one view. Matrices are lists of 16 numbers, row after row. Pixels are RGBA bytes in base 64, the bottom row first.
-window.draw = ({ projection, cameraToWorld, width, height }) => {
+window.draw = ({ projection, cameraToWorld, width, height, light }) => {
   renderer.setSize(width, height, false);
+  if (light !== null) illuminate(light);
   const camera = new THREE.Camera();
   camera.matrixAutoUpdate = camera.matrixWorldAutoUpdate = false;
   camera.matrixWorld.set(...cameraToWorld);

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Browser, ConsoleMessage, Page, Route
 
 from bbfit.geometry.camera import Camera
+from bbfit.geometry.light import Light
 
 HERE = Path(__file__).parent
 NODE = HERE.parent / "node"
@@ -75,25 +76,26 @@ class ThreeViewer:
         self._glb = Path()
         self._errors, self._warnings = list[str](), list[str]()
 
-    def render(self, glb: Path, camera: Camera, *, node: str | None = None) -> NDArray[np.float64]:
+    def render(self, glb: Path, camera: Camera, *, node: str | None = None, light: Light | None = None) -> NDArray[np.float64]:
         """Pictures over white of a batch of cameras, [V, H, W, 3]; see :meth:`show`."""
-        return self.show(glb, camera, node=node).images
+        return self.show(glb, camera, node=node, light=light).images
 
-    def show(self, glb: Path, camera: Camera, *, node: str | None = None) -> ThreeShow:
-        """Load a GLB and draw it from a batch of V cameras.
+    def show(self, glb: Path, camera: Camera, *, node: str | None = None, light: Light | None = None) -> ThreeShow:
+        """Load a GLB and draw it from a batch of V cameras, in V lights if there are any.
 
         ``node`` shows only the node of that name with its descendants, in the scene or beside it, as levels of detail are.
         Whatever the page reports as an error is an ``AssertionError``; the next model then has a new page.
         """
-        return self._thread.submit(self._show, glb, camera.batch(), node).result()
+        return self._thread.submit(self._show, glb, camera.batch(), node, light).result()
 
-    def _show(self, glb: Path, camera: Camera, node: str | None) -> ThreeShow:
+    def _show(self, glb: Path, camera: Camera, node: str | None, light: Light | None) -> ThreeShow:
         self._glb = glb
         self._warnings.clear()
         page = self._page = self._page or self._open()
         try:
             found = page.evaluate("node => window.load(node)", node)
-            views = [_draw(page, camera[index], np.array([found["low"], found["high"]])) for index in range(len(camera))]
+            bounds = np.array([found["low"], found["high"]])
+            views = [_draw(page, camera[index], bounds, None if light is None else light[[index]]) for index in range(len(camera))]
             assert not self._errors, self._errors
         except BaseException:
             self._close()
@@ -154,7 +156,7 @@ def projection_matrix(camera: Camera, near: float, far: float) -> NDArray[np.flo
     return np.stack([x, y, z, w]) @ FLIP
 
 
-def _draw(page: Page, camera: Camera, bounds: NDArray[np.float64]) -> tuple[NDArray[np.float64], int, int]:
+def _draw(page: Page, camera: Camera, bounds: NDArray[np.float64], light: Light | None) -> tuple[NDArray[np.float64], int, int]:
     distance = float(np.linalg.norm(camera.position.double().numpy() - bounds.mean(0)))
     radius = 1.01 * float(np.linalg.norm(bounds[1] - bounds[0])) / 2
     view = {
@@ -162,10 +164,21 @@ def _draw(page: Page, camera: Camera, bounds: NDArray[np.float64]) -> tuple[NDAr
         "cameraToWorld": (camera.camera_to_world.double().numpy() @ FLIP).ravel().tolist(),
         "width": camera.width,
         "height": camera.height,
+        "light": None if light is None else light_values(light),
     }
     drawn = page.evaluate("view => window.draw(view)", view)
     pixels = np.frombuffer(base64.b64decode(drawn["pixels"]), np.uint8).reshape(camera.height, camera.width, 4)
     return pixels[::-1, :, :3] / 255.0, drawn["calls"], drawn["triangles"]
+
+
+def light_values(light: Light) -> dict[str, Any]:
+    """One light as the pages of programs expect it."""
+    return {
+        "direction": light.sun_directions[0].tolist(),
+        "strength": light.sun_strengths.item(),
+        "color": light.sun_colors[0].tolist(),
+        "ambient": light.ambients.item(),
+    }
 
 
 def _material(found: dict[str, Any]) -> ThreeMaterial:
