@@ -31,14 +31,24 @@ def check_model_path(name: str, path: str | Path) -> Path:
     return check_output_file(name, path)
 
 
-def names_beside(path: Path, *, texture: bool = False, mip_files: bool = False) -> list[str]:
+def names_beside(path: Path, *, texture: bool = False, normals: bool = False, mip_files: bool = False) -> list[str]:
     """The names of the files that a model at ``path`` consists of, the model first.
 
-    A GLB is one file. An OBJ has a material library, and with ``texture`` a texture. ``mip_files`` adds a pattern for mip levels.
+    A GLB is one file. An OBJ has a material library, with ``texture`` a texture, and with ``normals`` a map of normals. ``mip_files``
+    adds a pattern for mip levels.
     """
-    others = [".mtl", *([".png"] if texture else [])] if path.suffix.lower() == ".obj" else []
+    if path.suffix.lower() != ".obj":
+        others = list[str]()
+    else:
+        maps = [normals_path(path).name] if normals else []
+        others = [path.with_suffix(suffix).name for suffix in (".mtl", *([".png"] if texture else []))] + maps
     levels = [f"{glob.escape(path.stem)}_mip*.png"] if mip_files else []
-    return [path.name, *(path.with_suffix(suffix).name for suffix in others), *levels]
+    return [path.name, *others, *levels]
+
+
+def normals_path(path: Path) -> Path:
+    """The file of the normals of a model at ``path``."""
+    return path.with_name(f"{path.stem}_normals.png")
 
 
 def glb_of_scene(scene: trimesh.Scene, complete: Callable[[dict[str, Any]], None], *, normals: bool = True) -> bytes:

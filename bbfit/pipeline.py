@@ -54,7 +54,7 @@ class RunConfig:
     grow: GrowConfig = field(default_factory=lambda: GrowConfig(detail=0.5))
     """Options for growing a tree. The default is moderate detail."""
     views: ViewsConfig = field(default_factory=ViewsConfig)
-    """Options for rendering the tree."""
+    """Options for rendering the tree. For a fit of maps, ``suns`` is at least 1."""
     fit: FitConfig = field(default_factory=FitConfig)
     """Options for fitting the billboards."""
     budget: BudgetConfig = field(default_factory=BudgetConfig)
@@ -67,6 +67,8 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.fit.preset == "thesis" and self.views.elevations is None:
             object.__setattr__(self, "views", replace(self.views, elevations=RING))
+        if self.fit.light == "maps" and not self.views.suns:
+            object.__setattr__(self, "views", replace(self.views, suns=1))
 
     def check(self, *, mesh: bool, rendered: bool, blender: bool) -> None:
         """Check all options together, before a folder is made or a tree is grown or rendered.
@@ -92,6 +94,8 @@ class RunConfig:
             self.limits.at_most("max_input_pixels", "size", "a view", self.views.size**2, "pixels")
             self.limits.at_most("max_input_frames", "count", "the tree", self.views.count, "views")
         if self.budget.given:
+            if self.fit.light == "maps":
+                fail("budget", "it does not count the bytes of maps", "leave out --budget, or fit with --light baked")
             check_budget(self.fit, self.budget)
         else:
             self.fit.resolve()
@@ -248,7 +252,12 @@ def prepare(
 def _record(out: str | Path, head: dict[str, Any], config: RunConfig, inputs: Iterable[Path | None]) -> Iterator[Record]:
     """The record of a run's folder, which no other process can write to until the context ends, and which has room for the results."""
     outputs: dict[str, tuple[str, ...]] = {"grow": GROW_OUTPUTS} if head["config"]["grow"] else {}
-    outputs |= {"fit": FIT_OUTPUTS, "export": export_outputs(config.export), "evaluate": EVALUATE_OUTPUTS, "report": REPORT_OUTPUTS}
+    outputs |= {
+        "fit": FIT_OUTPUTS,
+        "export": export_outputs(config.export, normals=config.fit.light == "maps"),
+        "evaluate": EVALUATE_OUTPUTS,
+        "report": REPORT_OUTPUTS,
+    }
     outputs |= {"budget": BUDGET_OUTPUTS} if config.budget.given else {}
     with claimed_folder("out", out) as folder:
         record = Record(folder, head, [path for path in inputs if path is not None])

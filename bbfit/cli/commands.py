@@ -224,6 +224,7 @@ def evaluate_command(
                 export=export,
                 original=original,
                 turned=dataset.turned,
+                lit=dataset.lit_test,
                 on_progress=partial(on_progress, "evaluate"),
             )
         report = replace(report, seconds={**seconds, **report.seconds})
@@ -255,7 +256,7 @@ def export_command(
     out = check_model_path("model file", out)
     export.check()
     billboards = BillboardCloud.load(cloud)
-    names = names_beside(out, texture=True, mip_files=export.resolve().mip_files)
+    names = names_beside(out, texture=True, normals=billboards.surface is not None, mip_files=export.resolve().mip_files)
     with single_files("bbfit export", out.parent, names, [cloud]):
         paths = model.export(billboards, out, export)
     for path in paths:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.checks import check_file, check_record
+from bbfit.evaluation.light import LightScore
 from bbfit.evaluation.measures import Measures, mean_measures
 from bbfit.evaluation.trunk import TrunkScore
 from bbfit.files import read_json, write_json
@@ -134,6 +135,8 @@ class Report:
     """The change between neighboring views in smaller and smaller pictures, the largest first; empty if the views have no neighbors."""
     trunk: TrunkScore | None = None
     """The trunk below the crown, or ``None`` if no view from near the horizon shows one."""
+    light: LightScore | None = None
+    """The model under held-out suns, or ``None`` if the views have one light."""
 
     @property
     def mean(self) -> Measures:
@@ -175,6 +178,7 @@ class Report:
             "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw", "shaded",
             "antialiased": {the same measures} or None,
             "trunk": {"iou", "worst_iou", "delta_e", "worst_view", "views": [{"name", "iou", "delta_e"}]} or None,
+            "light": {"psnr", "flip", "low", "r2", "suns": [..], "views": [..]} or None (:class:`~bbfit.evaluation.light.LightScore`),
             "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
             "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
             "shimmer": [{"width", "height", "tree", "ratio", "antialiased"}],
@@ -187,6 +191,7 @@ class Report:
             "overdraw": self.overdraw,
             "shaded": self.shaded,
             "trunk": None if self.trunk is None else self.trunk.to_json(),
+            "light": None if self.light is None else self.light.to_json(),
             "alpha": {"mode": self.alpha.kind, "cutoff": self.alpha.cutoff},
             "seconds": dict(self.seconds),
             "sizes": [asdict(size) for size in self.sizes],
@@ -227,7 +232,9 @@ class Report:
             shaded = content["shaded"]
             trunk = None if content["trunk"] is None else TrunkScore.from_json(content["trunk"])
             shimmer = tuple(ShimmerScore(**size) for size in content["shimmer"])
-            report = Report(scores, vertices, sizes, dict(content["seconds"]), alpha, content["overdraw"], afar, shaded, shimmer, trunk)
+            light = None if content["light"] is None else LightScore.from_json(content["light"])
+            seconds, overdraw = dict(content["seconds"]), content["overdraw"]
+            report = Report(scores, vertices, sizes, seconds, alpha, overdraw, afar, shaded, shimmer, trunk, light)
             if not scores:
                 raise ValueError("it has no views")
             check_record("report", report, Report)

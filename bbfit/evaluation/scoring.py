@@ -13,6 +13,7 @@ from torch import Tensor
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.evaluation import metrics, thesis_scale
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
+from bbfit.evaluation.light import held_out_suns, score_light
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.report import Cost, Report, ShimmerScore, ViewScore
 from bbfit.evaluation.shimmer import score_shimmer
@@ -25,6 +26,7 @@ from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.rendering.cards import CardRenderer
 from bbfit.views.dataset import TurnedViews
+from bbfit.views.lit import LitViews
 from bbfit.views.view_set import ViewSet
 
 
@@ -50,6 +52,7 @@ def evaluate(
     export: ExportConfig | None = None,
     original: OriginalTree | None = None,
     turned: TurnedViews | None = None,
+    lit: LitViews | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Report:
     """Measure a billboard cloud, as it is exported, against views that it was not fitted to.
@@ -68,6 +71,8 @@ def evaluate(
         The size of the original tree. Without it the report has no ratios.
     turned : TurnedViews
         Pairs of neighboring views, ``ViewDataset.turned``. Without them the report has no shimmer.
+    lit : LitViews
+        Held-out views under many lights, ``ViewDataset.lit_test``. Without them the report has no score under light.
     on_progress : callable
         Called with the number of finished pictures or picture sizes and their total.
 
@@ -81,7 +86,7 @@ def evaluate(
     InputError
         if there are no views or they are too small, if the cloud is empty, or if it draws numbers that are not finite.
     """
-    return evaluate_model(shipped_model(cloud, export), views, original=original, turned=turned, on_progress=on_progress)
+    return evaluate_model(shipped_model(cloud, export), views, original=original, turned=turned, lit=lit, on_progress=on_progress)
 
 
 def evaluate_model(
@@ -90,12 +95,15 @@ def evaluate_model(
     *,
     original: OriginalTree | None = None,
     turned: TurnedViews | None = None,
+    lit: LitViews | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Report:
     """Do what :func:`evaluate` does for a model whose polygons or file may already be computed."""
     started, original, on_progress = time.perf_counter(), original or OriginalTree(), on_progress or (lambda done, total: None)
     smooth = model.antialiased().draw if model.cloud.alpha.kind == "mask" else None
-    total, trunks = len(views) + HALVINGS + 1 + (turned is not None), list[TrunkView | None]()
+    under_suns = lit if lit is not None and views.light is not None else None
+    suns = len(held_out_suns(under_suns, views.light)) if under_suns is not None and views.light is not None else 0
+    total, trunks = len(views) + HALVINGS + 1 + (turned is not None) + suns, list[TrunkView | None]()
     names, elevations = views.names, view_angles(views.cameras)[:, 1].tolist()
 
     def drawn(index: int) -> Tensor:
@@ -113,7 +121,16 @@ def evaluate_model(
     shimmer: tuple[ShimmerScore, ...] = ()
     if turned is not None:
         shimmer = score_shimmer(model.draw, turned, smooth)
-        on_progress(total, total)
+        on_progress(total - suns, total)
+    light = None
+    if under_suns is not None and views.light is not None:
+        shown, has_maps = smooth or model.draw, model.cloud.surface is not None
+        light = score_light(
+            lambda camera, light: shown(camera, light if has_maps else None),
+            under_suns,
+            views.light[[0]],
+            lambda done, _: on_progress(total - suns + done, total),
+        )
     return Report(
         views=scores,
         vertices=Cost(model.cards.vertex_count, original.vertices),
@@ -124,6 +141,7 @@ def evaluate_model(
         shaded=score_shading(model.cards, views),
         shimmer=shimmer,
         trunk=trunk_score(trunks),
+        light=light,
         seconds={"evaluate": time.perf_counter() - started},
     )
 

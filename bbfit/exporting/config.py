@@ -63,7 +63,7 @@ class ExportConfig:
     """Also write the mip levels as PNG files beside the model, for programs that import them."""
     material: Material | None = None
     """unlit: colors as they are, with the light that the tree was rendered in. pbr: a rough dielectric that the program lights again.
-    Default: unlit."""
+    Default: unlit. A cloud with maps has a matte material of its own, which takes the program's light."""
     padding: Count = 8
     """Free texels around each texture in the atlas, at least 1; with 8 the mip levels 1 to 3 never mix two textures."""
     up: Up = "auto"

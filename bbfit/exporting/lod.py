@@ -110,7 +110,8 @@ def _append(tree: dict[str, Any], other: dict[str, Any], name: str) -> int:
     for material in other["materials"]:
         surface = material["pbrMetallicRoughness"]
         picture = moved(surface["baseColorTexture"], index="textures")
-        tree["materials"].append(material | {"pbrMetallicRoughness": surface | {"baseColorTexture": picture}})
+        maps = {name: moved(material[name], index="textures") for name in ("normalTexture", "occlusionTexture") if name in material}
+        tree["materials"].append(material | {"pbrMetallicRoughness": surface | {"baseColorTexture": picture}} | maps)
     for mesh in other["meshes"]:
         primitives = [
             moved(primitive, indices="accessors", material="materials")

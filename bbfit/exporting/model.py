@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
 from torch import Tensor
 
+from bbfit.checks import fail
 from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.gltf import glb_bytes
@@ -24,7 +26,7 @@ from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.light import Light
 from bbfit.images import encode_png
-from bbfit.model_files import check_model_path
+from bbfit.model_files import check_model_path, normals_path
 from bbfit.rendering.cards import CardRenderer
 from bbfit.rendering.dispatch import render
 
@@ -104,11 +106,15 @@ class ShippedModel:
             contents = {path: self.glb}
         else:
             material, texture = path.with_suffix(".mtl"), path.with_suffix(".png")
+            atlas, normals = self.cards.atlas, normals_path(path)
+            has_maps = atlas.surface is not None
             contents = {
                 path: obj_bytes(self.cards, self.config, material_file=material.name),
-                material: mtl_bytes(texture_file=texture.name),
-                texture: encode_png(self.cards.atlas.image),
+                material: mtl_bytes(texture_file=texture.name, normals_file=normals.name if has_maps else None),
+                texture: encode_png(atlas.image),
             }
+            if atlas.surface is not None:
+                contents[normals] = encode_png(np.ascontiguousarray(atlas.surface[..., :3]))
         if self.config.mip_files:
             levels = enumerate(self.cards.chain or [self.cards.atlas.image])
             contents |= {path.with_name(f"{path.stem}_mip{level}.png"): encode_png(image) for level, image in levels}
@@ -123,6 +129,8 @@ def shipped_model(cloud: BillboardCloud, config: ExportConfig | None = None, hal
     ``halvings`` halves the sides of the textures that many times, for a model that is only seen from afar.
     """
     resolved = (config or ExportConfig()).resolve()
+    if cloud.surface is not None and config is not None and config.material == "unlit":
+        fail("material", "the cloud has maps, whose colors contain no light", "leave out --material, or fit with --light baked")
     alpha = AlphaMode(resolved.alpha or cloud.alpha.kind, resolved.alpha_cutoff or cloud.alpha.cutoff)
     return ShippedModel(replace(cloud, alpha=alpha), resolved, halvings)
 

@@ -38,8 +38,12 @@ def obj_bytes(cards: Cards, config: ExportConfig, *, material_file: str) -> byte
     return ("\n".join(lines) + "\n").encode(errors="surrogateescape")
 
 
-def mtl_bytes(*, texture_file: str) -> bytes:
-    """The material library: the texture's unlit color (illumination model 0) and its alpha as opacity."""
+def mtl_bytes(*, texture_file: str, normals_file: str | None = None) -> bytes:
+    """The material library: the texture's unlit color (illumination model 0) and its alpha as opacity.
+
+    With normals the color is a matte surface's (illumination model 1), and ``norm`` names their map, as extensions of MTL for physically
+    based materials have it. MTL has no map of occlusion.
+    """
     lines = [
         "# bbfit billboard cloud",
         f"newmtl {_MATERIAL}",
@@ -47,9 +51,10 @@ def mtl_bytes(*, texture_file: str) -> bytes:
         "Kd 1 1 1",
         "Ks 0 0 0",
         "d 1",
-        "illum 0",
+        f"illum {0 if normals_file is None else 1}",
         f"map_Kd {texture_file}",
         f"map_d {texture_file}",
+        *([] if normals_file is None else [f"norm {normals_file}"]),
     ]
     return ("\n".join(lines) + "\n").encode(errors="surrogateescape")
 

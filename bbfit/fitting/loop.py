@@ -221,7 +221,8 @@ def fit(
 
 def fit_inputs(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> tuple[Any, ...]:
     """Return the inputs that determine the result of :func:`fit`: configuration, training views, and the mesh if the placement uses it."""
-    return config, views.train.fingerprint, None if tree is None or config.placement == "even" else tree.digest
+    lit = views.lit_train.fingerprint if config.light == "maps" and views.lit_train is not None else None
+    return config, views.train.fingerprint, lit, None if tree is None or config.placement == "even" else tree.digest
 
 
 def _initial_state(

@@ -18,7 +18,7 @@ from bbfit.fitting.steps import BLEND, pass_of
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.geometry.light import Light
+from bbfit.geometry.light import SUNNY, Light
 from bbfit.images import bleed_color
 from bbfit.operators.config import Backend
 from bbfit.operators.shading.reference import TextureLight, decode, shade_reference, texture_lights
@@ -27,8 +27,6 @@ from bbfit.views.dataset import ViewDataset
 from bbfit.views.lit import LitViews
 from bbfit.views.view_set import ViewSet
 
-SUNNY = (1.8 * math.pi, 0.4)
-"""Strengths of the sun and of the sky on a sunny day: a white surface that faces the sun has 1.8 and 0.4 times the radiance of white."""
 _LEARNING_RATE = 0.025
 # Exposures in a step.
 _BATCH = 4
@@ -56,9 +54,9 @@ def fit_maps(
 ) -> BillboardCloud:
     """Fit maps to the training views under many lights, for a cloud whose placement and alpha are fitted.
 
-    Each step draws some exposures: training views under their baked light, or under another of their suns on a sunny day (:data:`SUNNY`).
-    Texels are shaded in that light and drawn, and Adam takes the gradient of the loss in the maps. Placement and alpha stay as they are.
-    The start is :func:`baked_maps`.
+    Each step draws some exposures: training views under their baked light, or under another of their suns on a sunny day
+    (:data:`~bbfit.geometry.light.SUNNY`). Texels are shaded in that light and drawn, and Adam takes the gradient of the loss in the maps.
+    Placement and alpha stay as they are. The start is :func:`baked_maps`.
 
     ``views`` have ``lit_train`` and the light of their own pictures. ``on_step`` is called with the number of each step, from 1, and its
     loss. Returns the cloud with its maps; ``light`` is that of the views' own pictures.

@@ -66,6 +66,15 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
         trunk = report.trunk
         table.add_row("trunk's IoU, worst view", _UP, "", "", f"{trunk.iou:.4f}, {trunk.worst.iou:.4f}", "")
 
+    if report.light is not None:
+        table.add_section()
+        table.add_row("under other suns", "", "", "", "", "", style="bold")
+        light = report.light
+        table.add_row("PSNR, dB", _UP, f"{light.psnr:.2f}", "", "", "")
+        table.add_row("FLIP", _DOWN, f"{light.flip:.4f}", "", "", "")
+        table.add_row("PSNR of blocks, dB", _UP, "", "", "-" if light.low is None else f"{light.low:.2f}", "")
+        table.add_row("change of light, R2", _ONE, "", "", _share(light.r2), "")
+
     if report.antialiased is not None:
         table.add_section()
         table.add_row("with alpha to coverage", "", "", "", "", "", style="bold")

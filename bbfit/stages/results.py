@@ -26,9 +26,10 @@ EVALUATE_OUTPUTS = ("metrics.json", "comparison.png")
 REPORT_OUTPUTS = ("report.html",)
 
 
-def export_outputs(config: ExportConfig) -> tuple[str, ...]:
-    """The files that :func:`export_stage` writes."""
-    return ("model.glb", "model.obj", "model.mtl", "model.png", *(("model_mip*.png",) if config.mip_files else ()))
+def export_outputs(config: ExportConfig, *, normals: bool = False) -> tuple[str, ...]:
+    """The files that :func:`export_stage` writes, with ``normals`` for a cloud with maps."""
+    optional = [*(["model_normals.png"] if normals else []), *(["model_mip*.png"] if config.mip_files else [])]
+    return ("model.glb", "model.obj", "model.mtl", "model.png", *optional)
 
 
 def export_stage(folder: Path, model: ShippedModel) -> Stage:
@@ -39,7 +40,8 @@ def export_stage(folder: Path, model: ShippedModel) -> Stage:
             model.save(folder / f"model{suffix}")
             on_progress("export", step, 2)
 
-    return Stage("export", (model.config, digest_file(folder / "cloud.safetensors")), export_outputs(model.config), work)
+    outputs = export_outputs(model.config, normals=model.cloud.surface is not None)
+    return Stage("export", (model.config, digest_file(folder / "cloud.safetensors")), outputs, work)
 
 
 def evaluate_stage(folder: Path, model: ShippedModel, views: ViewDataset, tree: TreeFile | None, seconds: Mapping[str, float]) -> Stage:
@@ -51,13 +53,14 @@ def evaluate_stage(folder: Path, model: ShippedModel, views: ViewDataset, tree: 
 
     def work(on_progress: OnProgress) -> None:
         original, progress = original_tree(views, tree), partial(on_progress, "evaluate")
-        report = evaluate_model(model, views.test, original=original, turned=views.turned, on_progress=progress)
+        report = evaluate_model(model, views.test, original=original, turned=views.turned, lit=views.lit_test, on_progress=progress)
         replace(report, seconds={**seconds, **report.seconds}).save(folder / "metrics.json")
         comparison_picture(model, views.test, folder / "comparison.png")
 
     results = [digest_file(folder / name) for name in ("cloud.safetensors", "model.glb")]
     turned = None if views.turned is None else (views.turned.views.fingerprint, views.turned.turned.fingerprint)
-    inputs = (results, model.cloud.alpha, views.fingerprint, turned, None if tree is None else tree.digest)
+    lit = None if views.lit_test is None else views.lit_test.fingerprint
+    inputs = (results, model.cloud.alpha, views.fingerprint, turned, lit, None if tree is None else tree.digest)
     return Stage("evaluate", inputs, EVALUATE_OUTPUTS, work)
 
 

@@ -1,0 +1,44 @@
+"""Models with maps in the real three.js: it shows what bbfit shows in the same light."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from glb_edit import with_min_filter
+from noise_scene import noise_cloud
+from three_viewer import ThreeViewer
+
+from bbfit.evaluation.metrics import psnr
+from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.model import shipped_model
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.light import Light, sky
+from bbfit.images import over_color
+
+sys.path.append(str(Path(__file__).parents[1] / "exporting"))
+from test_lit import with_maps
+
+BILINEAR = 9729
+
+
+@pytest.mark.parametrize("two_sided", [False, True])
+@pytest.mark.parametrize("alpha", ["mask", "blend"])
+def test_three_lights_maps_as_bbfit_does(alpha: str, two_sided: bool, three: ThreeViewer, around: Camera, tmp_path: Path) -> None:
+    """Five views under five suns, from both sides of each plane."""
+    count = 3 if alpha == "mask" else 1
+    cloud = with_maps(noise_cloud(count, texels=32, two_sided=two_sided))
+    model = shipped_model(cloud, ExportConfig(alpha=alpha, outline="rectangle", mipmaps=False))
+    lights = Light.of(sky(5, 40.0), 1.8 * torch.pi, 0.4, (1.0, 0.9, 0.8))
+    (path,) = model.save(tmp_path / "model.glb")
+    show = three.show(with_min_filter(path, BILINEAR), around, light=lights)
+    own = over_color(model.draw(around, lights).double()).numpy()
+    assert psnr(own, show.images) >= 33
+    (material,) = show.materials
+    assert (material.kind, material.side) == ("MeshPhysicalMaterial", "front") and not show.warnings
+    opposite = Light(lights.sun_directions * torch.tensor([-1.0, 1.0, -1.0]), *list(vars(lights).values())[1:])
+    assert psnr(over_color(model.draw(around, opposite).double()).numpy(), show.images) < 28
+    assert np.ptp(show.images.mean((1, 2, 3))) > 0
