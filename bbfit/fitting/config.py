@@ -148,8 +148,8 @@ class FitConfig:
     """How many billboards may lie before each other, on average over the rectangle around the tree, when the fit chooses their number.
     More layers look better, and a graphics card shades all of them. Preset: 1.85 (mask) or 3.2."""
     light: Lighting = "baked"
-    """baked: colors contain the light of the views. maps: base color, normals and occlusion, which take the light of a program; they need
-    views under many lights (views --suns)."""
+    """baked: colors contain the light of the views. maps: base color, normals and occlusion, which take the light of a program.
+    Maps need views under many lights (suns)."""
     map_steps: Count = 150
     """Steps of the optimizer for maps, after those for placement and alpha."""
     placement: Placement | None = None

@@ -170,7 +170,7 @@ def _levels(cards: Cards) -> MipChain:
     if cards.atlas.surface is not None:
         surfaces = [cards.atlas.surface] if cards.surface_chain is None else cards.surface_chain
         chain = [np.concatenate(level, -1) for level in zip(chain, surfaces, strict=True)]
-    return joined(chain, (*cards.atlas.image.shape[:2], chain[0].shape[2]))
+    return joined(chain, (*cards.atlas.image.shape[:2], 4 if cards.atlas.surface is None else 8))
 
 
 def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> MipChain:

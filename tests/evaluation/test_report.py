@@ -77,6 +77,7 @@ def test_schema() -> None:
         "overdraw",
         "shaded",
         "trunk",
+        "light",
         "alpha",
         "seconds",
         "sizes",
