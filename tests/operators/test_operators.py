@@ -20,7 +20,14 @@ from bbfit.operators.sharpness.reference import sharpness_reference
 from bbfit.operators.ssim.fused import ssim_fused
 from bbfit.operators.ssim.reference import ssim_reference
 
-STEMS = {"adam": "Adam", "drawing": "render_", "image_loss": "image_loss_", "sharpness": "sharpness_", "ssim": "ssim_"}
+STEMS = {
+    "adam": "Adam",
+    "drawing": "render_",
+    "image_loss": "image_loss_",
+    "shading": "shade_",
+    "sharpness": "sharpness_",
+    "ssim": "ssim_",
+}
 
 
 def test_every_operator_has_a_folder_with_both_implementations_and_kernels() -> None:
