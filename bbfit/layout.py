@@ -21,7 +21,7 @@ from torch import Tensor
 from bbfit.checks import MissingFileError, check_range, fail
 from bbfit.files import read_json, write_json
 from bbfit.geometry.camera import Camera, camera_from_nerf, camera_to_nerf, pinhole_intrinsics
-from bbfit.geometry.light import Light
+from bbfit.geometry.light import Light, from_z_up, to_z_up
 from bbfit.inputs import LARGEST, InputLimits, reading
 
 _LIMITS = InputLimits()
@@ -132,8 +132,8 @@ def write_lit(folder: Path, camera: Camera, lit: Mapping[int, LitPaths], train: 
 
 def _light_entry(light: Light) -> dict[str, Any]:
     """The entry of a light, a batch of one, in the file's axes."""
-    strength, (x, y, z) = light.sun_strengths.item(), light.sun_directions[0].tolist()
-    sun = {"sun_direction": [x, -z, y], "sun_strength": strength, "sun_color": light.sun_colors[0].tolist()}
+    strength, towards = light.sun_strengths.item(), to_z_up(light.sun_directions[0].tolist())
+    sun = {"sun_direction": towards, "sun_strength": strength, "sun_color": light.sun_colors[0].tolist()}
     return (sun if strength else {"sun_strength": 0.0}) | {"ambient": light.ambients.item()}
 
 
@@ -289,7 +289,7 @@ def _light(entry: Any) -> Light | None:
         red, green, blue = map(float, entry.get("sun_color", (1, 1, 1)))
         if not max(abs(x), abs(y), abs(z), strength, ambient, red, green, blue) <= LARGEST:
             return None
-        return Light.of(torch.tensor([[x, z, -y]], dtype=torch.float64), strength, ambient, (red, green, blue))
+        return Light.of(torch.tensor([from_z_up([x, y, z])], dtype=torch.float64), strength, ambient, (red, green, blue))
     except (TypeError, ValueError, OverflowError):
         return None
 

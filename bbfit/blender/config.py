@@ -77,7 +77,7 @@ class ViewsConfig:
         if self.count < len(self.rings):
             fail("count", f"expected at least one view for each of {len(self.rings)} rings, got {self.count}")
         if self.suns and self.hdri is not None:
-            fail("suns", "a panorama takes the place of the sky, so billboards cannot take another", "leave out --hdri, or set --suns 0")
+            fail("suns", "they need an even sky, and a panorama replaces it", "leave out --hdri, or set --suns 0")
 
     @property
     def rings(self) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""The pictures of a view under one light at a time, which ``ViewsConfig.suns`` asks for."""
+"""The pictures of a view under one light at a time, for ``ViewsConfig.suns``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.geometry.light import direction, sky
+from bbfit.geometry.light import direction, sky, to_z_up
 
 HELD_OUT_SUNS, HELD_OUT_CAMERAS = 4, 8
 """Number of suns that no training camera sees the tree under, and of held-out cameras that see it under each of them."""
@@ -70,7 +70,7 @@ class LitPictures:
 
 def light_request(suns: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
     """The worker's request for a view's own picture, from the sky and the first of some suns."""
-    return {"suns": [[x, -z, y] for x, y, z in suns], "ambient": None, "of_suns": [], "albedo": None, "normal": None}  # Z up
+    return {"suns": list(map(to_z_up, suns)), "ambient": None, "of_suns": [], "albedo": None, "normal": None}
 
 
 def own_suns(config: ViewsConfig) -> list[tuple[float, float, float]]:

@@ -19,7 +19,7 @@ from bbfit.blender.processes import BlenderPool, require_bpy
 from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputError, check_range, fail
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, camera_to_nerf
-from bbfit.geometry.light import direction
+from bbfit.geometry.light import direction, to_z_up
 from bbfit.images import read_rgba
 from bbfit.outputs import claimed_folder
 from bbfit.tree_files.tree_file import TreeFile
@@ -142,13 +142,12 @@ def tree_settings(tree: TreeFile) -> dict[str, Any]:
 def worker_settings(tree: TreeFile, config: ViewsConfig, size: int, count: int, *, suns: int = 0) -> dict[str, Any]:
     """The worker's settings for ``count`` pictures of ``size`` x ``size`` pixels. With pictures under single lights, ``suns`` is the
     largest number of a view's suns."""
-    x, y, z = direction(config.sun_azimuth, config.sun_elevation).tolist()
     return {
         **tree_settings(tree),
         "size": size,
         "samples": config.samples,
         "denoise": config.denoise,
-        "sun_direction": [x, -z, y],  # Z up
+        "sun_direction": to_z_up(direction(config.sun_azimuth, config.sun_elevation).tolist()),
         "sun_strength": config.sun_strength,
         "ambient_strength": config.ambient_strength,
         "hdri": None if config.hdri is None else str(Path(config.hdri).resolve()),

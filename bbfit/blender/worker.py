@@ -144,7 +144,7 @@ def add_light(settings: dict[str, Any]) -> None:
         panorama = tree.nodes.new("ShaderNodeTexEnvironment")
         panorama.image = load_panorama(settings["hdri"])
         tree.links.new(panorama.outputs["Color"], background.inputs["Color"])
-    if settings["sun_strength"] > 0 and not settings.get("suns"):
+    if settings["sun_strength"] > 0 and not settings["suns"]:
         lamp = bpy.data.lights.new("bbfit sun", "SUN")
         lamp.energy = settings["sun_strength"]
         sun = bpy.data.objects.new("bbfit sun", lamp)
@@ -231,7 +231,7 @@ def render(frame: dict[str, Any], settings: dict[str, Any]) -> None:
     scene.cycles.seed = frame["seed"]
     part = path.with_name(f".bbfit-{path.stem}.part")
     scene.render.filepath = str(part).replace("{", "{{").replace("}", "}}")  # Blender would replace {names}
-    parts = LIGHTS.aim(frame["lights"], path, settings) if frame.get("lights") else {}
+    parts = LIGHTS.aim(frame["lights"], path, settings) if "lights" in frame else {}
     try:
         bpy.ops.render.render(write_still=True)
     except RuntimeError as error:

@@ -70,7 +70,7 @@ class _Graph:
         import bpy
 
         self.nodes, self.links, self.files = bpy.context.scene.node_tree.nodes, bpy.context.scene.node_tree.links, dict[str, str]()
-        self._path, self._denoise = path, denoise
+        self._denoise = denoise
         self.nodes.clear()
         self.render = self.nodes.new("CompositorNodeRLayers")
         self._composite = self.nodes.new("CompositorNodeComposite")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -14,7 +13,7 @@ from torch.nn.functional import avg_pool2d
 from bbfit.evaluation import metrics
 from bbfit.evaluation.backgrounds import BACKGROUNDS, mean_psnr, over_background
 from bbfit.geometry.camera import Camera
-from bbfit.geometry.light import SUNNY, Light
+from bbfit.geometry.light import SUNNY, Light, angles_degrees
 from bbfit.views.lit import LitViews
 from bbfit.views.view_set import ViewSet
 
@@ -22,9 +21,6 @@ BLOCKS = 15
 """Number of blocks along the tree's larger side in the pictures; the light is compared in the mean colors of blocks."""
 # Least mean alpha of the target in a block whose color counts.
 _INSIDE = 0.5
-_BEST = 120.0
-# Least difference between two suns, as the distance of unit vectors.
-_APART = 1e-3
 
 
 @dataclass(frozen=True)
@@ -70,8 +66,7 @@ class LightScore:
     def low(self) -> float | None:
         """PSNR in dB of the mean colors of blocks inside the tree, over all views: the light, without the leaves' misfit."""
         known = [view.low for view in self.views if view.low is not None]
-        mean = sum(known) / len(known) if known else None
-        return None if mean is None else _BEST if mean == 0 else min(-10 * math.log10(mean), _BEST)
+        return metrics.decibels(sum(known) / len(known)) if known else None
 
     @property
     def r2(self) -> float | None:
@@ -104,11 +99,6 @@ class LightScore:
         return LightScore(views)
 
 
-def held_out_suns(lit: LitViews, baked: Light) -> list[int]:
-    """The pictures under another sun than the baked one: those that are scored."""
-    return torch.nonzero((lit.directions - baked.sun_directions[0]).norm(dim=-1) > _APART)[:, 0].tolist()
-
-
 def score_light(
     draw: Callable[[Camera, Light], Tensor],
     lit: LitViews,
@@ -133,7 +123,7 @@ def score_light(
     LightScore or None
         ``None`` if there is no picture under a sun besides the baked one.
     """
-    chosen = held_out_suns(lit, baked)
+    chosen = lit.other_suns(baked)
     own = {camera: index for index, camera in enumerate(lit.cameras) if index not in chosen}
     sunny = lit.under(*SUNNY)
     assert sunny.light is not None
@@ -152,12 +142,10 @@ def score_light(
         inside = blocks[0][..., 3] >= _INSIDE
         after, drawn, earlier, drawn_earlier = (block[inside][:, :3] / block[inside][:, 3:].clamp_min(1e-3) for block in blocks)
         flips = [metrics.flip(*over_background(target, image, name)) for name in BACKGROUNDS]
-        x, y, z = lit.directions[index].tolist()
         results.append(
             LightView(
                 sunny.names[index],
-                round(math.degrees(math.atan2(x, z)) % 360, 6),
-                round(math.degrees(math.asin(min(max(y, -1.0), 1.0))), 6),
+                *angles_degrees(lit.directions[index]),
                 mean_psnr(target, image),
                 sum(flips) / len(flips),
                 float((after - drawn).square().mean()) if len(after) else None,

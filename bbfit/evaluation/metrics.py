@@ -50,7 +50,12 @@ def root_mean_squared_error(target: Image, render: Image) -> float:
 
 def psnr(target: Image, render: Image) -> float:
     """Peak signal-to-noise ratio in dB, at most 120; higher is better: ``-10 log10(mse)`` with one error over all pixels and channels."""
-    return float(-10 * np.log10(max(mean_squared_error(target, render), MSE_FLOOR)))
+    return decibels(mean_squared_error(target, render))
+
+
+def decibels(mse: float) -> float:
+    """A mean squared error of values in [0, 1] as a peak signal-to-noise ratio in dB, at most 120."""
+    return float(-10 * np.log10(max(mse, MSE_FLOOR)))
 
 
 def ssim(target: Image, render: Image) -> float:

@@ -13,7 +13,7 @@ from torch import Tensor
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.evaluation import metrics, thesis_scale
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
-from bbfit.evaluation.light import held_out_suns, score_light
+from bbfit.evaluation.light import score_light
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.report import Cost, Report, ShimmerScore, ViewScore
 from bbfit.evaluation.shimmer import score_shimmer
@@ -101,8 +101,8 @@ def evaluate_model(
     """Do what :func:`evaluate` does for a model whose polygons or file may already be computed."""
     started, original, on_progress = time.perf_counter(), original or OriginalTree(), on_progress or (lambda done, total: None)
     smooth = model.antialiased().draw if model.cloud.alpha.kind == "mask" else None
-    under_suns = lit if lit is not None and views.light is not None else None
-    suns = len(held_out_suns(under_suns, views.light)) if under_suns is not None and views.light is not None else 0
+    baked = views.light[[0]] if views.light is not None else None
+    suns = len(lit.other_suns(baked)) if lit is not None and baked is not None else 0
     total, trunks = len(views) + HALVINGS + 1 + (turned is not None) + suns, list[TrunkView | None]()
     names, elevations = views.names, view_angles(views.cameras)[:, 1].tolist()
 
@@ -123,12 +123,12 @@ def evaluate_model(
         shimmer = score_shimmer(model.draw, turned, smooth)
         on_progress(total - suns, total)
     light = None
-    if under_suns is not None and views.light is not None:
+    if lit is not None and baked is not None:
         shown, has_maps = smooth or model.draw, model.cloud.surface is not None
         light = score_light(
             lambda camera, light: shown(camera, light if has_maps else None),
-            under_suns,
-            views.light[[0]],
+            lit,
+            baked,
             lambda done, _: on_progress(total - suns + done, total),
         )
     return Report(

@@ -67,7 +67,5 @@ def _surfaces(cloud: BillboardCloud) -> list[NDArray[np.uint8]] | None:
     """For each texture its normals, as (n + 1) / 2, and occlusion, uint8 [h, w, 4]."""
     if cloud.surface is None:
         return None
-    x, y = (2 * cloud.surface[:, :2] - 1).unbind(-1)
-    normals = torch.nn.functional.normalize(torch.stack([x, y, (1 - x * x - y * y).clamp_min(0).sqrt()], -1), dim=-1)
-    maps = torch.cat([(normals + 1) / 2, cloud.surface[:, 2:3]], -1)
+    maps = torch.cat([(cloud.tangent_normals + 1) / 2, cloud.surface[:, 2:3]], -1)
     return [to_bytes(side) for texture in cloud.textures(maps) for side in texture]

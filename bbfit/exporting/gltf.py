@@ -20,6 +20,8 @@ _SAMPLER = {"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071
 _WITH_MIPS = _SAMPLER | {"minFilter": 9987}  # trilinear
 # Component types of glTF, and the largest index of 16 bits (65,535 would restart a primitive; glTF 2.0, section 3.7.2.1).
 _UNSIGNED_SHORT, _UNSIGNED_INT, _LARGEST_SHORT = 5123, 5125, 65_534
+# Pictures by name.
+_Pictures = dict[str, tuple[list[NDArray[np.uint8]], bool]]
 # The name under which trimesh writes tangents.
 _TANGENT = "_TANGENT"
 _EXTENSIONS = {"webp": ("EXT_texture_webp", "image/webp"), "ktx2": ("KHR_texture_basisu", "image/ktx2")}
@@ -71,9 +73,10 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
         scene.add_geometry(mesh, node_name=name, geom_name=name, transform=place)
     # Without light nothing reads normals, which are a third of a vertex.
     lit = cards.atlas.surface is not None or resolved.material != "unlit"
-    glb = glb_of_scene(scene, lambda tree: _complete(tree, cards, resolved), normals=lit)
+    pictures = _pictures(cards)
+    glb = glb_of_scene(scene, lambda tree: _complete(tree, cards, list(pictures), resolved), normals=lit)
     tree, views = split_glb(glb)
-    return joined_glb(tree, _with_pictures(tree, _with_short_indices(tree, views), cards, resolved))
+    return joined_glb(tree, _with_pictures(tree, _with_short_indices(tree, views), pictures, resolved))
 
 
 def _vertices(card: Card) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -105,12 +108,12 @@ def _meshes(cards: Cards) -> dict[str, list[Card]]:
     return meshes
 
 
-def _complete(tree: dict[str, Any], cards: Cards, config: ResolvedExport) -> None:
+def _complete(tree: dict[str, Any], cards: Cards, pictures: list[str], config: ResolvedExport) -> None:
     """Add to trimesh's glTF what trimesh cannot write, except for the pictures."""
     # trimesh lists the picture once per material.
     assert len({image["bufferView"] for image in tree["images"]}) == 1
     tree["images"] = [{"bufferView": tree["images"][0]["bufferView"]}]
-    tree["textures"] = [{"sampler": 0, "name": name} for name in _pictures(cards)]
+    tree["textures"] = [{"sampler": 0, "name": name} for name in pictures]
     tree["samplers"] = [_WITH_MIPS if config.textures == "ktx2" or config.mipmapped(cards.alpha) else _SAMPLER]
     used = set(tree.get("extensionsUsed", ()))
     for material in tree["materials"]:
@@ -144,7 +147,7 @@ def _with_short_indices(tree: dict[str, Any], views: list[bytes]) -> list[bytes]
     return views
 
 
-def _pictures(cards: Cards) -> dict[str, tuple[list[NDArray[np.uint8]], bool]]:
+def _pictures(cards: Cards) -> _Pictures:
     """The pictures by name: their mip levels, or level 0 alone, uint8 [h, w, C], and whether they are colors."""
     pictures = {"atlas": (list(cards.chain or [cards.atlas.image]), True)}
     if cards.atlas.surface is not None:
@@ -154,11 +157,11 @@ def _pictures(cards: Cards) -> dict[str, tuple[list[NDArray[np.uint8]], bool]]:
     return pictures
 
 
-def _with_pictures(tree: dict[str, Any], views: list[bytes], cards: Cards, config: ResolvedExport) -> list[bytes]:
+def _with_pictures(tree: dict[str, Any], views: list[bytes], pictures: _Pictures, config: ResolvedExport) -> list[bytes]:
     """The contents of the buffer views, with the pictures added; the JSON gets the references to them."""
     extension, kind = _EXTENSIONS.get(config.textures, ("", ""))
     images, encoded = list[tuple[str, str]](), list[bytes]()
-    for texture, (name, (levels, is_color)) in zip(tree["textures"], _pictures(cards).items(), strict=True):
+    for texture, (name, (levels, is_color)) in zip(tree["textures"], pictures.items(), strict=True):
         if not extension or config.fallback:
             texture["source"] = len(images)
             images.append((name, "image/png"))

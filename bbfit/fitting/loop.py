@@ -105,6 +105,7 @@ def fit(
     checkpoint: str | Path | None = None,
     on_step: Callable[[Step], None] | None = None,
     on_place: Callable[[int, int], None] | None = None,
+    on_map: Callable[[int, int], None] | None = None,
 ) -> FitResult:
     """Fit a billboard cloud to the training views. The test views are not used.
 
@@ -134,6 +135,8 @@ def fit(
         Called after every step.
     on_place
         Called during the search for a placement, with the work done and the total work.
+    on_map
+        Called after every step of the fit of maps, which follows the others, with its number and their total.
 
     Raises
     ------
@@ -206,7 +209,7 @@ def fit(
     bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
     if config.light == "maps":
-        fitted = fit_maps(trimmed(fitted), views, config)
+        fitted = fit_maps(trimmed(fitted), views, config, on_map)
     if config.colors != "joint":
         fitted = matched_colors(smoothed_colors(fitted), views.train, config.backend)
     fitted = palettized(fitted, config.palette)

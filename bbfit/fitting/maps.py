@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,18 @@ from bbfit.fitting.steps import BLEND, pass_of
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.geometry.light import SUNNY, Light
+from bbfit.geometry.light import SUNNY
 from bbfit.images import bleed_color
 from bbfit.operators.config import Backend
-from bbfit.operators.shading.reference import TextureLight, decode, shade_reference, texture_lights
+from bbfit.operators.shading.reference import (
+    TextureLight,
+    billboards_of_textures,
+    decode,
+    shade_reference,
+    shown_sides,
+    texture_lights,
+    textures_of_texels,
+)
 from bbfit.rendering.dispatch import render
 from bbfit.views.dataset import ViewDataset
 from bbfit.views.lit import LitViews
@@ -34,23 +42,12 @@ _BATCH = 4
 _BAKED = 24
 # The least weight of a texel in those views, in pixels, for which they determine its maps.
 _LEAST_WEIGHT = 1e-3
-# Distance of unit vectors up to which two suns are the same.
-_SAME_SUN = 1e-3
-# Vector of the maps of a texel that no view shows: its normal is the plane's, and nothing hides the sky.
+# The maps of a texel that no view shows: its normal is the plane's, and nothing hides the sky.
 _PLAIN = (0.5, 0.5, 1.0, 0.0)
 
 
-@dataclass(frozen=True)
-class _Shaded:
-    """Texels in the light of a view, as a pass differentiates them."""
-
-    texels: Tensor
-    gradient: Tensor
-    occupied: Tensor | None
-
-
 def fit_maps(
-    cloud: BillboardCloud, views: ViewDataset, config: ResolvedFit, on_step: Callable[[int, float], None] | None = None
+    cloud: BillboardCloud, views: ViewDataset, config: ResolvedFit, on_step: Callable[[int, int], None] | None = None
 ) -> BillboardCloud:
     """Fit maps to the training views under many lights, for a cloud whose placement and alpha are fitted.
 
@@ -58,16 +55,16 @@ def fit_maps(
     (:data:`~bbfit.geometry.light.SUNNY`). Texels are shaded in that light and drawn, and Adam takes the gradient of the loss in the maps.
     Placement and alpha stay as they are. The start is :func:`baked_maps`.
 
-    ``views`` have ``lit_train`` and the light of their own pictures. ``on_step`` is called with the number of each step, from 1, and its
-    loss. Returns the cloud with its maps; ``light`` is that of the views' own pictures.
+    ``views`` have ``lit_train`` and the light of their own pictures. ``on_step`` is called with the number of finished steps and their
+    total. Returns the cloud with its maps, on the CPU; ``light`` is that of the views' own pictures.
     """
     assert views.lit_train is not None and views.train.light is not None
     sunny = views.lit_train.under(*SUNNY)
-    exposures = ViewSet.joined([views.train, sunny.take(_other_suns(views.lit_train, views.train.light))])
+    others = views.lit_train.other_suns(views.train.light[[0]]) or list(range(len(sunny)))
+    exposures, cloud = ViewSet.joined([views.train, sunny.take(others)]), cloud.to(config.device)
     assert exposures.light is not None
-    device = cloud.texels.device
     texels, surface = baked_maps(cloud, views.lit_train, config.backend)
-    shader = _reference_shading if config.backend == "reference" else _fused_shading()
+    shade, pull_back = _shading(config.backend)
     alpha = BLEND if config.alpha != "mask" else AlphaMode("mask", config.alpha_cutoff, math.inf, config.antialiased)
     passes: Any = pass_of(config)(cloud.without_textures(), Targets.at(exposures, 0), config, None, 1)
     base, maps = (passes.adam.start(passes.adam.padded(values)) for values in (texels, surface))
@@ -75,19 +72,18 @@ def fit_maps(
     gradient = torch.zeros_like(base.texels)
     for step in range(config.map_steps):
         rate = _LEARNING_RATE * 0.5 * (1 + math.cos(math.pi * step / config.map_steps))
-        total = 0.0
         for index in _sample(len(exposures), step, config.seed):
-            shaded = _Shaded(shader[0](base.texels, maps.texels, lights[index]), gradient.zero_(), getattr(base, "occupied", None))
-            total += float(passes.differentiate(shaded, [index], alpha, False)[0]) / _BATCH
+            shaded = replace(base, texels=shade(base.texels, maps.texels, lights[index]), gradient=gradient.zero_())
+            passes.differentiate(shaded, [index], alpha, False)
             gradient[:, 3] = 0  # alpha is not to change
-            shader[1](base.texels, maps.texels, lights[index], gradient, base.gradient, maps.gradient)
+            pull_back(base.texels, maps.texels, lights[index], gradient, base.gradient, maps.gradient)
         maps.gradient[:, 3] = 0  # nor translucency
         for state in (base, maps):
             state.update(step + 1, rate, (config.beta1, config.beta2))
         if on_step is not None:
-            on_step(step + 1, total)
+            on_step(step + 1, config.map_steps)
     count = len(cloud.texels)
-    fitted = replace(cloud, texels=base.texels[:count], surface=maps.texels[:count], light=views.train.light[[0]].to(device))
+    fitted = replace(cloud, texels=base.texels[:count], surface=maps.texels[:count], light=views.train.light[[0]])
     return bled(fitted.to("cpu"))
 
 
@@ -113,20 +109,18 @@ def baked_maps(cloud: BillboardCloud, lit: LitViews, backend: Backend = "auto") 
     chosen = [index * len(lit.skies) // _BAKED for index in range(_BAKED)] if len(lit.skies) > _BAKED else list(range(len(lit.skies)))
     cameras = lit.skies.cameras[chosen].to(cloud.texels.dtype).to(cloud.texels.device)
     color, light, normal = (torch.zeros_like(cloud.texels[:, :3]) for _ in range(3))
-    billboard = torch.repeat_interleave(cloud.texture_sizes.prod(-1) * (1 + cloud.two_sided.long()))
-    rights, ups, normals = (axes[billboard] for axes in (cloud.rights, cloud.ups, cloud.normals))
+    texture = textures_of_texels(cloud).long()
+    rights, ups, normals = (axes[billboards_of_textures(cloud)][texture] for axes in (cloud.rights, cloud.ups, cloud.normals))
     for number, index in enumerate(chosen):
-        albedo, sky, facing = (part.images([index])[0].to(cloud.texels) / 255 for part in (lit.albedo, lit.skies, lit.normal))
+        albedo, sky = (part.image(index).to(cloud.texels) / 255 for part in (lit.albedo, lit.skies))
         alpha = albedo[..., 3:]
         weigh = _weights(cloud, cameras[number], backend)
         color += weigh(albedo[..., :3] * alpha)
         radiance, reflectance = (decode(picture[..., :3]).mean(-1, keepdim=True) for picture in (sky, albedo))
         light += weigh(torch.cat([torch.ones_like(alpha), radiance, reflectance], -1) * alpha)
-        x, y, z = (2 * facing[..., :3] - 1).unbind(-1)
-        world = weigh(torch.stack([x, z, -y], -1) * alpha)
-        along = (world * normals).sum(-1)
-        side = torch.where(cloud.two_sided, 1.0, _side(cloud, cameras[number]))[billboard]
-        normal += torch.stack([(world * rights).sum(-1), (world * ups).sum(-1), side * along], -1)
+        world = weigh(lit.normals(index).to(cloud.texels) * alpha)
+        sides = shown_sides(cloud, cameras[number])[0][texture]
+        normal += torch.stack([(world * rights).sum(-1), (world * ups).sum(-1), sides * (world * normals).sum(-1)], -1)
     seen = light[:, :1] > _LEAST_WEIGHT
     base = torch.where(seen, color / light[:, :1].clamp_min(_LEAST_WEIGHT), cloud.texels[:, :3]).clamp(0, 1)
     tangent = normalize(normal, dim=-1)
@@ -149,18 +143,6 @@ def _weights(cloud: BillboardCloud, camera: Camera, backend: Backend) -> Callabl
     return weigh
 
 
-def _side(cloud: BillboardCloud, camera: Camera) -> Tensor:
-    """1 for each billboard whose front a camera sees, -1 for the others, [N]."""
-    towards = -camera.forward if camera.orthographic else camera.position - cloud.centers
-    return torch.where((towards * cloud.normals).sum(-1) >= 0, 1.0, -1.0).to(cloud.texels)
-
-
-def _other_suns(lit: LitViews, baked: Light) -> list[int]:
-    """The pictures under another sun than that of the views' own pictures, or all if there are none."""
-    other = torch.nonzero((lit.directions - baked.sun_directions[0]).norm(dim=-1) > _SAME_SUN)[:, 0].tolist()
-    return other or list(range(len(lit)))
-
-
 def _sample(count: int, step: int, seed: int) -> list[int]:
     """The exposures, out of ``count``, of a step: all of them in random order, then again."""
     batch = min(_BATCH, count)
@@ -175,7 +157,10 @@ def _padded(light: TextureLight, count: int) -> TextureLight:
     return replace(light, texture=texture)
 
 
-def _fused_shading() -> tuple[Callable[..., Tensor], Callable[..., None]]:
+def _shading(backend: Backend) -> tuple[Callable[..., Tensor], Callable[..., None]]:
+    """The functions of a backend that shade texels, and that add the derivative of their colors to those of texels and maps."""
+    if backend == "reference":
+        return shade_reference, _pull_back_reference
     from bbfit.operators.shading.fused import pull_back, shaded  # Warp takes a while to start
 
     return shaded, pull_back
@@ -187,6 +172,3 @@ def _pull_back_reference(
     leaves = texels.detach().requires_grad_(), surface.detach().requires_grad_()
     for total, part in zip((of_texels, of_surface), torch.autograd.grad(shade_reference(*leaves, light), leaves, gradient), strict=True):
         total += part
-
-
-_reference_shading = (shade_reference, _pull_back_reference)

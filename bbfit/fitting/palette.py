@@ -34,7 +34,7 @@ def palettized(cloud: BillboardCloud, count: int) -> BillboardCloud:
     """
     if not count:
         return cloud
-    surface = None if cloud.surface is None else few_surfaces(cloud.surface, cloud.texels[:, 3] >= _VISIBLE, count)
+    surface = None if cloud.surface is None else few_surfaces(cloud, count)
     return replace(cloud, texels=few_colors(cloud.texels, cloud.alpha, count), surface=surface)
 
 
@@ -59,21 +59,21 @@ def few_colors(texels: Tensor, alpha: AlphaMode, count: int) -> Tensor:
     return rounded.index_copy(0, visible.to(texels.device), palette[labels].to(texels))
 
 
-def few_surfaces(surface: Tensor, visible: Tensor, count: int) -> Tensor:
-    """Round maps, [P, 4], so that the pictures of their normals and of their occlusion have few colors and compress well.
+def few_surfaces(cloud: BillboardCloud, count: int) -> Tensor:
+    """Round the maps of a cloud, [P, 4], so that the pictures of their normals and of their occlusion have few colors and compress well.
 
-    Normals get ``count`` - 1 different values, which leaves one to the gaps of an atlas: the means of clusters by k-means of those of the
-    texels that are ``visible``, [P]. Occlusion is rounded to 6 bits.
+    Normals get ``count`` - 1 different values, which leaves one to the gaps of an atlas: the means of clusters by k-means of those of
+    visible texels. Occlusion is rounded to 6 bits.
     """
-    occlusion = (surface[:, 2:3] * _OCCLUSIONS).round() / _OCCLUSIONS
-    if not bool(visible.any()):
-        return torch.cat([surface[:, :2], occlusion, surface[:, 3:]], 1)
-    x, y = (2 * surface[:, :2] - 1).unbind(-1)
-    normals = torch.stack([x, y, (1 - x * x - y * y).clamp_min(0).sqrt()], -1).float().numpy()
-    means = torch.from_numpy(_clustered(normals[visible.numpy()], count - 1))
-    across = (normalize(means, dim=-1)[:, :2] + 1) / 2
-    chosen = across[torch.from_numpy(vq(normals, means.numpy())[0]).long()]
-    return torch.cat([chosen.clamp(0, 1).to(surface), occlusion, surface[:, 3:]], 1)
+    assert cloud.surface is not None
+    visible, across = (cloud.texels[:, 3] >= _VISIBLE).numpy(), cloud.surface[:, :2]
+    if visible.any():
+        normals = cloud.tangent_normals.float().numpy()
+        means = _clustered(normals[visible], count - 1)
+        rounded = (normalize(torch.from_numpy(means), dim=-1)[:, :2] + 1) / 2
+        across = rounded[torch.from_numpy(vq(normals, means)[0]).long()].clamp(0, 1).to(across)
+    occlusion = (cloud.surface[:, 2:3] * _OCCLUSIONS).round() / _OCCLUSIONS
+    return torch.cat([across, occlusion, cloud.surface[:, 3:]], 1)
 
 
 def _clustered(points: NDArray[np.float32], count: int) -> NDArray[np.float32]:

@@ -95,6 +95,14 @@ class BillboardCloud:
         return torch.linalg.cross(self.rights, self.ups)
 
     @property
+    def tangent_normals(self) -> Tensor:
+        """The unit normals of a cloud with maps in the axes (right, up, towards the viewer's side) of their texture, [P, 3]."""
+        assert self.surface is not None
+        across = 2 * self.surface[:, :2] - 1
+        across = across / across.norm(dim=-1, keepdim=True).clamp_min(1)
+        return torch.cat([across, (1 - across.square().sum(-1, keepdim=True)).clamp_min(0).sqrt()], -1)
+
+    @property
     def vertex_count(self) -> int:
         """Vertices of the exported mesh: four per quad, two quads for a two-sided billboard."""
         return 4 * (len(self) + int(self.two_sided.sum()))

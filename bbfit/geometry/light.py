@@ -57,10 +57,6 @@ class Light:
         """The lights with these indices, a batch."""
         return Light(*(value[indices] for value in vars(self).values()))
 
-    def to(self, device: torch.device | str) -> Light:
-        """Move to a device."""
-        return Light(*(value.to(device) for value in vars(self).values()))
-
     @staticmethod
     def of(sun_directions: Tensor, sun_strength: float, ambient: float, sun_color: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Light:
         """Lights of equal strengths from different directions, [L, 3], which need not be unit vectors."""
@@ -79,6 +75,25 @@ def direction(azimuth_degrees: float, elevation_degrees: float) -> Tensor:
     azimuth, elevation = math.radians(azimuth_degrees), math.radians(elevation_degrees)
     across = math.cos(elevation)
     return torch.tensor([across * math.sin(azimuth), math.sin(elevation), across * math.cos(azimuth)], dtype=torch.float64)
+
+
+def angles_degrees(towards: Tensor) -> tuple[float, float]:
+    """Azimuth in [0, 360) and elevation of a unit vector towards a sun, [3]: the inverse of :func:`direction`, to 6 decimals."""
+    x, y, z = towards.tolist()
+    azimuth, elevation = math.degrees(math.atan2(x, z)), math.degrees(math.asin(min(max(y, -1.0), 1.0)))
+    return round(azimuth, 6) % 360, round(elevation, 6)
+
+
+def to_z_up(vector: Sequence[float]) -> list[float]:
+    """A vector in the axes of Blender and of the NeRF-synthetic layout, which are Z up."""
+    x, y, z = vector
+    return [x, -z, y]
+
+
+def from_z_up(vector: Sequence[float]) -> list[float]:
+    """The inverse of :func:`to_z_up`."""
+    x, y, z = vector
+    return [x, z, -y]
 
 
 def sky(count: int, turn_degrees: float = 0.0) -> Tensor:

@@ -180,8 +180,9 @@ def _check_size(name: str, pictures: str, width: int, height: int) -> None:
 
 def _lit_views(frames: list[Frame], folder: Path, view_set: Callable[[list[Frame]], ViewSet]) -> LitViews:
     """Match the pictures under single suns with those of the same cameras under the sky."""
-    skies = [frame for frame in frames if frame.light is not None and float(frame.light.ambients) > 0]
-    suns = [frame for frame in frames if frame not in skies]
+    skies, suns = list[Frame](), list[Frame]()
+    for frame in frames:
+        (skies if frame.light is not None and float(frame.light.ambients) > 0 else suns).append(frame)
     places = {_camera_key(frame): place for place, frame in enumerate(skies)}
     for frame in suns:
         if _camera_key(frame) not in places:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -11,9 +10,12 @@ import torch
 from torch import Tensor
 
 from bbfit.checks import check_range
-from bbfit.geometry.light import Light
+from bbfit.geometry.light import Light, from_z_up
 from bbfit.images import sum_of_lights
 from bbfit.views.view_set import ViewSet
+
+# Distance of unit vectors up to which two suns are the same.
+_SAME_SUN = 1e-3
 
 
 @dataclass(frozen=True)
@@ -68,12 +70,14 @@ class LitViews:
         light = Light(of_sun.sun_directions, sun_strength * ones, colors, ambient * ones)
         return ViewSet(self.suns.paths, self.suns.cameras, read, light)
 
-    def take(self, chosen: Sequence[int]) -> LitViews:
-        """The part of some of the V cameras."""
-        places = {camera: place for place, camera in enumerate(chosen)}
-        kept = [index for index, camera in enumerate(self.cameras) if camera in places]
-        passes = [views and views.take(chosen) for views in (self.albedo, self.normal)]
-        return LitViews(self.skies.take(chosen), self.suns.take(kept), tuple(places[self.cameras[index]] for index in kept), *passes)
+    def other_suns(self, baked: Light) -> list[int]:
+        """The pictures under another sun than that of a light, a batch of one."""
+        return torch.nonzero((self.directions - baked.sun_directions[0]).norm(dim=-1) > _SAME_SUN)[:, 0].tolist()
+
+    def normals(self, index: int) -> Tensor:
+        """The normals that one of the V cameras sees, Y up, float32 [H, W, 3]; they have unit length where one surface fills a pixel."""
+        assert self.normal is not None
+        return torch.stack(from_z_up((2 * self.normal.image(index)[..., :3].float() / 255 - 1).unbind(-1)), -1)  # type: ignore[arg-type]
 
     @property
     def fingerprint(self) -> str:

@@ -70,7 +70,7 @@ def test_own_picture_is_the_sum_of_its_lights(folder: Path) -> None:
 
 
 def test_a_picture_under_a_sun_is_that_of_a_render_with_that_sun(folder: Path, thing_glb: Path, tmp_path: Path) -> None:
-    """Against a render of its own with 256 samples: the root mean square is noise, and brightness agrees to 2 %."""
+    """Against a render of its own with 256 samples. Measured with 16: at most 4.7 bytes of noise (RMS), brightness to 1.4 %."""
     lit = ViewDataset.load(folder).lit_test
     assert lit is not None
     sunny = lit.under(4.0, 0.3)
@@ -136,7 +136,7 @@ def test_without_suns_there_are_no_lit_views_and_old_folders_load(unbroken: Path
 
 
 def test_suns_need_an_even_sky(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^suns: a panorama takes the place of the sky"):
+    with pytest.raises(InputError, match=r"^suns: they need an even sky"):
         ViewsConfig(suns=1, hdri=tmp_path / "sky.hdr")
 
 

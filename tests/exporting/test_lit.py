@@ -45,14 +45,14 @@ def with_maps(cloud: BillboardCloud, seed: int = 0) -> BillboardCloud:
 
 @pytest.mark.parametrize("kind", ["one", "two", "mixed"])
 def test_cards_show_what_the_cloud_shows_in_every_light(clouds: dict[str, BillboardCloud], orbit: Camera, kind: str) -> None:
-    """Shading after filtering instead of before, and 8 bits. Measured: at least 44 dB; a wrong side or axis of normals leaves 25 dB."""
+    """Shading after filtering instead of before, and 8 bits. Measured: at least 74.2 dB; with the sun on the other side at most 29.1."""
     cloud = with_maps(clouds[kind])
     lights = Light.of(sky(6, 20.0), 4.0, 0.4)
     model = shipped_model(cloud, PLAIN)
     shown, expected = model.draw(orbit, lights).double(), render(cloud, orbit, light=lights)
-    assert psnr(shown.numpy(), expected.numpy()) > 42
+    assert psnr(shown.numpy(), expected.numpy()) > 60
     turned = Light(lights.sun_directions * torch.tensor([-1.0, 1.0, -1.0]), *list(vars(lights).values())[1:])
-    assert psnr(model.draw(orbit, turned).double().numpy(), expected.numpy()) < 30
+    assert psnr(model.draw(orbit, turned).double().numpy(), expected.numpy()) < 35
     torch.testing.assert_close(model.draw(orbit[0]), model.draw(orbit[0], cloud.light))
     assert all(card.culled for card in model.cards.cards) and len(model.cards.cards) == 2 * len(cloud)
 

@@ -33,11 +33,24 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud, even_upright
+from bbfit.geometry.light import Light
 from bbfit.geometry.orbit import Orbit
 from bbfit.glb import gltf_parts
 from bbfit.images import encode_png, picture_header, read_rgba, to_bytes, unpremultiply
 from bbfit.inputs import InputLimits
-from bbfit.layout import REQUEST_FILE, TEST_FILE, TRAIN_FILE, TURNED_FILE, split_views, write_transforms, write_turned
+from bbfit.layout import (
+    LIT_TEST_FILE,
+    LIT_TRAIN_FILE,
+    REQUEST_FILE,
+    TEST_FILE,
+    TRAIN_FILE,
+    TURNED_FILE,
+    LitPaths,
+    split_views,
+    write_lit,
+    write_transforms,
+    write_turned,
+)
 from bbfit.operators.drawing.reference import render_reference
 from bbfit.stages.billboards import read_choice
 from bbfit.stages.stage import Record
@@ -98,6 +111,9 @@ def _camera() -> Camera:
     return Orbit(5).frame(points, target=torch.tensor([0.0, 1, 0]).double(), width=16, height=16)
 
 
+TRANSFORMS = [TRAIN_FILE, TEST_FILE, TURNED_FILE, LIT_TRAIN_FILE, LIT_TEST_FILE]
+
+
 @functools.cache
 def views_files() -> Files:
     """A folder of five views, and a second picture of one of them."""
@@ -108,7 +124,9 @@ def views_files() -> Files:
         train, test = split_views(len(camera), 0)
         write_transforms(Path(folder), camera, names, train, test)
         write_turned(Path(folder), camera[test[:1]], [names[train[0]]], [names[test[0]]])
-        texts = {name: (Path(folder) / name).read_bytes() for name in (TRAIN_FILE, TEST_FILE, TURNED_FILE)}
+        lit = {index: LitPaths(names[index], names[:2], torch.eye(3).double()[:2], names[0], names[1]) for index in range(len(camera))}
+        write_lit(Path(folder), camera, lit, train, test)
+        texts = {name: (Path(folder) / name).read_bytes() for name in TRANSFORMS}
     return dict(zip(names, pictures, strict=True)) | texts
 
 
@@ -116,6 +134,8 @@ def _read_views(folder: Path) -> None:
     views = ViewDataset.load(folder)
     views.check()
     assert len(views.fingerprint) == 64
+    for lit in (views.lit_train, views.lit_test):
+        assert lit is None or len(lit.fingerprint) == 64
 
 
 def _fit_views(folder: Path) -> None:
@@ -124,7 +144,7 @@ def _fit_views(folder: Path) -> None:
 
 def _transforms(draw: st.DrawFn) -> Files:
     files = dict(views_files())
-    name = draw(st.sampled_from([TRAIN_FILE, TEST_FILE, TURNED_FILE]))
+    name = draw(st.sampled_from(TRANSFORMS))
     files[name] = dumped(draw(documents(json.loads(files[name]))))
     if draw(st.integers(0, 9)) == 0:
         files["transforms.json"] = files.pop(TRAIN_FILE)
@@ -220,10 +240,15 @@ def _read_picture(folder: Path) -> None:
 def _cloud(draw: st.DrawFn) -> Files:
     cloud, data = small_cloud(), b""
     tensors = {name: getattr(cloud, name) for name in ("centers", "rights", "ups", "half_extents", "texture_sizes", "two_sided", "texels")}
+    has_maps = draw(st.booleans())
+    if has_maps:
+        light = Light.of(torch.tensor([[0.3, 0.9, 0.3]]), 2.5, 1.0)
+        tensors |= {"surface": cloud.texels.clone()} | {f"light.{name}": value for name, value in vars(light).items()}
+    version = f"bbfit billboard cloud {1 + has_maps} "
     name = draw(st.sampled_from(list(tensors)))
     tensor = tensors[name]
     kind = draw(st.integers(0, 6))
-    metadata = {"format": 'bbfit billboard cloud 1 {"kind": "blend", "cutoff": 0.5}'}
+    metadata = {"format": version + '{"kind": "blend", "cutoff": 0.5}'}
     if kind == 0:
         types = [
             torch.float8_e4m3fn,
@@ -243,7 +268,7 @@ def _cloud(draw: st.DrawFn) -> Files:
         tensors[name] = draw(st.sampled_from(shapes)).contiguous()
     elif kind == 3:
         text = draw(st.one_of(hostile.map(lambda value: dumped(value).decode()), st.text(max_size=20)))
-        metadata["format"] = "bbfit billboard cloud 1 " + text
+        metadata["format"] = version + text
     elif kind == 4:
         tensors["texture_sizes"] = torch.tensor([[1 << 40, 1 << 40], [6, 5]])
     data = save({key: value.clone() for key, value in tensors.items()}, metadata)

@@ -123,7 +123,7 @@ def test_too_bright_texels_can_become_darker() -> None:
 @pytest.mark.parametrize("count", [1, 3, 17])
 @pytest.mark.parametrize("sides", ["one", "two"])
 def test_kernels_agree_with_the_reference(count: int, sides: str) -> None:
-    """Measured on a CPU: colors to 1e-6, gradients to 3e-6 (relative L2). Allowed: 5e-6 and 2e-5, float32 with other powers."""
+    """Measured on a CPU: colors to 2e-7, gradients to 1.3e-5 (relative L2), where a normal is near the horizon of the sun."""
     cloud = cloud_with_maps(count, sides)
     for light in texture_lights(cloud, cameras(), Light.of(SUN.repeat(3, 1), 3.0, 0.5, (1.0, 0.9, 0.7))):
         generator = torch.Generator().manual_seed(count)
@@ -136,7 +136,7 @@ def test_kernels_agree_with_the_reference(count: int, sides: str) -> None:
             shown = shade(*inputs, light)
             (shown * weight.to(dtype)).sum().backward()
             results.append([shown.detach().double(), *(value.grad.double() for value in inputs)])  # type: ignore[union-attr]
-        assert (results[0][0] - results[1][0]).abs().max() < 5e-6
+        assert (results[0][0] - results[1][0]).abs().max() < 1e-6
         for expected, got in zip(results[0][1:], results[1][1:], strict=True):
             assert (expected - got).norm() < 2e-5 * expected.norm()
 

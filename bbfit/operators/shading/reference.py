@@ -11,6 +11,7 @@ from torch import Tensor
 from bbfit.checks import check_shape
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.homography import signed_distance
 from bbfit.geometry.light import Light
 
 LEAST_Z_SQUARED = 1e-4
@@ -74,26 +75,39 @@ def encode(value: Tensor) -> Tensor:
     return torch.where(high, 1.055 * torch.where(high, value, 1) ** (1 / 2.4) - 0.055, 12.92 * value)
 
 
+def textures_of_texels(cloud: BillboardCloud) -> Tensor:
+    """Index of each texel's texture, int32 [P]: a one-sided billboard has one texture, a two-sided one has a front and then a back."""
+    counts = cloud.texture_sizes.prod(-1)[billboards_of_textures(cloud)]
+    return torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts).to(torch.int32)
+
+
+def billboards_of_textures(cloud: BillboardCloud) -> Tensor:
+    """Index of each texture's billboard, int64 [T]."""
+    return torch.repeat_interleave(1 + cloud.two_sided.long())
+
+
+def shown_sides(cloud: BillboardCloud, camera: Camera) -> Tensor:
+    """1 for each texture that shows the front of its billboard to each of V cameras, and -1 for one that shows the back, [V, T].
+
+    The texture of a one-sided billboard shows the side that the camera is on.
+    """
+    owner = billboards_of_textures(cloud)
+    is_back = torch.zeros_like(owner, dtype=torch.bool)
+    is_back[1:] = owner[1:] == owner[:-1]
+    front = torch.where(cloud.two_sided[owner], ~is_back, signed_distance(cloud, camera)[:, owner] >= 0)
+    return torch.where(front, 1.0, -1.0).to(cloud.centers)
+
+
 def texture_lights(cloud: BillboardCloud, camera: Camera, light: Light) -> list[TextureLight]:
     """The light of each of V views of a cloud; ``light`` has V lights.
 
-    The texture of a one-sided billboard shows the side that the camera is on: from behind, only the component of a normal along the plane's
-    normal turns, so that a leaf that looks up does so from both sides. A back texture shows the back.
+    From behind, only the component of a normal along the plane's normal turns, so that a leaf that looks up does so from both sides.
     """
     check_shape("light", (len(light),), (len(camera.batch()),))
     device, dtype = cloud.centers.device, cloud.centers.dtype
-    camera, suns = camera.batch().to(dtype).to(device), light.sun_directions.to(dtype).to(device)
-    if camera.orthographic:
-        facing = -(camera.forward @ cloud.normals.mT)
-    else:
-        facing = ((camera.position[:, None] - cloud.centers) * cloud.normals).sum(-1)
-    sides = torch.where(cloud.two_sided | (facing >= 0), 1.0, -1.0).to(dtype)
-    along = suns @ cloud.normals.mT
-    front = torch.stack([suns @ cloud.rights.mT, suns @ cloud.ups.mT, sides * along], -1)
-    back = torch.stack([front[..., 0], front[..., 1], -along], -1)
-    exists = torch.stack([torch.ones_like(cloud.two_sided), cloud.two_sided], -1).flatten()
-    of_textures = torch.stack([front, back], 2).flatten(1, 2)[:, exists]
-    counts = cloud.texture_sizes.prod(-1).repeat_interleave(1 + cloud.two_sided.long())
-    texture = torch.repeat_interleave(torch.arange(len(counts), device=device), counts).to(torch.int32)
+    suns, sides = light.sun_directions.to(dtype).to(device), shown_sides(cloud, camera.to(dtype).to(device))
+    along = [suns @ axes[billboards_of_textures(cloud)].mT for axes in (cloud.rights, cloud.ups, cloud.normals)]
+    of_textures = torch.stack([*along[:2], sides * along[2]], -1)
     strengths = torch.cat([light.sun_colors * light.sun_strengths[:, None] / math.pi, light.ambients[:, None]], -1)
+    texture = textures_of_texels(cloud)
     return [TextureLight(texture, *each) for each in zip(of_textures, strengths, strict=True)]
