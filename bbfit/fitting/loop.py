@@ -74,7 +74,7 @@ class FitResult:
     cloud: BillboardCloud
     """The fitted cloud, float32 on the CPU."""
     losses: list[float]
-    """Loss of every step."""
+    """Loss of every step for placement, color and alpha."""
     config: ResolvedFit
     """The configuration, resolved."""
     seconds: float
@@ -105,7 +105,6 @@ def fit(
     checkpoint: str | Path | None = None,
     on_step: Callable[[Step], None] | None = None,
     on_place: Callable[[int, int], None] | None = None,
-    on_map: Callable[[int, int], None] | None = None,
 ) -> FitResult:
     """Fit a billboard cloud to the training views. The test views are not used.
 
@@ -132,11 +131,9 @@ def fit(
         with the same configuration, the fit resumes from it and ends with the same result as an uninterrupted fit. The caller removes the
         file once the result is saved.
     on_step
-        Called after every step.
+        Called after every step, also those of maps, which follow the others.
     on_place
         Called during the search for a placement, with the work done and the total work.
-    on_map
-        Called after every step of the fit of maps, which follows the others, with its number and their total.
 
     Raises
     ------
@@ -191,7 +188,7 @@ def fit(
             indices = sample_views(config, len(views.train), index, level.halvings)
             losses.append(float(stepper.step(indices, rate, placement_learning_rate, step_alpha(config, level, index))))
             if on_step is not None:
-                on_step(Step(index + 1, config.steps, losses[-1], rate, partial(getattr, stepper, "cloud")))
+                on_step(Step(index + 1, _total_steps(config), losses[-1], rate, partial(getattr, stepper, "cloud")))
             if checkpoint is not None and ((index + 1) % config.checkpoint_every == 0 or index + 1 == config.steps):
                 _save(checkpoint, key, _FitState(losses, start, None, stepper.tensors(), time.perf_counter() - started))
         fitted = stepper.finish()
@@ -209,7 +206,8 @@ def fit(
     bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
     if config.light == "maps":
-        fitted = fit_maps(trimmed(fitted), views, config, on_map)
+        fitted = trimmed(fitted)
+        fitted = fit_maps(fitted, views, config, None if on_step is None else partial(_report_map_step, on_step, fitted, config))
     if config.colors != "joint":
         fitted = matched_colors(smoothed_colors(fitted), views.train, config.backend)
     fitted = palettized(fitted, config.palette)
@@ -220,6 +218,17 @@ def fit(
     except InputError as error:
         fail("fit", f"the result cannot be used ({error})", "check the pictures, the cameras and the size of the tree, or lower the rates")
     return FitResult(fitted, losses, config, time.perf_counter() - started)
+
+
+def _total_steps(config: ResolvedFit) -> int:
+    return config.steps + (config.map_steps if config.light == "maps" else 0)
+
+
+def _report_map_step(
+    on_step: Callable[[Step], None], cloud: BillboardCloud, config: ResolvedFit, index: int, loss: float, rate: float
+) -> None:
+    """Report a step of the fit of maps; a snapshot shows the cloud with baked light that they are fitted for."""
+    on_step(Step(config.steps + index, _total_steps(config), loss, rate, lambda: cloud))
 
 
 def fit_inputs(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> tuple[Any, ...]:

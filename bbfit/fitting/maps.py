@@ -47,7 +47,7 @@ _PLAIN = (0.5, 0.5, 1.0, 0.0)
 
 
 def fit_maps(
-    cloud: BillboardCloud, views: ViewDataset, config: ResolvedFit, on_step: Callable[[int, int], None] | None = None
+    cloud: BillboardCloud, views: ViewDataset, config: ResolvedFit, on_step: Callable[[int, float, float], None] | None = None
 ) -> BillboardCloud:
     """Fit maps to the training views under many lights, for a cloud whose placement and alpha are fitted.
 
@@ -55,8 +55,8 @@ def fit_maps(
     (:data:`~bbfit.geometry.light.SUNNY`). Texels are shaded in that light and drawn, and Adam takes the gradient of the loss in the maps.
     Placement and alpha stay as they are. The start is :func:`baked_maps`.
 
-    ``views`` have ``lit_train`` and the light of their own pictures. ``on_step`` is called with the number of finished steps and their
-    total. Returns the cloud with its maps, on the CPU; ``light`` is that of the views' own pictures.
+    ``views`` have ``lit_train`` and the light of their own pictures. ``on_step`` is called with the number of each step, from 1, its
+    loss, and its learning rate. Returns the cloud with its maps, on the CPU; ``light`` is that of the views' own pictures.
     """
     assert views.lit_train is not None and views.train.light is not None
     sunny = views.lit_train.under(*SUNNY)
@@ -72,16 +72,17 @@ def fit_maps(
     gradient = torch.zeros_like(base.texels)
     for step in range(config.map_steps):
         rate = _LEARNING_RATE * 0.5 * (1 + math.cos(math.pi * step / config.map_steps))
+        loss = 0.0
         for index in _sample(len(exposures), step, config.seed):
             shaded = replace(base, texels=shade(base.texels, maps.texels, lights[index]), gradient=gradient.zero_())
-            passes.differentiate(shaded, [index], alpha, False)
+            loss += float(passes.differentiate(shaded, [index], alpha, False)[0]) / _BATCH
             gradient[:, 3] = 0  # alpha is not to change
             pull_back(base.texels, maps.texels, lights[index], gradient, base.gradient, maps.gradient)
         maps.gradient[:, 3] = 0  # nor translucency
         for state in (base, maps):
             state.update(step + 1, rate, (config.beta1, config.beta2))
         if on_step is not None:
-            on_step(step + 1, config.map_steps)
+            on_step(step + 1, loss, rate)
     count = len(cloud.texels)
     fitted = replace(cloud, texels=base.texels[:count], surface=maps.texels[:count], light=views.train.light[[0]])
     return bled(fitted.to("cpu"))

@@ -91,10 +91,7 @@ def fit_stage(
         def on_place(done: int, total: int) -> None:
             on_progress("place", done, total)
 
-        def on_map(done: int, total: int) -> None:
-            on_progress("maps", done, total)
-
-        result = fit(views, config, tree=tree, checkpoint=checkpoint, on_step=after, on_place=on_place, on_map=on_map)
+        result = fit(views, config, tree=tree, checkpoint=checkpoint, on_step=after, on_place=on_place)
         cloud = result.cloud if limit is None else fitted_within_bytes(views, result, *limit)
         cloud.save(folder / "cloud.safetensors")
         write_bytes(folder / "loss.csv", _loss_table(result.losses))

@@ -159,7 +159,9 @@ def test_whole_fit_has_maps_and_scores_better_than_baked(known: BillboardCloud, 
     scores = {}
     for light in ("baked", "maps"):
         config = FitConfig(alpha="blend", billboards=2, placement="even", steps=120, map_steps=80, light=light, texel_density=1.0)
-        cloud = fit(views, config).cloud
+        steps = list[tuple[int, int]]()
+        cloud = fit(views, config, on_step=lambda step, steps=steps: steps.append((step.index, step.total))).cloud  # type: ignore[misc]
+        assert steps == [(index + 1, 200 if light == "maps" else 120) for index in range(len(steps))] and steps[-1][0] == steps[-1][1]
         assert (cloud.surface is not None) == (light == "maps")
         draw = lambda camera, light, cloud=cloud: render(cloud, camera, light=light if cloud.surface is not None else None)  # noqa: E731
         score = score_light(draw, views.lit_test, BAKED)  # type: ignore[arg-type]
