@@ -20,7 +20,7 @@ from bbfit.checks import check_file
 VERSIONS: Mapping[str, int] = {
     "grow": 1,
     "convert": 1,
-    "views": 5,
+    "views": 6,
     "budget": 10,
     "fit": 20,
     "export": 8,

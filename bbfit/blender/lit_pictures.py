@@ -11,11 +11,11 @@ import numpy as np
 from torch import Tensor
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.geometry.light import direction, sky, to_z_up
+from bbfit.geometry.light import QUARTER_TURN, direction, sky, to_z_up
 
 HELD_OUT_SUNS, HELD_OUT_CAMERAS = 4, 8
 """Number of suns that no training camera sees the tree under, and of held-out cameras that see it under each of them."""
-# The held-out suns are turned against the others.
+# The held-out suns are turned against the others, by degrees.
 _TURN = 100.0
 
 
@@ -73,22 +73,24 @@ def light_request(suns: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
     return {"suns": list(map(to_z_up, suns)), "ambient": None, "of_suns": [], "albedo": None, "normal": None}
 
 
-def own_suns(config: ViewsConfig) -> list[tuple[float, float, float]]:
-    """The sun of the views' own pictures, if there is one."""
-    return [_rounded(direction(config.sun_azimuth, config.sun_elevation))] if config.sun_strength else []
+def own_suns(config: ViewsConfig, turn_degrees: float = 0.0) -> list[tuple[float, float, float]]:
+    """The sun of the views' own pictures, turned about the vertical, if there is one."""
+    return [_rounded(direction(config.sun_azimuth + turn_degrees, config.sun_elevation))] if config.sun_strength else []
 
 
 def lit_pictures(config: ViewsConfig, pictures: Sequence[Path], train: Sequence[int], test: Sequence[int]) -> dict[int, LitPictures]:
     """The lit pictures by the indices of their views; nothing if there are none.
 
     Training cameras share suns that are spread over the whole sky, ``config.suns`` for each, in random order. Some held-out cameras, spread
-    evenly, have :data:`HELD_OUT_SUNS` others, the same for all of them.
+    evenly, have :data:`HELD_OUT_SUNS` others, the same for all of them. One of these is the sun of the views' own pictures, turned by
+    :data:`~bbfit.geometry.light.QUARTER_TURN`: what a tree sees that is turned under a fixed sun.
     """
     if not config.suns:
         return {}
     directions = sky(len(train) * config.suns)[np.random.default_rng(config.seed).permutation(len(train) * config.suns)]
     seen = [_rounded(sun) for sun in directions]
-    unseen = [_rounded(sun) for sun in sky(HELD_OUT_SUNS, _TURN)]
+    turned = own_suns(config, QUARTER_TURN)
+    unseen = [*turned, *(_rounded(sun) for sun in sky(HELD_OUT_SUNS - len(turned), _TURN))]
     suns = {index: seen[place * config.suns :][: config.suns] for place, index in enumerate(train)}
     suns |= dict.fromkeys(spread(test, HELD_OUT_CAMERAS), unseen)
     return {index: LitPictures((*own_suns(config), *suns[index]), pictures[index]) for index in sorted(suns)}

@@ -15,6 +15,8 @@ LEAST_ELEVATION = 10.0
 """Least elevation of the suns of :func:`sky` in degrees: below it, a sun lights little but the edges of a tree."""
 SUNNY = (1.8 * math.pi, 0.4)
 """Strengths of the sun and of the sky on a sunny day: a white surface that faces the sun has 1.8 and 0.4 times the radiance of white."""
+QUARTER_TURN = 90.0
+"""Angle in degrees by which one of the held-out suns is turned about the vertical against the sun of the views' own pictures."""
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
