@@ -24,7 +24,7 @@ VERSIONS: Mapping[str, int] = {
     "budget": 10,
     "fit": 20,
     "export": 8,
-    "evaluate": 12,
+    "evaluate": 13,
     "report": 6,
     "lod": 3,
     "compare": 4,

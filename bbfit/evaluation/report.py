@@ -178,7 +178,7 @@ class Report:
             "sharpness", "brightness", "vertices": {"model", "original", "ratio"}, "bytes": {the same}, "overdraw", "shaded",
             "antialiased": {the same measures} or None,
             "trunk": {"iou", "worst_iou", "delta_e", "worst_view", "views": [{"name", "iou", "delta_e"}]} or None,
-            "light": {"psnr", "flip", "low", "r2", "suns": [..], "views": [..]} or None,
+            "light": {"psnr", "flip", "low", "r2", "drift", "albedo", "normal_degrees", "suns", "cameras", "views"} or None,
             "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
             "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
             "shimmer": [{"width", "height", "tree", "ratio", "antialiased"}],

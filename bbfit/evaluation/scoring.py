@@ -129,6 +129,7 @@ def evaluate_model(
             lambda camera, light: shown(camera, light if has_maps else None),
             lit,
             baked,
+            model.surfaces if has_maps else None,
             lambda done, _: on_progress(total - suns + done, total),
         )
     return Report(

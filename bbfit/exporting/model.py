@@ -93,6 +93,10 @@ class ShippedModel:
             return self._renderer.draw(camera, light)
         return render(self.cloud, camera.to(self.cloud.texels.device))
 
+    def surfaces(self, camera: Camera) -> Tensor:
+        """What the files show of the surfaces of a cloud with maps: see :meth:`~bbfit.rendering.cards.CardRenderer.surfaces`."""
+        return self._renderer.surfaces(camera)
+
     def antialiased(self) -> ShippedModel:
         """The same model as a program draws it that smooths the edges of masks by alpha to coverage."""
         model = replace(self, cloud=replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=True)))

@@ -150,10 +150,41 @@ class CardRenderer:
         with torch.no_grad():
             pictures = []
             for index in range(len(cameras)):
-                own = None if light is None else light[[index if len(light) > 1 else 0]]
-                pictures.append(_view(self._cards, self._sheets, self._levels, cameras[index], own))
+                met, straight = self._shown(cameras[index])
+                colors = straight[:, :3]
+                if light is not None:
+                    colors = _lit(colors, straight[:, 4:], self._sheets.axes[met.sheet], light[[index if len(light) > 1 else 0]])
+                pictures.append(self._composited(colors, straight[:, 3], met, cameras[index]))
             image = torch.stack(pictures)
         return image if camera.batched else image[0]
+
+    def surfaces(self, camera: Camera) -> Tensor:
+        """What the surfaces are that cards with maps show to a single camera, without light: premultiplied base color, display-referred,
+        premultiplied normals in the world, and alpha, float32 [H, W, 7]."""
+        with torch.no_grad():
+            met, straight = self._shown(camera)
+            normals = normalize(2 * straight[:, 4:7] - 1, dim=-1)
+            in_world = (normals[:, None] @ self._sheets.axes[met.sheet].float())[:, 0]
+            return self._composited(torch.cat([straight[:, :3], in_world], -1), straight[:, 3], met, camera)
+
+    def _shown(self, camera: Camera) -> tuple[Hits, Tensor]:
+        """The places that a single camera sees, and the filtered values of the atlas there, [M, C]."""
+        met = hits(self._cards, self._sheets, camera)
+        return met, filtered(self._levels, met.uv, met.detail) / 255
+
+    def _composited(self, values: Tensor, alphas: Tensor, met: Hits, camera: Camera) -> Tensor:
+        """The picture of places with values [M, C] and alpha [M] in a single camera, [H, W, C + 1]."""
+        alpha = self._cards.alpha
+        if alpha.kind == "hash":
+            alphas = (alphas >= thresholds(met.x, met.y, self._sheets.first[met.sheet])).to(alphas)
+        elif alpha.antialiased:
+            across, down = ((filtered(self._levels, uv, met.detail)[:, 3] / 255 - alphas).abs() for uv in _beside(met))
+            alphas = coverage(alphas, across + down, alpha)
+        else:
+            alphas = opacity(alphas, alpha)
+        shown, pixels, count = alphas > 0, met.y * camera.width + met.x, camera.height * camera.width
+        image = composite_fragments(values[shown], alphas[shown], met.depth[shown], pixels[shown], count, nested=alpha.antialiased)
+        return image.unflatten(0, (camera.height, camera.width))
 
     def fragments(self, camera: Camera) -> int:
         """How many fragments a graphics card shades for a single camera: the pixel centers inside the polygons of all layers.
@@ -295,25 +326,6 @@ def _bilinear(levels: MipChain, uv: Tensor, level: Tensor) -> Tensor:
     # In this form equal texels give their own value exactly, whatever the weights: alpha at the cutoff stays at the cutoff.
     upper, lower = a + (b - a) * x, c + (d - c) * x
     return upper + (lower - upper) * y
-
-
-def _view(cards: Cards, sheets: Sheets, levels: MipChain, camera: Camera, light: Light | None) -> Tensor:
-    """Picture of a single camera in a light, a batch of one, [H, W, 4]."""
-    met = hits(cards, sheets, camera)
-    straight = filtered(levels, met.uv, met.detail) / 255
-    colors, alphas = straight[:, :3], straight[:, 3]
-    if light is not None:
-        colors = _lit(colors, straight[:, 4:], sheets.axes[met.sheet], light)
-    if cards.alpha.kind == "hash":
-        alphas = (alphas >= thresholds(met.x, met.y, sheets.first[met.sheet])).to(alphas)
-    elif cards.alpha.antialiased:
-        across, down = ((filtered(levels, uv, met.detail)[:, 3] / 255 - alphas).abs() for uv in _beside(met))
-        alphas = coverage(alphas, across + down, cards.alpha)
-    else:
-        alphas = opacity(alphas, cards.alpha)
-    shown, pixels, count = alphas > 0, met.y * camera.width + met.x, camera.height * camera.width
-    image = composite_fragments(colors[shown], alphas[shown], met.depth[shown], pixels[shown], count, nested=cards.alpha.antialiased)
-    return image.unflatten(0, (camera.height, camera.width))
 
 
 def _lit(colors: Tensor, maps: Tensor, axes: Tensor, light: Light) -> Tensor:

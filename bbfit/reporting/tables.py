@@ -74,6 +74,13 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
         table.add_row("FLIP", _DOWN, f"{light.flip:.4f}", "", "", "")
         table.add_row("PSNR of blocks, dB", _UP, "", "", "-" if light.low is None else f"{light.low:.2f}", "")
         table.add_row("change of light, R2", _ONE, "", "", _share(light.r2), "")
+        for name, value, digits, unit in (
+            ("drift, turned by 90°", light.drift, 4, ""),
+            ("base color of blocks", light.albedo, 4, ""),
+            ("normals of blocks", light.normal_degrees, 1, "°"),
+        ):
+            if value is not None:
+                table.add_row(name, _DOWN, "", "", f"{value:.{digits}f}{unit}", "")
 
     if report.antialiased is not None:
         table.add_section()

@@ -14,8 +14,8 @@ from bbfit.geometry.light import Light, from_z_up
 from bbfit.images import sum_of_lights
 from bbfit.views.view_set import ViewSet
 
-# Distance of unit vectors up to which two suns are the same.
-_SAME_SUN = 1e-3
+SAME_SUN = 1e-3
+"""Distance of unit vectors up to which two suns are the same."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class LitViews:
 
     def other_suns(self, baked: Light) -> list[int]:
         """The pictures under another sun than that of a light, a batch of one."""
-        return torch.nonzero((self.directions - baked.sun_directions[0]).norm(dim=-1) > _SAME_SUN)[:, 0].tolist()
+        return torch.nonzero((self.directions - baked.sun_directions[0]).norm(dim=-1) > SAME_SUN)[:, 0].tolist()
 
     def normals(self, index: int) -> Tensor:
         """The normals that one of the V cameras sees, Y up, float32 [H, W, 3]; they have unit length where one surface fills a pixel."""

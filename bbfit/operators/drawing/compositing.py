@@ -33,10 +33,11 @@ def composite(colors: list[Tensor], alphas: list[Tensor], depths: list[Tensor], 
 
 
 def composite_fragments(colors: Tensor, alphas: Tensor, depths: Tensor, pixels: Tensor, count: int, *, nested: bool = False) -> Tensor:
-    """Do what :func:`composite` does for M fragments in place of whole layers: premultiplied RGBA of ``count`` pixels, [count, 4].
+    """Do what :func:`composite` does for M fragments in place of whole layers: premultiplied values and alpha of ``count`` pixels.
 
-    A fragment is what one layer shows in one pixel: straight color [M, 3], opacity [M], depth [M] and the index of the pixel, int64 [M].
-    Fragments are in the order of their layers. For sparse layers this is many times faster.
+    A fragment is what one layer shows in one pixel: straight color or other values [M, C], opacity [M], depth [M] and the index of the
+    pixel, int64 [M]. The result is [count, C + 1], for colors RGBA. Fragments are in the order of their layers. For sparse layers this is
+    many times faster.
     """
     order = depths.sort(stable=True).indices
     order = order[pixels[order].sort(stable=True).indices]
@@ -53,7 +54,7 @@ def composite_fragments(colors: Tensor, alphas: Tensor, depths: Tensor, pixels: 
     first[1:] = pixel[1:] != pixel[:-1]
     rank = number - torch.where(first, number, 0).cummax(0).values
     by_rank = rank.sort(stable=True).indices  # no pixel occurs twice in a rank
-    shown, hidden = colors.new_zeros(count, 4), colors.new_zeros(count)
+    shown, hidden = colors.new_zeros(count, colors.shape[1] + 1), colors.new_zeros(count)
     for some in by_rank.split(torch.bincount(rank).tolist()):
         where, chosen = pixel[some], order[some]
         alpha, behind = alphas[chosen], hidden[where]
