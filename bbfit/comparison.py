@@ -16,11 +16,12 @@ from bbfit.blender.pictures import render_pictures
 from bbfit.blender.requirements import check_blender
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError, check_record, fail
+from bbfit.evaluation.light import LightScore
 from bbfit.evaluation.measures import Measures, mean_measures
-from bbfit.evaluation.scoring import held_out, score_views
+from bbfit.evaluation.scoring import held_out, score_model_light, score_views
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
-from bbfit.exporting.model import ShippedModel, shipped_model
+from bbfit.exporting.model import shipped_model
 from bbfit.files import read_json, remove_parts, write_bytes, write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_per_meter
@@ -33,10 +34,11 @@ from bbfit.provenance import VERSIONS
 from bbfit.reporting.comparison_tables import CompareRow, compare_csv, compare_markdown, compare_picture, compare_plot
 from bbfit.rivals.baking import BakeConfig
 from bbfit.rivals.billboard_clouds import billboard_cloud
-from bbfit.rivals.config import SYSTEMS, CompareConfig
+from bbfit.rivals.config import LIT, SYSTEMS, CompareConfig
 from bbfit.rivals.crossed import crossed_planes
 from bbfit.rivals.decimation import decimate
 from bbfit.rivals.draco import draco_size
+from bbfit.rivals.fluffed import fluffed
 from bbfit.rivals.learned_mesh import learn_mesh, mesh_glb
 from bbfit.rivals.slicing import slicing
 from bbfit.stages.results import original_tree
@@ -78,6 +80,8 @@ class _SystemResult:
     note: str = ""
     size: int | None = None
     """Size in bytes if there is no GLB file."""
+    lit: Callable[[], LightScore | None] | None = None
+    """Scores it under the suns of held-out views. ``None`` if that is not done."""
 
 
 def compare(
@@ -91,9 +95,10 @@ def compare(
     """Simplify a tree with bbfit and with alternative systems, and score all results on the same held-out views.
 
     Each result is drawn as its authors intended. Billboards, slices and learned meshes are unlit and blended (bbfit's default uses an alpha
-    test). Decimated meshes are rendered by Blender in the light of the views. Writes ``views/``, a folder for each system with its model
-    and its pictures of the held-out views, ``compare.csv``, ``compare.md``, ``compare.json``, ``systems.png`` and ``quality.png``. A killed
-    comparison continues where it stopped.
+    test). Billboards with maps take the light of the views, and Blender renders decimated meshes in it. Billboards are also scored under
+    the suns of held-out views; the systems with maps need such views, which then have at least one sun. Writes ``views/``, a folder for
+    each system with its model and its pictures of the held-out views, ``compare.csv``, ``compare.md``, ``compare.json``, ``systems.png``
+    and ``quality.png``. A killed comparison continues where it stopped.
 
     Parameters
     ----------
@@ -117,7 +122,10 @@ def compare(
     tree = TreeFile.open(tree, stages.limits)
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "the comparison sets their numbers", "omit billboards and budgets")
-    systems = [system for system in SYSTEMS if system in config.systems or not config.systems]
+    chosen = config.systems or (SYSTEMS if stages.views.hdri is None else tuple(system for system in SYSTEMS if system not in LIT))
+    systems = [system for system in SYSTEMS if system in chosen]
+    if set(systems) & set(LIT) and not stages.views.suns:
+        stages = replace(stages, views=replace(stages.views, suns=1))
     for system, (fit, budget) in _fits(config, stages.fit).items():
         if system == "bbfit" or system in systems:  # others take its size
             replace(stages, fit=fit, budget=budget).check(mesh=False, rendered=True, blender=False)
@@ -166,6 +174,8 @@ def _fits(config: CompareConfig, shared: FitConfig) -> dict[str, tuple[FitConfig
         "bbfit-blend": FitConfig(alpha="blend", billboards=count),
         "bbfit-many": FitConfig(alpha="blend", billboards=config.many),
         "thesis": FitConfig(preset="thesis", billboards=4, sides="pair"),
+        "bbfit-maps": FitConfig(billboards=count, light="maps"),
+        "baked-maps": FitConfig(billboards=count, light="maps", map_steps=0),
     }
     open_fields = {
         system: [entry.name for entry in fields(FitConfig) if getattr(fit, entry.name) == getattr(default, entry.name)]
@@ -204,6 +214,9 @@ class _Comparison:
             "draco": ("the tree, with Draco", self._draco),
             "learned": (f"learned mesh, {config.mesh_vertices} vertices", partial(self._learned, config.mesh_vertices)),
             "learned-many": (f"learned mesh, {config.mesh_vertices_many} vertices", partial(self._learned, config.mesh_vertices_many)),
+            "bbfit-maps": (f"bbfit, {count} billboards, mask, fitted maps", partial(self._fitted, "bbfit-maps")),
+            "baked-maps": (f"bbfit, {count} billboards, mask, baked maps", partial(self._fitted, "baked-maps")),
+            "fluffed": (f"bbfit, {count} billboards, mask, baked maps, spherical normals", self._fluffed),
         }
 
     def row(self, system: str) -> CompareRow:
@@ -216,8 +229,10 @@ class _Comparison:
             if result.model is not None:
                 write_bytes(folder / "model.glb", result.model)
             measures = None if result.draw is None else self._score(system, result.draw, output_folder("out", folder / "held_out"))
+            score = None if result.lit is None else result.lit()
+            light = None if score is None else score.figures
             size = result.size if result.model is None else len(result.model)
-            row = CompareRow(system, title, result.planes, result.vertices, size, round(result.seconds, 1), measures, result.note)
+            row = CompareRow(system, title, result.planes, result.vertices, size, round(result.seconds, 1), measures, result.note, light)
             write_json(folder / "result.json", row.to_json())
 
         settings = replace(self._config, systems=())
@@ -230,7 +245,7 @@ class _Comparison:
         except InputError as error:
             if "is not installed" not in str(error) and "LLVM" not in str(error):
                 raise
-            return CompareRow(system, title, None, None, None, None, None, str(error))
+            return CompareRow(system, title, None, None, None, None, None, str(error), None)
         content = read_json("result", folder / "result.json")
         with reading("result", folder / "result.json", "remove it, then start bbfit compare again"):
             row = replace(CompareRow.from_json(content), title=title)
@@ -262,22 +277,39 @@ class _Comparison:
             self._on_progress(f"{folder.name} {stage}", done, total, note)
 
         result = run(self._folder / "views", folder / "run", replace(stages, tree=self._tree.path), on_progress=report)
-        shipped = shipped_model(result.cloud, self._stages.export.comparable())
         seconds = sum(result.report.seconds.get(stage, 0.0) for stage in ("budget", "fit", "export"))
-        model = (folder / "run" / "model.glb").read_bytes()
+        return replace(self._of(result.cloud, self._stages.export.comparable(), seconds), lit=lambda: result.report.light)
+
+    def _of(self, cloud: BillboardCloud, export: ExportConfig, seconds: float) -> _SystemResult:
+        """The result of a system that makes billboards."""
+        model = shipped_model(cloud, export)
+
+        def lit() -> LightScore | None:
+            views, baked = self._views.lit_test, self._views.test.light
+            return None if views is None or baked is None else score_model_light(model, views, baked[[0]])
+
         return _SystemResult(
-            model, result.report.vertices.model or 0, seconds, lambda index: self._drawn(shipped, index), len(result.cloud)
+            model.glb,
+            model.cards.vertex_count,
+            seconds,
+            lambda index: held_out(model.draw, self._views.test, index)[1],
+            len(cloud),
+            lit=lit,
         )
 
-    def _drawn(self, model: ShippedModel, index: int) -> Tensor:
-        return held_out(model.draw, self._views.test, index)[1]
+    def _fluffed(self, folder: Path) -> _SystemResult:
+        """Spherical normals in place of the baked ones of the system ``baked-maps``."""
+        baked = self.row("baked-maps")
+        started = time.perf_counter()
+        cloud = fluffed(BillboardCloud.load(self._folder / "baked-maps" / "run" / "cloud.safetensors"))
+        result = self._of(cloud, self._stages.export.comparable(), 0.0)
+        return replace(result, seconds=(baked.seconds or 0.0) + time.perf_counter() - started)
 
     def _baked(self, bake: Callable[..., BillboardCloud], folder: Path) -> _SystemResult:
         started = time.perf_counter()
         cloud = bake(self._tree, config=self._bake, folder=folder / "baked", on_progress=self._on(folder, "bake"))
-        model = shipped_model(cloud, ExportConfig(outline="rectangle"))
-        vertices = glb_counts(model.glb)[0]
-        return _SystemResult(model.glb, vertices, time.perf_counter() - started, lambda index: self._drawn(model, index), len(cloud))
+        result = self._of(cloud, ExportConfig(outline="rectangle"), 0.0)
+        return replace(result, seconds=time.perf_counter() - started)
 
     def _sliced(self, folder: Path) -> _SystemResult:
         started = time.perf_counter()

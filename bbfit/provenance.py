@@ -27,7 +27,7 @@ VERSIONS: Mapping[str, int] = {
     "evaluate": 13,
     "report": 6,
     "lod": 3,
-    "compare": 4,
+    "compare": 5,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""
 EXECUTION = {"affects_result": False}

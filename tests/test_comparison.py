@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from khronos import WARNING, messages
 from PIL import Image
@@ -23,7 +24,7 @@ from bbfit.exporting.lod import glb_counts
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.pipeline import RunConfig
-from bbfit.rivals.config import SYSTEMS, CompareConfig
+from bbfit.rivals.config import LIT, SYSTEMS, CompareConfig
 from bbfit.views.dataset import ViewDataset
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
@@ -67,6 +68,29 @@ def test_bbfits_row_is_its_run(done: CompareResult) -> None:
     report = evaluate(cloud, ViewDataset.load(done.folder / "views").test, export=ExportConfig(outline="rectangle"))
     assert done.rows[0].measures == report.mean and cloud.alpha.kind == "mask"
     assert BillboardCloud.load(done.folder / "bbfit-blend" / "run" / "cloud.safetensors").alpha.kind == "blend"
+
+
+def test_maps_take_the_light_of_other_suns(done: CompareResult) -> None:
+    """Each on the planes of bbfit. Baked colors reproduce nothing of the change; decimated meshes are not scored."""
+    rows = {row.system: row for row in done.rows}
+    lit = {name: row.light["r2"] for name, row in rows.items() if row.light is not None}
+    assert set(lit) == {name for name in SYSTEMS if not name.startswith(("decimated", "thinned", "draco", "learned", "slicing"))}
+    assert all(lit[name] == pytest.approx(0, abs=1e-9) for name in lit if name not in LIT)
+    assert all(abs(lit[name] or 0) > 1e-3 for name in LIT)
+    maps, baked = rows["bbfit-maps"].light, rows["bbfit"].light
+    assert maps and baked and (maps["low"] or 0) > (baked["low"] or 0) + 1
+    clouds = {name: BillboardCloud.load(done.folder / name / "run" / "cloud.safetensors") for name in ("bbfit", "bbfit-maps", "baked-maps")}
+    for name in ("bbfit-maps", "baked-maps"):
+        torch.testing.assert_close(clouds[name].centers, clouds["bbfit"].centers)
+        assert rows[name].light != rows["bbfit"].light
+    assert rows["fluffed"].vertices == rows["baked-maps"].vertices and rows["fluffed"].light != rows["baked-maps"].light
+    assert "## Under other suns" in (done.folder / "compare.md").read_text()
+
+
+def test_panoramas_leave_out_what_needs_suns(tmp_path: Path) -> None:
+    views = replace(STAGES.views, hdri=tmp_path / "sky.hdr")
+    with pytest.raises(InputError, match="suns: they need an even sky"):
+        compare(TREE, tmp_path / "out", CompareConfig(systems=("fluffed",)), RunConfig(views=views, fit=STAGES.fit))
 
 
 def test_tables_and_pictures(done: CompareResult) -> None:

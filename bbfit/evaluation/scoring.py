@@ -13,7 +13,7 @@ from torch import Tensor
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.evaluation import metrics, thesis_scale
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
-from bbfit.evaluation.light import score_light
+from bbfit.evaluation.light import LightScore, score_light
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.report import Cost, Report, ShimmerScore, ViewScore
 from bbfit.evaluation.shimmer import score_shimmer
@@ -24,6 +24,7 @@ from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.light import Light
 from bbfit.rendering.cards import CardRenderer
 from bbfit.views.dataset import TurnedViews
 from bbfit.views.lit import LitViews
@@ -124,14 +125,7 @@ def evaluate_model(
         on_progress(total - suns, total)
     light = None
     if lit is not None and baked is not None:
-        shown, has_maps = smooth or model.draw, model.cloud.surface is not None
-        light = score_light(
-            lambda camera, light: shown(camera, light if has_maps else None),
-            lit,
-            baked,
-            model.surfaces if has_maps else None,
-            lambda done, _: on_progress(total - suns + done, total),
-        )
+        light = score_model_light(model, lit, baked, lambda done, _: on_progress(total - suns + done, total))
     return Report(
         views=scores,
         vertices=Cost(model.cards.vertex_count, original.vertices),
@@ -145,6 +139,15 @@ def evaluate_model(
         light=light,
         seconds={"evaluate": time.perf_counter() - started},
     )
+
+
+def score_model_light(
+    model: ShippedModel, lit: LitViews, baked: Light, on_view: Callable[[int, int], None] | None = None
+) -> LightScore | None:
+    """Do what :func:`~bbfit.evaluation.light.score_light` does for a model, whose masks are drawn with alpha to coverage."""
+    shown, has_maps = model.antialiased() if model.cloud.alpha.kind == "mask" else model, model.cloud.surface is not None
+    draw = shown.draw if has_maps else lambda camera, light: shown.draw(camera)
+    return score_light(draw, lit, baked, model.surfaces if has_maps else None, on_view)
 
 
 def score_shading(cards: Cards, views: ViewSet) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ _MEASURES = (
     *("psnr", "ssim", "flip", "white_psnr", "white_ssim", "white_flip", "rgba_rmse", "rgba_psnr", "iou", "sharpness", "brightness"),
     *("color_delta_e", "color_chroma", "color_brightness", "thesis_psnr"),
 )
+_LIGHT = ("psnr", "flip", "low", "r2")
 # Headings of the measures in compare.md.
 _SHOWN = ("PSNR, dB", "SSIM", "FLIP", "PSNR over white", "silhouette IoU", "sharpness", "color ΔE", "chroma", "brightness")
 
@@ -52,6 +53,8 @@ class CompareRow:
     """Means over the held-out views; ``None`` where nothing was drawn."""
     note: str
     """A remark for the reader."""
+    light: Mapping[str, float | None] | None
+    """PSNR, FLIP, PSNR of blocks and R2 under the suns of held-out views (``LightScore.figures``); ``None`` where that was not scored."""
 
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON holds them."""
@@ -69,9 +72,13 @@ def compare_csv(rows: Sequence[CompareRow]) -> bytes:
     """CSV with one line per system: all measures and costs."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["system", "title", "planes", "vertices", "bytes", "seconds", *_MEASURES, "note"])
+    writer.writerow(
+        ["system", "title", "planes", "vertices", "bytes", "seconds", *_MEASURES, *(f"light_{name}" for name in _LIGHT), "note"]
+    )
     for row in rows:
-        writer.writerow([row.system, row.title, row.planes, row.vertices, row.bytes, row.seconds, *_measures(row.measures), row.note])
+        costs = [row.planes, row.vertices, row.bytes, row.seconds]
+        light = [None if row.light is None else row.light[name] for name in _LIGHT]
+        writer.writerow([row.system, row.title, *costs, *_measures(row.measures), *light, row.note])
     return text.getvalue().encode(errors="backslashreplace")
 
 
@@ -94,7 +101,21 @@ def compare_markdown(rows: Sequence[CompareRow], original: OriginalTree) -> str:
     head = ["system", "planes", "vertices", "bytes", "seconds", *_SHOWN]
     notes = "".join(f"- {row.title}: {row.note}\n" for row in rows if row.note)
     means = "Means over the held-out views, which are the same for all systems. PSNR, SSIM and FLIP are also means over four backgrounds."
-    return f"# Comparison\n\n{means}\n\n{markdown(head, table)}\n{notes}"
+    return f"# Comparison\n\n{means}\n\n{markdown(head, table)}\n{_light_markdown(rows)}{notes}"
+
+
+def _light_markdown(rows: Sequence[CompareRow]) -> str:
+    """The part of the document about light; nothing if no system was scored under other suns."""
+    table, digits = [], dict(zip(_LIGHT, (2, 4, 2, 2), strict=True))
+    for row in rows:
+        if row.light is not None:
+            known = {name: row.light[name] for name in _LIGHT}
+            table.append([row.title, *("" if value is None else f"{value:.{digits[name]}f}" for name, value in known.items())])
+    if not table:
+        return ""
+    head = ["system", "PSNR, dB", "FLIP", "PSNR of blocks, dB", "R²"]
+    intro = "Held-out cameras under four suns that no training view had, on a sunny day. R² is the share of the change of light that shows."
+    return f"## Under other suns\n\n{intro}\n\n{markdown(head, table)}\n"
 
 
 def _shown(measures: Measures | None) -> list[str]:

@@ -157,13 +157,14 @@ def sweep_table(rows: Sequence[SweepRow]) -> Table:
 
 def compare_table(rows: Sequence[CompareRow]) -> Table:
     """A ``rich`` table with one line per system: its costs and its measures on the held-out views, means over the backgrounds."""
-    table = _table(["system"], ["PSNR, dB", "SSIM", "FLIP", "planes", "vertices", "bytes", "seconds"], no_wrap=True)
-    table.caption, table.caption_justify = _MEANS, "left"
+    table = _table(["system"], ["PSNR, dB", "SSIM", "FLIP", "lit, dB", "planes", "vertices", "bytes", "seconds"], no_wrap=True)
+    table.caption, table.caption_justify = f"{_MEANS}; lit: PSNR under other suns", "left"
     for row in rows:
         over = None if row.measures is None else row.measures.over.mean
         scores = ["-"] * 3 if over is None else [f"{over.psnr:.2f}", f"{over.ssim:.3f}", f"{over.flip:.3f}"]
         seconds = "-" if row.seconds is None else f"{row.seconds:,.1f}"
-        table.add_row(row.title, *scores, _count(row.planes), _count(row.vertices), _count(row.bytes), seconds)
+        lit = "-" if row.light is None else f"{row.light['psnr']:.2f}"
+        table.add_row(row.title, *scores, lit, _count(row.planes), _count(row.vertices), _count(row.bytes), seconds)
     return table
 
 

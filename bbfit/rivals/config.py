@@ -22,8 +22,13 @@ SYSTEMS = (
     "draco",
     "learned",
     "learned-many",
+    "bbfit-maps",
+    "baked-maps",
+    "fluffed",
 )
 """Names of all systems, in the order of tables."""
+LIT = ("bbfit-maps", "baked-maps", "fluffed")
+"""Those that take a program's light, for which views need suns."""
 
 
 @dataclass(frozen=True)
