@@ -22,7 +22,7 @@ VERSIONS: Mapping[str, int] = {
     "convert": 1,
     "views": 6,
     "budget": 10,
-    "fit": 20,
+    "fit": 21,
     "export": 8,
     "evaluate": 13,
     "report": 6,

@@ -150,7 +150,7 @@ class FitConfig:
     light: Lighting = "baked"
     """baked: colors contain the light of the views. maps: base color, normals and occlusion, which take the light of a program.
     Maps need views under many lights (suns)."""
-    map_steps: Annotated[int, Range(0)] = 150
+    map_steps: Annotated[int, Range(0)] = 100
     """Steps of the optimizer for maps, after those for placement and alpha. With 0, maps are what the views show of the tree's surfaces."""
     placement: Placement | None = None
     """Where billboards start: upright at k*180/N degrees through the tree's axis (even), or where the tree is (clusters).
