@@ -21,7 +21,7 @@ from typing import Any
 from bbfit.checks import InputError
 from bbfit.geometry.extent import corners
 from bbfit.reporting.charts import billboard_color
-from bbfit.reporting.threejs import drawing_script, library_page
+from bbfit.reporting.threejs import drawing_script, library_page, page_light
 from bbfit.viewing.address import is_own_request, listen
 from bbfit.viewing.field import plant
 from bbfit.viewing.levels import ViewerLevel, field_levels, largest_scale
@@ -32,8 +32,8 @@ from bbfit.views.dataset import ViewDataset
 
 # Connections that are open at a time, and seconds for which one may wait for the other side.
 _MAX_CONNECTIONS, _TIMEOUT = 64, 10
-# Shares of the sky's and the sun's light that reach a leaf among others, in place of shadows. With them the mean color of data/tree.glb in
-# the viewer is that of its views within 6 of 255.
+# Shares of the sky's and the sun's light that reach a leaf among others, in place of shadows, which models with maps have in their maps.
+# With them the mean color of data/tree.glb in the viewer is that of its views within 6 of 255.
 _SKY, _SUN = 0.3, 0.5
 _FILES = {"/": ("viewer.html", "text/html"), "/viewer.css": ("viewer.css", "text/css"), "/viewer.js": ("viewer.js", "text/javascript")}
 _MODEL = re.compile(r"/([0-9]{1,9})/model/([0-9]{1,4})/([0-4])/(mask|blend|hash)(-split)?\.glb")
@@ -268,14 +268,13 @@ def _state(shown: _Shown | None) -> dict[str, Any] | None:
     """What the page knows of a tree. A scale is null if it is not known, and for the first level, which has none."""
     if shown is None:
         return None
-    tree, clouds, light = shown.tree, shown.tree.clouds, shown.tree.light
+    tree, clouds, light = shown.tree, shown.tree.clouds, page_light(shown.tree.clouds[0].light or shown.tree.light)
 
     def described(level: ViewerLevel) -> dict[str, Any]:
         scale = None if level.scale is None or math.isinf(level.scale) else level.scale
         cloud = next((index for index, cloud in enumerate(clouds) if cloud is level.cloud), None)
         return {"name": level.name, "scale": scale, "cloud": cloud, "halvings": level.halvings}
 
-    azimuth, elevation = math.radians(light.sun_azimuth), math.radians(light.sun_elevation)
     return {
         "name": tree.name,
         "generation": shown.generation,
@@ -291,8 +290,7 @@ def _state(shown: _Shown | None) -> dict[str, Any] | None:
         "alpha": tree.export.alpha or clouds[0].alpha.kind,
         "split": bool(tree.export.resolve().split),
         "bounds": tree.bounds.tolist(),
-        # A white matte surface returns its irradiance over pi, in Blender's sun and sky as in three.js's lights.
-        "sky": _SKY * math.pi * light.ambient_strength,
-        "sun": _SUN * light.sun_strength,
-        "sunward": [math.cos(elevation) * math.sin(azimuth), math.sin(elevation), math.cos(elevation) * math.cos(azimuth)],
+        "maps": tree.has_maps,
+        "light": light,
+        "shaded": light | {"sky": _SKY * light["sky"], "sun": _SUN * light["sun"]},
     }

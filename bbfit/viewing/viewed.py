@@ -17,6 +17,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.files import read_json
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
+from bbfit.geometry.light import Light, direction
 from bbfit.inputs import reading
 from bbfit.layout import REQUEST_FILE
 from bbfit.stages.stage import RECORD_FILE
@@ -41,8 +42,8 @@ class ViewedTree:
     """How the run's models are exported; the textures are PNG, which browsers read."""
     bounds: NDArray[np.float64]
     """Lowest and highest corner of what the billboards show in meters, [2, 3]."""
-    light: ViewsConfig
-    """How the tree was lit in the views, as far as it is known."""
+    light: Light
+    """The light of the views, as far as it is known, a batch of one."""
     views: Path | None = None
     """The folder of views that the billboards were fitted to."""
     notes: tuple[str, ...] = ()
@@ -54,6 +55,11 @@ class ViewedTree:
     def clouds(self) -> tuple[BillboardCloud, ...]:
         """The clouds of the levels that have billboards."""
         return tuple(level.cloud for level in self.levels if level.cloud is not None)
+
+    @property
+    def has_maps(self) -> bool:
+        """Whether the billboards take the light of a program: all clouds have maps."""
+        return all(cloud.surface is not None for cloud in self.clouds)
 
     @property
     def is_measured(self) -> bool:
@@ -93,7 +99,7 @@ def _open_run(folder: Path, original_bytes: int) -> ViewedTree:
     return replace(tree, export=_export(record), views=views, notes=notes, live=False)
 
 
-def live_tree(cloud: BillboardCloud, name: str, original: Original, light: ViewsConfig) -> ViewedTree:
+def live_tree(cloud: BillboardCloud, name: str, original: Original, light: Light) -> ViewedTree:
     """A tree whose billboards are being fitted."""
     levels = (ViewerLevel(None, math.inf), ViewerLevel(cloud, None)) if original.glb is not None else (ViewerLevel(cloud, math.inf),)
     return ViewedTree(name, levels, original, ExportConfig(), shown_bounds(cloud).numpy(), light, live=True)
@@ -112,16 +118,17 @@ def sources(folder: Path, record: dict[str, Any]) -> list[Path | None]:
     return [Path(given)] if isinstance(given, str) else []
 
 
-def light_of(views: Path | None) -> ViewsConfig:
-    """The light of a folder of views by its ``views.json``; the default light if that file has none."""
+def light_of(views: Path | None) -> Light:
+    """The light of a folder of views by its ``views.json``, a batch of one; the default light if that file has none."""
     path = None if views is None else views / REQUEST_FILE
     names = ("sun_strength", "sun_azimuth", "sun_elevation", "ambient_strength")
     try:
         request = ViewsRequest.load(path) if path is not None and path.is_file() else None
-        config = request.config if request else {}
-        return ViewsConfig(**{name: config[name] for name in names if isinstance(config.get(name), int | float)})
+        stored = request.config if request else {}
+        config = ViewsConfig(**{name: stored[name] for name in names if isinstance(stored.get(name), int | float)})
     except InputError:
-        return ViewsConfig()
+        config = ViewsConfig()
+    return Light.of(direction(config.sun_azimuth, config.sun_elevation)[None], config.sun_strength, config.ambient_strength)
 
 
 def _record(folder: Path) -> dict[str, Any]:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import torch
 
-from bbfit.blender.config import ViewsConfig
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.loop import Step
 from bbfit.geometry.alpha import AlphaKind, AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.light import Light
 from bbfit.images import premultiply, unpremultiply
 from bbfit.viewing.models import ModelCache, ModelOptions
 from bbfit.viewing.originals import Original, find_original
@@ -43,7 +43,7 @@ class Watch:
 
     def __init__(self, viewer: Viewer, run: WatchedRun, *, interval: float = 2.0, share: float = 0.04) -> None:
         self._viewer, self._run, self._interval, self._share = viewer, run, interval, share
-        self._origin: tuple[Original, ViewsConfig] | None = None
+        self._origin: tuple[Original, Light] | None = None
         self._thread: threading.Thread | None = None
         self._next, self._spent = 0.0, 0.0
 
@@ -89,7 +89,7 @@ class Watch:
         self._next = time.monotonic() + max(self._interval, took / self._share)
 
 
-def _origin(run: WatchedRun) -> tuple[Original, ViewsConfig]:
+def _origin(run: WatchedRun) -> tuple[Original, Light]:
     """The original of a run, and its light."""
     if run.source is not None and run.source.is_dir():
         return find_original([run.tree]), light_of(run.source)

@@ -1,14 +1,27 @@
 "use strict";
-// What the report and the viewer share: models drawn by three.js in the colors of their textures, and a camera that orbits an upright tree.
+// What the report and the viewer share: models drawn by three.js in the colors of their textures, a sun and a sky, and a camera that orbits an
+// upright tree.
 window.bbfit = (() => {
   const STEEPEST = Math.PI / 2 - 0.05;
+  const TURNED_NORMAL = "transformedNormal = m * transformedNormal;";
 
   // The namespace of three.js, which the page in a hidden frame defines.
   const library = (frame) => new Promise((resolve) => {
     const check = () => { if (frame.contentWindow.THREE) resolve(frame.contentWindow.THREE); };
     frame.addEventListener("load", check);
     check();
-  });
+  }).then(withTurnedTangents);
+
+  // Turns the tangents of instances, without which normal maps do not turn. This version of three.js turns their normals alone.
+  function withTurnedTangents(THREE) {
+    const chunk = THREE.ShaderChunk.defaultnormal_vertex;
+    if (!chunk.includes(TURNED_NORMAL)) throw new Error("three.js turns the normals of instances in another way");
+    THREE.ShaderChunk.defaultnormal_vertex = chunk.replace(TURNED_NORMAL, `${TURNED_NORMAL}
+#ifdef USE_TANGENT
+  objectTangent = m * objectTangent;
+#endif`);
+    return THREE;
+  }
 
   // A renderer that writes sRGB and lights surfaces in physical units. Its canvas, which three.js has to make itself, replaces an element.
   function createRenderer(THREE, element) {
@@ -17,6 +30,20 @@ window.bbfit = (() => {
     for (const { name, value } of element.attributes) renderer.domElement.setAttribute(name, value);
     element.replaceWith(renderer.domElement);
     return renderer;
+  }
+
+  // The light of a scene: a sun at an azimuth and a height in degrees, and an even sky. `light` has their intensities and the sun's color.
+  function createLight(THREE, scene) {
+    const sun = new THREE.DirectionalLight(), sky = new THREE.AmbientLight();
+    scene.add(sun, sky);
+    return {
+      aim: (azimuth, height) => sun.position.setFromSphericalCoords(1, ((90 - height) * Math.PI) / 180, (azimuth * Math.PI) / 180),
+      shine(light) {
+        sun.intensity = light.sun;
+        sun.color.setRGB(...light.color);
+        sky.intensity = light.sky;
+      },
+    };
   }
 
   // The scene in the bytes of a GLB file. In a layered one, texels that are at least half opaque are drawn first and hide what is behind
@@ -102,5 +129,5 @@ window.bbfit = (() => {
     return orbit;
   }
 
-  return { library, createRenderer, loadModel, createOrbit };
+  return { library, createRenderer, createLight, loadModel, createOrbit };
 })();

@@ -11,9 +11,9 @@
   const THREE = await bbfit.library($("library"));
   const renderer = bbfit.createRenderer(THREE, document.querySelector("canvas")), canvas = renderer.domElement;
   const scene = new THREE.Scene(), groups = { original: new THREE.Group(), billboards: new THREE.Group(), field: new THREE.Group() };
-  const sky = new THREE.AmbientLight(0xffffff), sun = new THREE.DirectionalLight(0xffffff), ground = new THREE.LineSegments(undefined, new THREE.LineBasicMaterial({ color: 0xd0d7de }));
+  const light = bbfit.createLight(THREE, scene), ground = new THREE.LineSegments(undefined, new THREE.LineBasicMaterial({ color: 0xd0d7de }));
   scene.background = new THREE.Color(0xffffff);
-  scene.add(...Object.values(groups), sky, sun, ground);
+  scene.add(...Object.values(groups), ground);
   const models = new Map(); // by address: null while it loads, false if that failed
   const intervals = [], durations = [];
   let state = { serial: -1, tree: null }, tree = null, status = "", error = "";
@@ -87,7 +87,7 @@
       if (model === null || address.startsWith(`/${tree.generation}/`) || address === originalAddress() || groups.billboards.children.includes(model.root)) continue;
       for (const { geometry, material } of model.meshes ?? []) {
         geometry.dispose();
-        material.map?.dispose();
+        for (const map of ["map", "normalMap", "aoMap"]) material[map]?.dispose();
         material.dispose();
       }
       models.delete(address);
@@ -110,6 +110,7 @@
   // A new state of the server.
   function accept(next) {
     const first = next.tree !== null && (tree === null || (tree.live && !next.tree.live)), start = tree === null;
+    const relit = JSON.stringify(next.tree?.light) !== JSON.stringify(tree?.light);
     if (next.tree?.generation !== tree?.generation) error = ""; // of a model that is no longer shown
     state = next;
     status = next.status;
@@ -131,12 +132,21 @@
       controls.split.checked = tree.split;
     }
     $("notes").replaceChildren(...tree.notes.map((note) => Object.assign(document.createElement("p"), { textContent: note })));
-    sky.intensity = tree.sky;
-    sun.intensity = tree.sun;
-    sun.position.fromArray(tree.sunward);
+    controls.sun.disabled = !tree.maps || tree.light.sun === 0;
+    if (relit) aimSun(tree.light);
     applyMode();
     if (start) fitTree();
     measure();
+  }
+
+  // Move the sun to an azimuth and a height in degrees.
+  function aimSun({ azimuth, height }) {
+    light.aim(azimuth, height);
+    [controls.azimuth.value, controls.height.value] = [azimuth, height];
+    $("sun-note").textContent = !tree.maps ? "The light is in the colors. Fit with --light maps to move the sun."
+      : tree.light.sun === 0 ? "The views have no sun."
+      : `The sun is at ${Math.round(azimuth)}°, ${Math.round(height)}° high; that of the views at ${Math.round(tree.light.azimuth)}°, ${Math.round(tree.light.height)}°. 0° is in front of the tree, 90° on its right.`;
+    dirty = true;
   }
 
   function applyMode() {
@@ -274,6 +284,7 @@
       const { left, bottom, width, height: high } = pane.lastElementChild.getBoundingClientRect();
       if (width === 0 || high === 0) return;
       for (const group of Object.values(groups)) group.visible = group === shown[index];
+      light.shine(tree.maps && shown[index] !== groups.original ? tree.light : tree.shaded);
       renderer.setViewport(left - whole.left, whole.bottom - bottom, width, high);
       renderer.setScissor(left - whole.left, whole.bottom - bottom, width, high);
       orbit.camera.aspect = width / high;
@@ -339,8 +350,13 @@
   }
   controls.slider.addEventListener("input", () => go(distanceOf(controls.slider.value)));
   controls.meters.addEventListener("change", () => go(Number(controls.meters.value)));
+  for (const input of [controls.azimuth, controls.height]) input.addEventListener("input", () => {
+    aimSun({ azimuth: Number(controls.azimuth.value), height: Number(controls.height.value) });
+  });
+  controls["views-sun"].addEventListener("click", () => aimSun(tree.light));
   form.addEventListener("change", (event) => {
-    if (tree === null || [controls.slider, controls.meters, controls.trees, controls.seed].includes(event.target)) return;
+    const { slider, meters, trees, seed, azimuth, height } = controls;
+    if (tree === null || [slider, meters, trees, seed, azimuth, height].includes(event.target)) return;
     error = "";
     if (event.target === controls.show) applyMode();
     measure();
