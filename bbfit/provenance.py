@@ -25,7 +25,7 @@ VERSIONS: Mapping[str, int] = {
     "fit": 21,
     "export": 8,
     "evaluate": 13,
-    "report": 6,
+    "report": 7,
     "lod": 3,
     "compare": 5,
 }

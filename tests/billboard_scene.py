@@ -1,12 +1,14 @@
-"""A tiny scene with a known answer: two crossing billboards, and a views folder that holds exactly what they look like."""
+"""Tiny scenes with a known answer: two crossing billboards and a views folder that holds exactly what they look like; a lit column."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from bbfit.geometry.cloud import BillboardCloud, even_upright
+from bbfit.geometry.light import Light
 from bbfit.geometry.orbit import Orbit
 from bbfit.images import to_bytes, unpremultiply, write_png
 from bbfit.layout import write_transforms
@@ -23,6 +25,14 @@ def crossing_billboards(count: int = 2) -> BillboardCloud:
         texture_sizes=torch.tensor([12, 8]),
     )
     return cloud.with_texels(torch.rand(cloud.texels.shape, generator=torch.Generator().manual_seed(1)))
+
+
+def column(light: Light, color: tuple[float, float, float] = (0.6, 0.5, 0.3)) -> BillboardCloud:
+    """A billboard that looks to +Z, 2 x 3 meters, of one color, with the normals of an upright cylinder: at its left they point left."""
+    plane = even_upright(1, axis=torch.tensor([0.0, 1.5, 0.0]), half_extents=torch.tensor([1.0, 1.5]), texture_sizes=torch.tensor([48, 36]))
+    across = 0.95 * torch.linspace(-1, 1, 36).repeat(48)
+    surface = torch.stack([(across + 1) / 2, torch.full_like(across, 0.5), torch.ones_like(across), torch.zeros_like(across)], -1)
+    return replace(plane, texels=torch.tensor([*color, 1.0]).repeat(len(across), 1), surface=surface, light=light)
 
 
 def write_views(folder: Path, cloud: BillboardCloud, *, count: int = 8, width: int = 40, height: int = 32) -> ViewDataset:

@@ -25,7 +25,9 @@ from bbfit.images import to_bytes, unpremultiply
 from bbfit.model_files import generator
 from bbfit.reporting.charts import FEW, MEASURES, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
 from bbfit.reporting.plots import magma, spread_views
-from bbfit.reporting.threejs import drawing_script, library_page
+from bbfit.reporting.suns import UnderSun, under_suns
+from bbfit.reporting.threejs import drawing_script, library_page, page_light
+from bbfit.views.lit import LitViews
 from bbfit.views.view_set import ViewSet
 
 # The most held-out views with pictures, besides the worst ones, and the largest width of a picture in pixels.
@@ -52,15 +54,16 @@ class RunFacts:
     """The picture of a budget's trials (PNG), if there was a budget."""
 
 
-def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunFacts, glb: bytes) -> str:
+def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunFacts, glb: bytes, lit: LitViews | None = None) -> str:
     """The report on V held-out ``views`` as HTML. The page loads nothing from elsewhere, and names that users chose are escaped.
 
     It shows the key figures beside the original's, held-out views (target, result, FLIP map) with a slider and over the background that the
-    reader chooses, every measure by azimuth with the worst views, the model in 3D, textures and a plan of the billboards, the quality from
-    a distance, the loss, and the options. Of the views it shows the worst ones and at most 36 others, no wider than 512 pixels.
+    reader chooses, every measure by azimuth with the worst views, the model in 3D, with a sun to drag if it has maps, textures and a plan
+    of the billboards, the quality from a distance, the loss, and the options. Of the views it shows the worst ones and at most 36 others,
+    no wider than 512 pixels.
 
-    ``glb`` is the model for the 3D view, with pictures that browsers read (PNG or WebP). Raises InputError if a view cannot be read, or if
-    there are none.
+    ``glb`` is the model for the 3D view, with pictures that browsers read (PNG or WebP). ``lit`` are the held-out views of the report's
+    score under light: the page shows one camera under three suns. Raises InputError if a view cannot be read, or if there are none.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
@@ -98,6 +101,8 @@ def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunF
         glb=base64.b64encode(glb).decode(),
         bounds=shown_bounds(cloud, spared=0.005).tolist(),
         layered=layered,
+        light=None if cloud.light is None else page_light(cloud.light),
+        suns=[] if lit is None or report.light is None else [_under_sun(each) for each in under_suns(model, lit, report.light.views)],
         costs=[("vertices", report.vertices), ("file, bytes", report.bytes)],
         facts=facts,
         changed=_changed(facts),
@@ -114,10 +119,8 @@ def _view(model: ShippedModel, views: ViewSet, score: ViewScore, index: int) -> 
     """The pictures and measures of a held-out view."""
     target, result = held_out(model.draw, views, index)
     error = mean_flip_map(target, result)
-    height, width = error.shape
-    size = (min(width, _MAX_WIDTH), max(1, height * min(width, _MAX_WIDTH) // width))
+    size = _shown_size(target)
     mapped = magma(shrunk(torch.from_numpy(error)[..., None], *size)[..., 0].numpy())
-    pictures = [to_bytes(unpremultiply(shrunk(picture, *size))) for picture in (target, result)]
     opaque = np.full((*mapped.shape[:2], 1), 255, np.uint8)
     over = score.measures.over
     return {
@@ -130,8 +133,29 @@ def _view(model: ShippedModel, views: ViewSet, score: ViewScore, index: int) -> 
         "iou": score.measures.rgba.iou,
         "width": size[0],
         "height": size[1],
-        "pictures": [_webp(picture) for picture in (*pictures, np.concatenate([mapped, opaque], -1))],
+        "pictures": [_picture(target), _picture(result), _webp(np.concatenate([mapped, opaque], -1))],
     }
+
+
+def _under_sun(shown: UnderSun) -> dict[str, Any]:
+    """A column of the strip under other suns."""
+    return {
+        **asdict(shown.score),
+        "camera": shown.camera_azimuth_degrees,
+        "size": _shown_size(shown.target),
+        "pictures": [_picture(shown.target), _picture(shown.image)],
+    }
+
+
+def _shown_size(picture: torch.Tensor) -> tuple[int, int]:
+    """Width and height of a picture, [H, W, 4], in the page."""
+    height, width = picture.shape[:2]
+    return min(width, _MAX_WIDTH), max(1, height * min(width, _MAX_WIDTH) // width)
+
+
+def _picture(picture: torch.Tensor) -> str:
+    """A picture, premultiplied RGBA [H, W, 4], as the page shows it."""
+    return _webp(to_bytes(unpremultiply(shrunk(picture, *_shown_size(picture)))))
 
 
 def _worst(views: Sequence[ViewScore]) -> list[dict[str, Any]]:

@@ -84,13 +84,14 @@ def report_stage(
         picture = pareto.read_bytes() if pareto else None
         readable = replace(model.config, textures="webp", fallback=False, mip_files=False)  # browsers read WebP
         known = RunFacts(**facts, losses=losses, pareto=picture)
-        page = report_page(report, model, views.test, known, glb_bytes(model.cards, readable))
+        page = report_page(report, model, views.test, known, glb_bytes(model.cards, readable), views.lit_test)
         write_bytes(folder / "report.html", page.encode(errors="backslashreplace"))
         on_progress("report", 1, 1)
 
     shown = [folder / name for name in ("cloud.safetensors", "metrics.json", "loss.csv")] + ([pareto] if pareto else [])
     described = {name: value for name, value in facts.items() if name != "versions"}
-    inputs = ([digest_file(file) for file in shown], described, views.fingerprint)
+    lit = None if views.lit_test is None else views.lit_test.fingerprint
+    inputs = ([digest_file(file) for file in shown], described, views.fingerprint, lit)
     return Stage("report", inputs, REPORT_OUTPUTS, work)
 
 

@@ -5,41 +5,30 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from billboard_scene import column
 from numpy.typing import NDArray
 from page_browser import Browse, Tab, colored
 from playwright.sync_api import Page, Route
 
 import bbfit
-from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.light import Light, direction
 from bbfit.operators.shading.reference import decode, encode
 from bbfit.viewing.server import Viewer
 
-COLOR, LIGHT = torch.tensor([0.6, 0.5, 0.3]), Light.of(direction(20.0, 35.0)[None], 2.5, 0.4, (1.0, 0.9, 0.8))
+COLOR, LIGHT = (0.6, 0.5, 0.3), Light.of(direction(20.0, 35.0)[None], 2.5, 0.4, (1.0, 0.9, 0.8))
 SIDES = {"right": 90, "left": 270}  # azimuths of suns beside a camera in front
-
-
-def column() -> BillboardCloud:
-    """A billboard that looks to +Z, of one color, with the normals of an upright cylinder: those at its left side point to the left."""
-    height, width = 48, 36
-    plane = even_upright(1, axis=torch.tensor([0.0, 1.5, 0.0]), half_extents=torch.tensor([1.0, 1.5]), texture_sizes=torch.tensor([48, 36]))
-    across = 0.95 * torch.linspace(-1, 1, width).expand(height, width).flatten()
-    surface = torch.stack([(across + 1) / 2, torch.full_like(across, 0.5), torch.ones_like(across), torch.zeros_like(across)], -1)
-    texels = torch.cat([COLOR, torch.ones(1)]).repeat(len(across), 1)
-    return replace(plane, texels=texels, surface=surface, light=LIGHT)
 
 
 @pytest.fixture(scope="module")
 def lit(small_run: Path, browse: Browse, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Viewer, Tab]]:
     """The viewer of the small run with a column in place of its billboards, and a tab on it."""
     folder = Path(shutil.copytree(small_run, tmp_path_factory.mktemp("lit") / "lit"))
-    column().save(folder / "cloud.safetensors")
+    column(LIGHT, COLOR).save(folder / "cloud.safetensors")
     with bbfit.view(folder, port=0) as viewer, browse(viewer.url) as tab:
         tab.wait_until("bbfit.viewer.state.tree && !bbfit.viewer.state.tree.measuring")
         tab.select("level", "1")
@@ -85,7 +74,7 @@ def test_at_first_the_light_is_that_of_the_views(lit: tuple[Viewer, Tab]) -> Non
     tab.do(lambda page: page.get_by_role("button", name="As in the views").click())
     picture = tab.picture("right")
     irradiance = LIGHT.sun_directions[0, 2] * LIGHT.sun_strengths / math.pi * LIGHT.sun_colors[0] + LIGHT.ambients
-    wanted = 255 * encode(decode(COLOR.double()) * irradiance).numpy()
+    wanted = 255 * encode(decode(torch.tensor(COLOR).double()) * irradiance).numpy()
     np.testing.assert_allclose(picture[picture.shape[0] // 2, picture.shape[1] // 2], wanted, atol=2)
     assert "20°, 35° high; that of the views at 20°, 35°." in tab.text("#sun-note")
 

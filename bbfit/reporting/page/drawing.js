@@ -37,6 +37,7 @@ window.bbfit = (() => {
     const sun = new THREE.DirectionalLight(), sky = new THREE.AmbientLight();
     scene.add(sun, sky);
     return {
+      sun,
       aim: (azimuth, height) => sun.position.setFromSphericalCoords(1, ((90 - height) * Math.PI) / 180, (azimuth * Math.PI) / 180),
       shine(light) {
         sun.intensity = light.sun;
