@@ -177,7 +177,7 @@ def view(run: str | Path, *, host: str = "127.0.0.1", port: int = 8080, original
     """Show a run or levels of detail in the browser, and return at once.
 
     The page has the original and the billboards side by side under one camera, the alpha modes, the planes' outlines, the levels of detail,
-    and fields of up to 10,000 trees with the time of a frame.
+    a sun to move around models with maps, and fields of up to 10,000 trees with the time of a frame.
 
     Parameters
     ----------

@@ -145,7 +145,7 @@
     [controls.azimuth.value, controls.height.value] = [azimuth, height];
     $("sun-note").textContent = !tree.maps ? "The light is in the colors. Fit with --light maps to move the sun."
       : tree.light.sun === 0 ? "The views have no sun."
-      : `The sun is at ${Math.round(azimuth)}°, ${Math.round(height)}° high; that of the views at ${Math.round(tree.light.azimuth)}°, ${Math.round(tree.light.height)}°. 0° is in front of the tree, 90° on its right.`;
+      : `The sun is at ${Math.round(azimuth)}°, ${Math.round(height)}° high; that of the views at ${Math.round(tree.light.azimuth)}°, ${Math.round(tree.light.height)}°. 0° is where the camera begins, 90° to the right of it.`;
     dirty = true;
   }
 
