@@ -141,7 +141,6 @@ def _under_sun(shown: UnderSun) -> dict[str, Any]:
     """A column of the strip under other suns."""
     return {
         **asdict(shown.score),
-        "camera": shown.camera_azimuth_degrees,
         "size": _shown_size(shown.target),
         "pictures": [_picture(shown.target), _picture(shown.image)],
     }

@@ -9,7 +9,7 @@ from functools import partial
 from torch import Tensor
 
 from bbfit.evaluation.light import LightView
-from bbfit.evaluation.scoring import held_out, view_angles
+from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.model import ShippedModel
 from bbfit.geometry.light import SUNNY
 from bbfit.views.lit import LitViews
@@ -22,9 +22,7 @@ class UnderSun:
     """What a held-out camera sees under one sun, on a sunny day (:data:`~bbfit.geometry.light.SUNNY`)."""
 
     score: LightView
-    """Name, sun and measures."""
-    camera_azimuth_degrees: float
-    """Azimuth of the camera, in [0, 360)."""
+    """Name, camera, sun and measures."""
     target: Tensor
     """The view, premultiplied RGBA in [0, 1], float64 [H, W, 4]."""
     image: Tensor
@@ -40,8 +38,8 @@ def under_suns(model: ShippedModel, lit: LitViews, scores: Sequence[LightView]) 
     by_camera, indices = dict[int, list[LightView]](), {name: index for index, name in enumerate(lit.suns.names)}
     for score in scores:
         by_camera.setdefault(lit.cameras[indices[score.name]], []).append(score)
-    azimuths, elevations = view_angles(lit.skies.cameras).T.tolist()
-    camera = min(by_camera, key=lambda number: (-min(len(by_camera[number]), _SUNS), abs(elevations[number]), number))
+    elevations = {number: abs(own[0].elevation_degrees) for number, own in by_camera.items()}
+    camera = min(by_camera, key=lambda number: (-min(len(by_camera[number]), _SUNS), elevations[number], number))
     rest = sorted(by_camera[camera], key=lambda score: score.sun_azimuth_degrees)
     chosen = [rest.pop(0)]
     while rest and len(chosen) < _SUNS:
@@ -56,5 +54,5 @@ def under_suns(model: ShippedModel, lit: LitViews, scores: Sequence[LightView]) 
     for score in sorted(chosen, key=lambda score: score.sun_azimuth_degrees):
         index = indices[score.name]
         light = sunny.light[[index]] if model.cloud.surface is not None else None
-        strip.append(UnderSun(score, azimuths[camera], *held_out(partial(shown.draw, light=light), sunny, index)))
+        strip.append(UnderSun(score, *held_out(partial(shown.draw, light=light), sunny, index)))
     return strip
