@@ -18,7 +18,7 @@ from typing import Any
 from bbfit.checks import check_file
 
 VERSIONS: Mapping[str, int] = {
-    "grow": 1,
+    "grow": 2,
     "convert": 1,
     "views": 6,
     "budget": 10,

@@ -41,7 +41,7 @@ def import_beside(name: str) -> ModuleType:
     return module
 
 
-SCENE, LIGHTS = import_beside("worker_scene"), import_beside("worker_lights")
+SCENE, LIGHTS, THIN = (import_beside(f"worker_{name}") for name in ("scene", "lights", "thin"))
 
 
 def main() -> NoReturn:
@@ -117,6 +117,7 @@ def prepare(settings: dict[str, Any], answer: Any) -> None:
     """Load the tree, set up light, camera and renderer, and report the measurements of the tree."""
     import bpy
 
+    THIN.read_transmission()
     points, facts = SCENE.open_tree(settings["tree"], settings["files"])
     add_light(settings)
     set_up_cycles(settings)

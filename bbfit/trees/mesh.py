@@ -11,7 +11,7 @@ from bbfit.trees.formulas import stem_radius
 from bbfit.trees.leaf_shapes import leaf_shape
 from bbfit.trees.parts import Material, Part
 from bbfit.trees.skeleton import Array, Indices, Skeleton, Stems, cross, dot, unit
-from bbfit.trees.species import Species
+from bbfit.trees.species import LEAF_TINT, Species
 
 # By level, at detail 1: rings for each segment of a stem's curve, and corners of a ring.
 _RINGS = (8, 4, 3, 3)
@@ -217,6 +217,7 @@ def _leaf_parts(skeleton: Skeleton, lines: _Lines, seed: int) -> list[Part]:
         # Across, along and normal make a left-handed system: turned over, a triangle runs counter-clockwise seen from the normal's side.
         faces = (first[:, None, None] + shape.faces[:, ::-1]).reshape(-1, 3)
         uvs = np.tile(shape.uvs.astype(np.float32), (len(chosen), 1))
-        material = Material(f"leaf_{tone}", color, 0.6, double_sided=True)
+        red, green, blue = (min(value * tint, 1.0) for value, tint in zip(color, LEAF_TINT, strict=True))
+        material = Material(f"leaf_{tone}", color, 0.6, True, species.leaf_transmission, (red, green, blue))
         parts.append(Part(material, vertices.reshape(-1, 3), normal.repeat(len(outline), 0), uvs, faces))
     return parts

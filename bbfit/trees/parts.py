@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Material:
-    """A plain surface: color and roughness, no texture."""
+    """A plain surface: color, roughness and the light that passes through, no texture."""
 
     name: str
     """Name in the file, such as ``bark`` or ``leaf_0``."""
@@ -20,6 +20,10 @@ class Material:
     """Roughness in [0, 1], as glTF's ``roughnessFactor``."""
     double_sided: bool
     """Whether the back of a triangle is visible, with its normal reversed, as for leaves."""
+    transmission: float = 0.0
+    """Share in [0, 1] of the light below the gloss that passes through, as glTF's ``diffuseTransmissionFactor``; the rest is reflected."""
+    transmission_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Linear RGB in [0, 1], as glTF's ``diffuseTransmissionColorFactor``: the surface transmits ``transmission`` of it."""
 
 
 @dataclass(frozen=True)

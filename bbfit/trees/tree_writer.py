@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 from bbfit.checks import fail
 from bbfit.files import write_bytes, write_pieces
 from bbfit.model_files import check_model_path, generator, glb_of_scene
-from bbfit.trees.parts import Part
+from bbfit.trees.parts import Material, Part
 
 if TYPE_CHECKING:
     import trimesh
 
 _COLOR = "base_color"
 """Key of the unrounded linear color in a geometry's metadata; trimesh's material keeps 8 bits."""
+_TRANSMISSION = "KHR_materials_diffuse_transmission"
+"""Extension of glTF, and key of its values in a geometry's metadata."""
 _GLB_LIMIT = 2**32 - 2**20
 """Limit on bytes of vertices and triangles in a GLB, whose header has a 32-bit length (glTF 2.0 specification, section 4.4)."""
 _VERTEX_BYTES, _TRIANGLE_BYTES = 32, 12
@@ -30,7 +32,8 @@ def scene_of(parts: Sequence[Part], *, name: str) -> trimesh.Scene:
     """One geometry, named after its material, for each part that has triangles; ``name`` is the name of the scene.
 
     Vertices, triangles and their order are unchanged; trimesh stores them in 64 bits. trimesh's material keeps 8 bits of the color, the
-    geometry's ``metadata["base_color"]`` all of it.
+    geometry's ``metadata["base_color"]`` all of it. ``metadata["KHR_materials_diffuse_transmission"]`` has the values of this extension of
+    glTF for the parts that transmit light.
     """
     import trimesh
 
@@ -52,11 +55,18 @@ def scene_of(parts: Sequence[Part], *, name: str) -> trimesh.Scene:
             part.faces,
             vertex_normals=part.normals,
             visual=trimesh.visual.TextureVisuals(uv=part.uvs, material=surface),
-            metadata={_COLOR: [float(value) for value in material.color]},
+            metadata={_COLOR: [float(value) for value in material.color]} | _transmission(material),
             process=False,
         )
         scene.add_geometry(mesh, node_name=material.name, geom_name=material.name)
     return scene
+
+
+def _transmission(material: Material) -> dict[str, dict[str, Any]]:
+    if not material.transmission:
+        return {}
+    color = [float(value) for value in material.transmission_color]
+    return {_TRANSMISSION: {"diffuseTransmissionFactor": float(material.transmission), "diffuseTransmissionColorFactor": color}}
 
 
 def write_tree(scene: trimesh.Scene, path: str | Path) -> list[Path]:
@@ -66,7 +76,7 @@ def write_tree(scene: trimesh.Scene, path: str | Path) -> list[Path]:
     to restore every float32. The same scene gives the same bytes.
 
     An MTL holds the linear color as Kd: neither Wavefront's description nor Blender converts it. Its other values make Blender's
-    importer create the same surface as from the GLB.
+    importer create the same surface as from the GLB, but an opaque one: MTL has no diffuse transmission.
 
     Returns
     -------
@@ -114,15 +124,18 @@ def _base_color(mesh: Any) -> list[float]:
 
 
 def _complete(tree: dict[str, Any], scene: trimesh.Scene) -> None:
-    """Add the scene's name and the unrounded colors to the glTF."""
+    """Add the scene's name, the unrounded colors and the transmitted light to the glTF."""
     (stage,) = tree["scenes"]
     extras = stage.pop("extras", {})
     if "name" in extras:
         stage["name"] = extras["name"]
     for mesh in tree["meshes"]:
         (primitive,) = mesh["primitives"]
-        surface = tree["materials"][primitive["material"]].setdefault("pbrMetallicRoughness", {})
-        surface["baseColorFactor"] = _base_color(scene.geometry[mesh["name"]])
+        material, geometry = tree["materials"][primitive["material"]], scene.geometry[mesh["name"]]
+        material.setdefault("pbrMetallicRoughness", {})["baseColorFactor"] = _base_color(geometry)
+        if _TRANSMISSION in geometry.metadata:
+            material["extensions"] = {_TRANSMISSION: geometry.metadata[_TRANSMISSION]}
+            tree["extensionsUsed"] = [_TRANSMISSION]
 
 
 def _mtl(scene: trimesh.Scene) -> str:
