@@ -313,6 +313,20 @@ def put(content: dict[str, Any], place: str, value: Any) -> dict[str, Any]:
         ("scenes.0.nodes", [3]),
         ("scene", 8),
         ("nodes", {"a": 1}),
+        *(
+            ("materials", [{"extensions": {"KHR_materials_diffuse_transmission": value}}])
+            for value in (
+                7,
+                {"diffuseTransmissionFactor": 1.5},
+                {"diffuseTransmissionFactor": float("nan")},
+                {"diffuseTransmissionFactor": "1"},
+                {"diffuseTransmissionColorFactor": [1, 1]},
+                {"diffuseTransmissionColorFactor": [1, -1, 1]},
+                {"diffuseTransmissionColorFactor": 1},
+                {"diffuseTransmissionTexture": {"index": 0}},
+                {"diffuseTransmissionColorTexture": 3},
+            )
+        ),
         ("accessors", "none"),
     ],
 )

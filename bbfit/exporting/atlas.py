@@ -16,8 +16,8 @@ from bbfit.images import PALETTE, bleed_color, distinct
 
 # Side of the blocks in which graphics cards compress textures, in texels.
 BLOCK = 4
-# What lies in the gaps between cells of a surface: the plane's own normal, in the open.
-_PLAIN = (128, 128, 255, 255)
+# What lies in the gaps between cells of a surface: the plane's own normal, in the open, opaque.
+_PLAIN = (128, 128, 255, 255, 0)
 
 
 def pack_atlas(textures: list[NDArray[np.uint8]], padding: int, surfaces: list[NDArray[np.uint8]] | None = None) -> Atlas:
@@ -29,7 +29,7 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int, surfaces: list[N
     (:func:`fill_cell`). If that makes more than 256 colors of fewer visible ones, the transparent texels' colors are rounded, so that the
     atlas fits into the palette of a PNG.
 
-    ``surfaces`` are further channels of each texture, uint8 [h, w, 4], packed in the same way; their padding repeats their rims.
+    ``surfaces`` are further channels of each texture, uint8 [h, w, 4 or 5], packed in the same way; their padding repeats their rims.
     """
     sizes = np.array([texture.shape[1::-1] for texture in textures], dtype=np.int64)
     unit = max(BLOCK, 1 << (padding.bit_length() - 1))
@@ -44,7 +44,7 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int, surfaces: list[N
     image[image[..., 3] == 0, :3] = _within_palette(image)
     surface = None
     if surfaces is not None:
-        surface = np.full((height, width, 4), _PLAIN, np.uint8)
+        surface = np.tile(np.array(_PLAIN[: surfaces[0].shape[-1]], np.uint8), (height, width, 1))
         for part, place, cell in zip(surfaces, places * unit, cells * unit, strict=True):
             (x, y), (w, h), (rows, columns) = place.tolist(), cell.tolist(), part.shape[:2]
             rims = (padding, h - rows - padding), (padding, w - columns - padding), (0, 0)

@@ -64,8 +64,8 @@ def cloud_cards(cloud: BillboardCloud, padding: int) -> Cards:
 
 
 def _surfaces(cloud: BillboardCloud) -> list[NDArray[np.uint8]] | None:
-    """For each texture its normals, as (n + 1) / 2, and occlusion, uint8 [h, w, 4]."""
+    """For each texture its normals, as (n + 1) / 2, and occlusion, uint8 [h, w, 4]; [h, w, 5] with translucency, if there is any."""
     if cloud.surface is None:
         return None
-    maps = torch.cat([(cloud.tangent_normals + 1) / 2, cloud.surface[:, 2:3]], -1)
+    maps = torch.cat([(cloud.tangent_normals + 1) / 2, cloud.surface[:, 2 : 4 if cloud.translucent else 3]], -1)
     return [to_bytes(side) for texture in cloud.textures(maps) for side in texture]

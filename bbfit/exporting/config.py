@@ -73,6 +73,11 @@ class ExportConfig:
     def __post_init__(self) -> None:
         check_fields(self)
 
+    @property
+    def transmits(self) -> bool:
+        """Whether the program reads light that passes through leaves (KHR_materials_diffuse_transmission)."""
+        return self.profile == "babylon"
+
     def comparable(self) -> ExportConfig:
         """The same options with rectangles unless they ask for outlines: all models have as many vertices for each billboard."""
         return replace(self, outline="rectangle") if self.outline is None else self

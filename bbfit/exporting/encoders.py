@@ -19,7 +19,7 @@ def encode_ktx2(levels: list[NDArray[np.uint8]], *, srgb: bool = True) -> bytes:
     """Encode mip levels as KTX 2.0 in Basis Universal's ETC1S with BasisLZ, for glTF's extension ``KHR_texture_basisu``.
 
     The levels are straight-alpha display-referred sRGB, uint8 [h, w, 4] each, or, with ``srgb`` false, data that are no colors, such as
-    normals, uint8 [h, w, 3]. The sides of the first are multiples of 4. Each further level
+    normals, uint8 [h, w, 3 or 4]. The sides of the first are multiples of 4. Each further level
     has half the sides of the one before, rounded down, at least 1; the last need not be 1 x 1. Raises InputError for levels of other sizes,
     or if the package alktx2 is missing. One release of alktx2 gives the same bytes for the same levels, with any number of threads.
 
@@ -34,14 +34,14 @@ def encode_ktx2(levels: list[NDArray[np.uint8]], *, srgb: bool = True) -> bytes:
         fail("KTX2", "the package alktx2 is not installed", missing)
     if not levels:
         fail("levels", "expected at least one")
-    height, width = levels[0].shape[:2]
+    height, width, channels = *levels[0].shape[:2], 4 if srgb or levels[0].shape[-1] == 4 else 3
     if height % BLOCK or width % BLOCK:
         fail("levels", f"sides must be multiples of {BLOCK}, got {width} x {height}")
     for number, level in enumerate(levels):
-        check_shape(f"levels[{number}]", level.shape, (max(1, height >> number), max(1, width >> number), 4 if srgb else 3))
+        check_shape(f"levels[{number}]", level.shape, (max(1, height >> number), max(1, width >> number), channels))
     import alktx2
 
-    opaque = [level if srgb else np.pad(level, ((0, 0), (0, 0), (0, 1)), constant_values=255) for level in levels]
+    opaque = [np.pad(level, ((0, 0), (0, 0), (0, 4 - channels)), constant_values=255) for level in levels]
     raw = [(level.tobytes(), level.shape[1], level.shape[0]) for level in opaque]
     return alktx2.encode_raw_mips_to_ktx2(raw, codec="etc1s", quality=100, effort=3, srgb=srgb)
 

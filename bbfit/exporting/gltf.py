@@ -22,6 +22,9 @@ _WITH_MIPS = _SAMPLER | {"minFilter": 9987}  # trilinear
 _UNSIGNED_SHORT, _UNSIGNED_INT, _LARGEST_SHORT = 5123, 5125, 65_534
 # Pictures by name.
 _Pictures = dict[str, tuple[list[NDArray[np.uint8]], bool]]
+_TRANSMISSION = "KHR_materials_diffuse_transmission"
+# Channels of a surface without translucency.
+_OPAQUE_CHANNELS = 4
 # The name under which trimesh writes tangents.
 _TANGENT = "_TANGENT"
 _EXTENSIONS = {"webp": ("EXT_texture_webp", "image/webp"), "ktx2": ("KHR_texture_basisu", "image/ktx2")}
@@ -31,7 +34,7 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
     """A GLB file with one mesh for the cards that show both sides, one for those with back-face culling, and one per card with an origin.
 
     Cards with maps have a matte material (``KHR_materials_specular`` with the factor 0) with textures of base color, normals and occlusion,
-    and tangents.
+    and tangents. Translucency is the alpha of the occlusion's texture, from which ``KHR_materials_diffuse_transmission`` takes it.
 
     The node of a card with an origin is at that origin, and two vertices that no triangle uses center the mesh's bounds on it: programs
     sort blended meshes by one or the other. The sampler uses mip levels if the file includes them (``ktx2``) or if the options let
@@ -121,6 +124,12 @@ def _complete(tree: dict[str, Any], cards: Cards, pictures: list[str], config: R
         if cards.atlas.surface is not None:
             material |= {"normalTexture": {"index": 1}, "occlusionTexture": {"index": 2}}
             material["extensions"] = {"KHR_materials_specular": {"specularFactor": 0.0}}
+            if cards.atlas.surface.shape[-1] > _OPAQUE_CHANNELS:
+                material["extensions"][_TRANSMISSION] = {
+                    "diffuseTransmissionFactor": 1.0,
+                    "diffuseTransmissionTexture": {"index": 2},
+                    "diffuseTransmissionColorTexture": {"index": 0},
+                }
         elif config.material == "unlit":
             material["extensions"] = {"KHR_materials_unlit": {}}
         used |= set(material.get("extensions", ()))
@@ -153,7 +162,8 @@ def _pictures(cards: Cards) -> _Pictures:
     if cards.atlas.surface is not None:
         levels = cards.surface_chain or [cards.atlas.surface]
         pictures["normals"] = [np.ascontiguousarray(level[..., :3]) for level in levels], False
-        pictures["occlusion"] = [np.ascontiguousarray(level[..., 3:].repeat(3, -1)) for level in levels], False
+        # Occlusion as gray, then translucency, if there is any.
+        pictures["occlusion"] = [np.concatenate([level[..., 3:4].repeat(3, -1), level[..., 4:]], -1) for level in levels], False
     return pictures
 
 

@@ -100,6 +100,10 @@ def _append(tree: dict[str, Any], other: dict[str, Any], name: str) -> int:
     def moved(item: dict[str, Any], **kinds: str) -> dict[str, Any]:
         return item | {key: item[key] + at[kind] for key, kind in kinds.items() if key in item}
 
+    def with_moved_textures(item: dict[str, Any]) -> dict[str, Any]:
+        inner = {key: with_moved_textures(value) for key, value in item.items() if isinstance(value, dict)}
+        return moved(item | inner, index="textures")
+
     tree["bufferViews"] += other["bufferViews"]
     tree["accessors"] += [moved(accessor, bufferView="bufferViews") for accessor in other["accessors"]]
     tree["images"] += [moved(image, bufferView="bufferViews") for image in other["images"]]
@@ -107,11 +111,7 @@ def _append(tree: dict[str, Any], other: dict[str, Any], name: str) -> int:
     for texture in other["textures"]:
         sources = {extension: moved(entry, source="images") for extension, entry in texture.get("extensions", {}).items()}
         tree["textures"].append(moved(texture, sampler="samplers", source="images") | ({"extensions": sources} if sources else {}))
-    for material in other["materials"]:
-        surface = material["pbrMetallicRoughness"]
-        picture = moved(surface["baseColorTexture"], index="textures")
-        maps = {name: moved(material[name], index="textures") for name in ("normalTexture", "occlusionTexture") if name in material}
-        tree["materials"].append(material | {"pbrMetallicRoughness": surface | {"baseColorTexture": picture}} | maps)
+    tree["materials"] += [with_moved_textures(material) for material in other["materials"]]
     for mesh in other["meshes"]:
         primitives = [
             moved(primitive, indices="accessors", material="materials")

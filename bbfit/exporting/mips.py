@@ -47,7 +47,7 @@ def plain_chain(image: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
 
 
 def surface_chain(surface: NDArray[np.uint8], alpha: NDArray[np.uint8] | None) -> list[NDArray[np.uint8]]:
-    """The mip levels of normals and occlusion, uint8 [H, W, 4], of the sizes of :func:`plain_chain`.
+    """The mip levels of normals and further maps, uint8 [H, W, C], of the sizes of :func:`plain_chain`.
 
     Means are weighted by ``alpha``, [H, W], so that only visible texels count, and normals are unit vectors again. Without ``alpha`` they
     are the plain means that graphics cards compute, in which normals are shorter where they differ.
@@ -56,7 +56,7 @@ def surface_chain(surface: NDArray[np.uint8], alpha: NDArray[np.uint8] | None) -
     weighted, levels, (height, width) = np.concatenate([surface * weight, weight], -1), [surface], surface.shape[:2]
     for level in range(1, max(height, width).bit_length()):
         mean = _shrink(weighted, (max(1, height >> level), max(1, width >> level)))
-        values = mean[..., :4] / mean[..., 4:]
+        values = mean[..., :-1] / mean[..., -1:]
         if alpha is not None:
             normals = values[..., :3] / 127.5 - 1
             values[..., :3] = (normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6) + 1) * 127.5

@@ -136,6 +136,7 @@ def shipped_model(cloud: BillboardCloud, config: ExportConfig | None = None, hal
     if cloud.surface is not None and config is not None and config.material == "unlit":
         fail("material", "the cloud has maps, whose colors contain no light", "leave out --material, or fit with --light baked")
     alpha = AlphaMode(resolved.alpha or cloud.alpha.kind, resolved.alpha_cutoff or cloud.alpha.cutoff)
+    cloud = cloud if resolved.transmits else cloud.opaque()
     return ShippedModel(replace(cloud, alpha=alpha), resolved, halvings)
 
 

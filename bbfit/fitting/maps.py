@@ -35,6 +35,7 @@ from bbfit.views.dataset import ViewDataset
 from bbfit.views.lit import LitViews
 from bbfit.views.view_set import ViewSet
 
+TRANSLUCENT = False
 _LEARNING_RATE = 0.03
 # Exposures in a step.
 _BATCH = 4
@@ -78,7 +79,8 @@ def fit_maps(
             loss += float(passes.differentiate(shaded, [index], alpha, False)[0]) / _BATCH
             gradient[:, 3] = 0  # alpha is not to change
             pull_back(base.texels, maps.texels, lights[index], gradient, base.gradient, maps.gradient)
-        maps.gradient[:, 3] = 0  # nor translucency
+        if not TRANSLUCENT:
+            maps.gradient[:, 3] = 0  # nor translucency
         for state in (base, maps):
             state.update(step + 1, rate, (config.beta1, config.beta2))
         if on_step is not None:
@@ -91,10 +93,14 @@ def fit_maps(
 def bled(cloud: BillboardCloud) -> BillboardCloud:
     """Give the transparent texels of a cloud with maps the maps of the nearest opaque ones, because filtering shows them."""
     assert cloud.surface is not None
-    maps = torch.cat([cloud.surface[:, :3], cloud.texels[:, 3:]], 1)
-    sides = [bleed_color(side).reshape(-1, 4) for texture in cloud.textures(maps) for side in texture]
-    color = [bleed_color(side).reshape(-1, 4) for texture in cloud.textures() for side in texture]
-    return replace(cloud, texels=torch.cat(color), surface=torch.cat([torch.cat(sides)[:, :3], cloud.surface[:, 3:]], 1))
+
+    def bleed(values: Tensor) -> Tensor:
+        pictures = cloud.textures(torch.cat([values, cloud.texels[:, 3:]], 1))
+        return torch.cat([bleed_color(side).reshape(-1, 4) for texture in pictures for side in texture])[:, :3]
+
+    translucency = bleed(cloud.surface[:, 3:].expand(-1, 3))[:, :1] if cloud.translucent else cloud.surface[:, 3:]
+    surface = torch.cat([bleed(cloud.surface[:, :3]), translucency], 1)
+    return replace(cloud, texels=torch.cat([bleed(cloud.texels[:, :3]), cloud.texels[:, 3:]], 1), surface=surface)
 
 
 def baked_maps(cloud: BillboardCloud, lit: LitViews, backend: Backend = "auto") -> tuple[Tensor, Tensor]:

@@ -63,17 +63,25 @@ def few_surfaces(cloud: BillboardCloud, count: int) -> Tensor:
     """Round the maps of a cloud, [P, 4], so that the pictures of their normals and of their occlusion have few colors and compress well.
 
     Normals get ``count`` - 1 different values, which leaves one to the gaps of an atlas: the means of clusters by k-means of those of
-    visible texels. Occlusion is rounded to 6 bits.
+    visible texels. Occlusion is rounded to 6 bits. Of a translucent cloud, pairs of occlusion and translucency, which share a picture, get
+    ``count`` - 1 values in the same way.
     """
     assert cloud.surface is not None
-    visible, across = (cloud.texels[:, 3] >= _VISIBLE).numpy(), cloud.surface[:, :2]
+    visible, across = cloud.texels[:, 3] >= _VISIBLE, cloud.surface[:, :2]
     if visible.any():
-        normals = cloud.tangent_normals.float().numpy()
-        means = _clustered(normals[visible], count - 1)
-        rounded = (normalize(torch.from_numpy(means), dim=-1)[:, :2] + 1) / 2
-        across = rounded[torch.from_numpy(vq(normals, means)[0]).long()].clamp(0, 1).to(across)
+        normals = _few(cloud.tangent_normals, visible, count - 1)
+        across = ((normalize(normals, dim=-1)[:, :2] + 1) / 2).clamp(0, 1).to(across)
+    if cloud.translucent and visible.any():
+        return torch.cat([across, _few(cloud.surface[:, 2:], visible, count - 1).to(across)], 1)
     occlusion = (cloud.surface[:, 2:3] * _OCCLUSIONS).round() / _OCCLUSIONS
     return torch.cat([across, occlusion, cloud.surface[:, 3:]], 1)
+
+
+def _few(points: Tensor, visible: Tensor, count: int) -> Tensor:
+    """Points, float32 [P, C], at the nearest of the means of at most ``count`` clusters of the visible ones."""
+    values = points.float().numpy()
+    means = _clustered(values[visible.numpy()], count)
+    return torch.from_numpy(means[vq(values, means)[0]])
 
 
 def _clustered(points: NDArray[np.float32], count: int) -> NDArray[np.float32]:

@@ -26,7 +26,8 @@ class Atlas:
     sizes: NDArray[np.int64]
     """Width and height of each texture in texels, [R, 2]."""
     surface: NDArray[np.uint8] | None = None
-    """Normals in the axes of each texture, as (n + 1) / 2, and occlusion, [H, W, 4]. ``None`` if colors contain the light."""
+    """Normals in the axes of each texture, as (n + 1) / 2, and occlusion, [H, W, 4]; [H, W, 5] with translucency, if there is any.
+    ``None`` if colors contain the light."""
 
     @property
     def used(self) -> float:

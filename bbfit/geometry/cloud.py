@@ -103,6 +103,11 @@ class BillboardCloud:
         return torch.cat([across, (1 - across.square().sum(-1, keepdim=True)).clamp_min(0).sqrt()], -1)
 
     @property
+    def translucent(self) -> bool:
+        """Whether light passes through a texel, in 8 bits."""
+        return self.surface is not None and bool((255 * self.surface[:, 3] > 0.5).any())
+
+    @property
     def vertex_count(self) -> int:
         """Vertices of the exported mesh: four per quad, two quads for a two-sided billboard."""
         return 4 * (len(self) + int(self.two_sided.sum()))
@@ -119,11 +124,11 @@ class BillboardCloud:
         return {name: getattr(self, name) for name in TENSORS} | ({} if self.surface is None else {"surface": self.surface})
 
     def textures(self, values: Tensor | None = None) -> list[Tensor]:
-        """The textures as views into ``texels``, or into other values of the texels, [P, 4]: N tensors of [S, h, w, 4]; S = 1 or 2 (front,
+        """The textures as views into ``texels``, or into other values of the texels, [P, C]: N tensors of [S, h, w, C]; S = 1 or 2 (front,
         back)."""
         parts = (self.texels if values is None else values).split(self._texel_counts)
         sizes, sides = self.texture_sizes.tolist(), self.two_sided.tolist()
-        return [part.reshape(1 + two, h, w, 4) for part, (h, w), two in zip(parts, sizes, sides, strict=True)]
+        return [part.reshape(1 + two, h, w, -1) for part, (h, w), two in zip(parts, sizes, sides, strict=True)]
 
     def to(self, target: torch.device | torch.dtype | str) -> BillboardCloud:
         """Move to a device, or convert the floating-point tensors to a dtype."""
@@ -144,6 +149,10 @@ class BillboardCloud:
     def without_textures(self) -> BillboardCloud:
         """The same rectangles with transparent texels, which take no memory, and no maps; do not write to them."""
         return self.baked(self.texels.new_zeros(1, 4).expand(len(self.texels), 4))
+
+    def opaque(self) -> BillboardCloud:
+        """The same without translucency, as programs show it that know none."""
+        return replace(self, surface=self.surface * self.surface.new_tensor([1, 1, 1, 0])) if self.surface is not None else self
 
     def take(self, kept: Iterable[int]) -> BillboardCloud:
         """Some of the billboards, in the given order."""

@@ -196,12 +196,12 @@ class CardRenderer:
 
 
 def _levels(cards: Cards) -> MipChain:
-    """The levels of the atlas; those of its surface are channels 4 to 7."""
+    """The levels of the atlas; those of its surface are channels 4 and up."""
     chain: Sequence[NDArray[np.uint8]] = [cards.atlas.image] if cards.chain is None else cards.chain
     if cards.atlas.surface is not None:
         surfaces = [cards.atlas.surface] if cards.surface_chain is None else cards.surface_chain
         chain = [np.concatenate(level, -1) for level in zip(chain, surfaces, strict=True)]
-    return joined(chain, (*cards.atlas.image.shape[:2], 4 if cards.atlas.surface is None else 8))
+    return joined(chain, (*cards.atlas.image.shape[:2], chain[0].shape[-1] if chain else 4))
 
 
 def joined(chain: Sequence[NDArray[np.uint8]], shape: tuple[int, ...]) -> MipChain:
@@ -329,14 +329,16 @@ def _bilinear(levels: MipChain, uv: Tensor, level: Tensor) -> Tensor:
 
 
 def _lit(colors: Tensor, maps: Tensor, axes: Tensor, light: Light) -> Tensor:
-    """Shade base colors of fragments, [M, 3], given their filtered normals and occlusion, [M, 4], and the axes of the normals, [M, 3, 3].
+    """Shade base colors of fragments, [M, 3], given their filtered maps, [M, 4 or 5], and the axes of the normals, [M, 3, 3].
 
     The formula is that of :func:`~bbfit.operators.shading.reference.shade_reference`.
     """
     normals = normalize(2 * maps[:, :3] - 1, dim=-1)
-    cosine = (normals * (axes @ light.sun_directions[0]).float()).sum(-1, keepdim=True).clamp_min(0)
+    cosine = (normals * (axes @ light.sun_directions[0]).float()).sum(-1, keepdim=True)
+    occlusion, translucency = maps[:, 3:4], maps[:, 4:] if maps.shape[1] > 4 else 0
+    of_sun = (1 - translucency) * cosine.clamp_min(0) + translucency * (-cosine).clamp_min(0)
     sun = (light.sun_colors[0] * light.sun_strengths / math.pi).float()
-    return encode(decode(colors) * (cosine * sun + float(light.ambients) * maps[:, 3:])).clamp_max(1)
+    return encode(decode(colors) * (of_sun * sun + float(light.ambients) * occlusion)).clamp_max(1)
 
 
 def _beside(met: Hits) -> list[Tensor]:

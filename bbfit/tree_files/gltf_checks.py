@@ -63,6 +63,7 @@ def check_gltf(path: Path, content: dict[str, Any], buffers: Sequence[bytes], li
                 _index(primitive["material"], entries_of(content, "materials"), "material")
         meshes.append(mesh)
     limits.at_most("max_input_vertices", "tree", path, indices // _INDICES, f"vertices for {_INDICES} indices each")
+    _check_transmission(content)
     _check_nodes(path, content, meshes, accessors, limits)
 
 
@@ -183,6 +184,22 @@ def _box(path: Path, accessor: _Accessor) -> NDArray[np.float64]:
 def _united(boxes: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
     stacked = np.stack([np.array([[np.inf] * 3, [-np.inf] * 3]), *boxes])
     return np.stack([stacked[:, 0].min(0), stacked[:, 1].max(0)])
+
+
+def _check_transmission(content: dict[str, Any]) -> None:
+    """Require that what materials transmit has the types and ranges of KHR_materials_diffuse_transmission; Blender's importer skips it."""
+    for material in entries_of(content, "materials"):
+        values = (material.get("extensions") or {}).get("KHR_materials_diffuse_transmission", {})
+        color = values.get("diffuseTransmissionColorFactor", [1.0, 1.0, 1.0])
+        if not isinstance(color, list) or len(color) != 3 or not all(map(_is_share, (*color, values.get("diffuseTransmissionFactor", 0)))):
+            raise ValueError("the transmitted light of a material is no share in [0, 1]")
+        for name in ("diffuseTransmissionTexture", "diffuseTransmissionColorTexture"):
+            if name in values:
+                _index(values[name]["index"], entries_of(content, "textures"), "texture")
+
+
+def _is_share(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= 1
 
 
 def _check_nodes(path: Path, content: dict[str, Any], meshes: list[_Mesh], accessors: list[_Accessor], limits: InputLimits) -> None:

@@ -322,6 +322,11 @@ def _resume(folder: Path) -> None:
 # Trees.
 
 
+def _transmitting(tree: dict[str, Any]) -> None:
+    values = {"diffuseTransmissionFactor": 0.5, "diffuseTransmissionTexture": {"index": 0}, "diffuseTransmissionColorFactor": [0.5, 1, 0.1]}
+    tree["materials"][0]["extensions"] = {"KHR_materials_diffuse_transmission": values}
+
+
 @functools.cache
 def _trees() -> dict[str, bytes]:
     box = trimesh.creation.box(extents=(1.0, 2.0, 1.0))
@@ -332,7 +337,7 @@ def _trees() -> dict[str, bytes]:
     scene.add_geometry(box, node_name="a")
     scene.add_geometry(box, node_name="b", parent_node_name="a", transform=trimesh.transformations.translation_matrix([1, 0, 0]))
     plain = trimesh.creation.box(extents=(1.0, 2.0, 1.0))
-    made: dict[str, bytes] = {"tree.glb": trimesh.exchange.gltf.export_glb(scene)}
+    made: dict[str, bytes] = {"tree.glb": trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=_transmitting)}
     made["tree.ply"] = trimesh.exchange.ply.export_ply(plain)
     made["ascii.ply"] = trimesh.exchange.ply.export_ply(plain, encoding="ascii")
     made["tree.stl"] = trimesh.exchange.stl.export_stl(plain)

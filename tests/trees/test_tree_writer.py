@@ -24,7 +24,11 @@ from bbfit.trees.parts import Material, Part
 from bbfit.trees.tree_writer import scene_of, write_tree
 
 BARK = Material("bark", (0.0221, 1 / 3, 0.1), 0.85, double_sided=False)
-LEAVES = (Material("leaf_0", (0.0225, 0.3, 0.05), 0.6, double_sided=True), Material("leaf_1", (0.5, 0.25, 0.0), 0.6, double_sided=True))
+LEAVES = (
+    Material("leaf_0", (0.0225, 0.3, 0.05), 0.6, double_sided=True),
+    Material("leaf_1", (0.5, 0.25, 0.0), 0.6, double_sided=True, transmission=0.4, transmission_color=(2 / 3, 0.25, 0.0)),
+)
+TRANSMISSION = "KHR_materials_diffuse_transmission"
 
 
 def sample() -> list[Part]:
@@ -103,6 +107,7 @@ def test_a_glb_holds_the_parts_bit_for_bit(tmp_path: Path) -> None:
     assert [node["name"] for node in tree["nodes"]] == ["bark", "leaf_0", "leaf_1"]
     assert tree["scenes"] == [{"nodes": [0, 1, 2], "name": "Aspen äöü"}]
     assert tree["asset"]["generator"].startswith("bbfit") and "extras" not in path.read_bytes().decode("latin-1")
+    transmitted = {"diffuseTransmissionFactor": 0.4, "diffuseTransmissionColorFactor": [2 / 3, 0.25, 0.0]}
     for made, surface in zip(parts, tree["materials"], strict=True):
         assert surface == {
             "name": made.material.name,
@@ -112,7 +117,8 @@ def test_a_glb_holds_the_parts_bit_for_bit(tmp_path: Path) -> None:
                 "metallicFactor": 0.0,
                 "roughnessFactor": made.material.roughness,
             },
-        }
+        } | ({"extensions": {TRANSMISSION: transmitted}} if made.material is LEAVES[1] else {})
+    assert tree["extensionsUsed"] == [TRANSMISSION] and "extensionsRequired" not in tree
 
 
 @pytest.mark.parametrize("ending", [".glb", ".obj"])
@@ -196,8 +202,10 @@ os._exit(0)
 def test_khronos_validator_finds_nothing(tmp_path: Path) -> None:
     write_tree(scene_of(sample(), name="tree"), tmp_path / "tree.glb")
     (report,) = reports(tmp_path / "tree.glb")
-    # Texture coordinates without a texture are noted as information; they are for those who add one.
-    assert {message["code"] for message in report["issues"]["messages"]} <= {"UNUSED_OBJECT"}, report["issues"]
+    # Texture coordinates without a texture are noted as information; they are for those who add one. So is an extension that is unknown.
+    found = report["issues"]["messages"]
+    assert {message["code"] for message in found} <= {"UNUSED_OBJECT", "UNSUPPORTED_EXTENSION"}, report["issues"]
+    assert {message["message"].split("'")[1] for message in found if message["code"] == "UNSUPPORTED_EXTENSION"} == {TRANSMISSION}
     assert report["info"]["totalVertexCount"] == sum(len(made.vertices) for made in sample())
 
 
