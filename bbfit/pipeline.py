@@ -89,6 +89,8 @@ class RunConfig:
             views would not suffice for the fit.
         """
         self.export.check()
+        if self.fit.translucency and not self.export.transmits:
+            fail("translucency", "only Babylon.js shows it", "add --profile babylon, or leave out --translucency")
         self.limits.check()
         if rendered:
             self.limits.at_most("max_input_pixels", "size", "a view", self.views.size**2, "pixels")

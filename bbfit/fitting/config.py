@@ -150,6 +150,9 @@ class FitConfig:
     light: Lighting = "baked"
     """baked: colors contain the light of the views. maps: base color, normals and occlusion, which take the light of a program.
     Maps need views under many lights (suns)."""
+    translucency: bool = False
+    """Also fit how much light passes through texels (with light maps), as through leaves. Only Babylon.js shows it (profile babylon);
+    elsewhere such a model is too bright in front of the sun and too dark behind it."""
     map_steps: Annotated[int, Range(0)] = 100
     """Steps of the optimizer for maps, after those for placement and alpha. With 0, maps are what the views show of the tree's surfaces."""
     placement: Placement | None = None
@@ -254,6 +257,8 @@ class FitConfig:
         """
         if isinstance(self, ResolvedFit):
             return self
+        if self.translucency and self.light != "maps":
+            fail("translucency", "it is one of the maps", "add --light maps")
         if self.least_billboards > self.most_billboards:
             fail(
                 "least_billboards", f"{self.least_billboards} are more than most_billboards allows, {self.most_billboards}", "exchange them"

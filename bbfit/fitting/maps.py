@@ -35,7 +35,6 @@ from bbfit.views.dataset import ViewDataset
 from bbfit.views.lit import LitViews
 from bbfit.views.view_set import ViewSet
 
-TRANSLUCENT = False
 _LEARNING_RATE = 0.03
 # Exposures in a step.
 _BATCH = 4
@@ -79,8 +78,8 @@ def fit_maps(
             loss += float(passes.differentiate(shaded, [index], alpha, False)[0]) / _BATCH
             gradient[:, 3] = 0  # alpha is not to change
             pull_back(base.texels, maps.texels, lights[index], gradient, base.gradient, maps.gradient)
-        if not TRANSLUCENT:
-            maps.gradient[:, 3] = 0  # nor translucency
+        if not config.translucency:
+            maps.gradient[:, 3] = 0
         for state in (base, maps):
             state.update(step + 1, rate, (config.beta1, config.beta2))
         if on_step is not None:

@@ -14,6 +14,7 @@ from bbfit.fitting.config import TRANSPARENT_COLORS, FitConfig
 from bbfit.fitting.palette import palettized
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud, even_upright
+from bbfit.geometry.light import Light
 from bbfit.images import PALETTE, distinct, encode_png, to_bytes
 
 
@@ -63,3 +64,18 @@ def test_the_atlas_fits_into_a_palette() -> None:
 def test_too_few_colors_are_refused() -> None:
     with pytest.raises(InputError, match="palette: 20 colors are too few"):
         FitConfig(palette=20).resolve()
+
+
+def test_the_picture_of_occlusion_and_translucency_fits_into_a_palette() -> None:
+    """Both are random here. Measured: off by 0.013 on average."""
+    cloud = cloud_of("blend")
+    surface = torch.rand(len(cloud.texels), 4, generator=torch.Generator().manual_seed(1))
+    leaf = replace(cloud, surface=surface, light=Light.of(torch.tensor([[0.0, 1.0, 0.0]]), 1.0, 1.0))
+    fewer = palettized(leaf, PALETTE)
+    assert fewer.surface is not None
+    atlas = cloud_cards(fewer, 8).atlas.surface
+    assert atlas is not None and atlas.shape[-1] == 5
+    assert len(np.unique(atlas[..., 3:].reshape(-1, 2), axis=0)) <= PALETTE
+    visible = cloud.texels[:, 3] > 0
+    error = (fewer.surface - surface)[visible, 2:].abs().mean()
+    assert error < 0.025

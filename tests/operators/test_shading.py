@@ -164,3 +164,19 @@ def test_no_billboards() -> None:
     assert render(cloud, cameras()).abs().sum() == 0
     light = TextureLight(torch.zeros(0, dtype=torch.int32), torch.zeros(0, 3), torch.zeros(4).double())
     assert shade_fused(torch.zeros(0, 4), torch.zeros(0, 4), light).shape == (0, 4)
+
+
+def test_a_translucent_texel_makes_no_light() -> None:
+    """It reflects and transmits together what an opaque one of the same color reflects, in linear light, and shows as much sky."""
+    cloud = cloud_with_maps(2)
+    assert cloud.surface is not None
+    opposite = Light.of(-SUN, 1.0, 0.0)
+
+    def shown(light: Light, surface: Tensor) -> Tensor:
+        (each,) = texture_lights(cloud, cameras()[[0]], light)
+        return decode(shade_reference(cloud.texels, surface, each)[:, :3])
+
+    opaque = cloud.surface * torch.tensor([1, 1, 1, 0])
+    both = [sum(shown(light, surface) for light in (Light.of(SUN, 1.0, 0.0), opposite)) for surface in (cloud.surface, opaque)]
+    assert (cloud.surface[:, 3] > 0.1).any() and torch.allclose(both[0], both[1], atol=1e-9)
+    assert torch.equal(shown(Light.of(SUN, 0.0, 1.0), cloud.surface), shown(Light.of(SUN, 0.0, 1.0), opaque))
