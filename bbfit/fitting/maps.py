@@ -1,4 +1,4 @@
-"""Maps of a finished fit: base color, normals and occlusion, from views under many lights."""
+"""Maps of a finished fit: base color, normals, occlusion and translucency, from views under many lights."""
 
 from __future__ import annotations
 
@@ -54,6 +54,10 @@ def fit_maps(
     Each step draws some exposures: training views under their baked light, or under another of their suns on a sunny day
     (:data:`~bbfit.geometry.light.SUNNY`). Texels are shaded in that light and drawn, and Adam takes the gradient of the loss in the maps.
     Placement and alpha stay as they are. The start is :func:`baked_maps`.
+
+    Translucency stays 0 unless ``config.translucency`` asks for it. Measured under held-out suns (blend, 90 views): an aspen whose leaves
+    transmit light gains 0.18 dB of PSNR and 0.39 dB of ``low``, and loses 0.020 of R2; one with opaque leaves gains 0.07 dB, and loses
+    0.44 dB of ``low`` and 0.025 of R2.
 
     ``views`` have ``lit_train`` and the light of their own pictures. ``on_step`` is called with the number of each step, from 1, its
     loss, and its learning rate. Returns the cloud with its maps, on the CPU; ``light`` is that of the views' own pictures.
