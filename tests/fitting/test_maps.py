@@ -11,6 +11,7 @@ import torch
 
 from bbfit.checks import InputError
 from bbfit.evaluation.light import score_light
+from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import fit
 from bbfit.fitting.maps import baked_maps, bled, fit_maps
@@ -19,6 +20,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.light import SUNNY, Light, sky
 from bbfit.geometry.orbit import Orbit
 from bbfit.images import to_bytes, unpremultiply
+from bbfit.pipeline import RunConfig
 from bbfit.rendering.dispatch import render
 from bbfit.views.dataset import ViewDataset
 from bbfit.views.lit import LitViews
@@ -207,6 +209,15 @@ def test_whole_fit_has_maps_and_scores_better_than_baked(known: BillboardCloud, 
 def test_light_needs_views_under_many_lights(views: ViewDataset) -> None:
     with pytest.raises(InputError, match="light: maps need views under many lights"):
         fit(replace(views, lit_train=None), FitConfig(light="maps"))
+
+
+def test_translucency_is_for_maps_and_for_programs_that_show_it() -> None:
+    leaf = FitConfig(light="maps", translucency=True)
+    with pytest.raises(InputError, match="translucency: it is one of the maps"):
+        replace(leaf, light="baked").resolve()
+    with pytest.raises(InputError, match=r"translucency: only Babylon\.js shows it; add --profile babylon"):
+        RunConfig(fit=leaf, export=ExportConfig(profile="three")).check(mesh=True, rendered=True, blender=False)
+    RunConfig(fit=leaf, export=ExportConfig(profile="babylon")).check(mesh=True, rendered=True, blender=False)
 
 
 def test_pictures_under_any_light_are_sums(known: BillboardCloud, views: ViewDataset) -> None:
