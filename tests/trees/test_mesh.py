@@ -183,6 +183,10 @@ def test_leaf_tones_are_drawn_evenly_and_by_the_seed() -> None:
     assert np.abs(counts - total / 3).max() < 4 * np.sqrt(total * 2 / 9)  # four standard deviations
     assert [part.material.name for part in first] == ["bark", "leaf_0", "leaf_1", "leaf_2"]
     assert [part.material.double_sided for part in first] == [False, True, True, True]
+    assert [part.material.transmission for part in first] == [0, 0.58, 0.58, 0.58]
+    for part, color in zip(first[1:], species.leaf_colors, strict=True):  # red passes more easily
+        assert part.material.transmission_color == (1.29 * color[0], color[1], color[2])
+    assert tree_parts(replace(skeleton, species=replace(species, leaf_transmission=0)), 0, detail=0.1)[1].material.transmission == 0
     assert np.array_equal(first[0].vertices, other[0].vertices)
     assert not np.array_equal(first[1].vertices[:10], other[1].vertices[:10])
 
