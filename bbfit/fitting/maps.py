@@ -35,7 +35,7 @@ from bbfit.views.dataset import ViewDataset
 from bbfit.views.lit import LitViews
 from bbfit.views.view_set import ViewSet
 
-_LEARNING_RATE = 0.03
+_LEARNING_RATE = 0.05
 # Exposures in a step.
 _BATCH = 4
 # Most cameras whose passes are baked onto the billboards to start from.
