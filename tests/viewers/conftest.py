@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from browser_viewer import BrowserViewer, open_three
 from playwright.sync_api import Browser
-from three_viewer import ThreeViewer, open_three
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.orbit import Orbit
@@ -20,7 +20,7 @@ sys.path.append(str(Path(__file__).parents[1] / "exporting"))  # for glb_viewer
 
 
 @pytest.fixture(scope="session")
-def three(chromium: tuple[Browser, ThreadPoolExecutor]) -> Iterator[ThreeViewer]:
+def three(chromium: tuple[Browser, ThreadPoolExecutor]) -> Iterator[BrowserViewer]:
     """three.js in a browser."""
     with open_three(*chromium) as viewer:
         yield viewer

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from blender_viewer import render_blender
+from browser_viewer import BrowserViewer, open_three
 from numpy.typing import NDArray
 from playwright.sync_api import Browser
-from three_viewer import ThreeViewer, open_three
 
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import evaluate, held_out
@@ -63,7 +63,7 @@ def psnrs(
 
 @pytest.mark.parametrize("alpha", ["mask", "blend"])
 def test_three_shows_what_was_scored(
-    three: ThreeViewer, fits: dict[str, BillboardCloud], files: dict[str, Path], views: ViewDataset, alpha: str
+    three: BrowserViewer, fits: dict[str, BillboardCloud], files: dict[str, Path], views: ViewDataset, alpha: str
 ) -> None:
     """Scores at the views' size, pictures at twice that. Measured: mask 36.5 dB, the score 0.05 dB off; blend 53.3 and 0.002 dB.
 
@@ -99,7 +99,7 @@ def test_three_smooths_the_edges_of_masks(
 
 
 def test_what_is_not_split_is_shown_in_the_wrong_order(
-    three: ThreeViewer, fits: dict[str, BillboardCloud], files: dict[str, Path], views: ViewDataset, tmp_path: Path
+    three: BrowserViewer, fits: dict[str, BillboardCloud], files: dict[str, Path], views: ViewDataset, tmp_path: Path
 ) -> None:
     """So that the test above is known to see it. Measured: 44.1 and 38.6 dB."""
     (whole,) = export(fits["blend"], tmp_path / "model.glb", replace(THREE, split=False))
@@ -108,7 +108,7 @@ def test_what_is_not_split_is_shown_in_the_wrong_order(
 
 
 def test_three_shows_mip_levels_as_dense_as_the_views_from_afar(
-    three: ThreeViewer, fits: dict[str, BillboardCloud], views: ViewDataset, tmp_path: Path
+    three: BrowserViewer, fits: dict[str, BillboardCloud], views: ViewDataset, tmp_path: Path
 ) -> None:
     """At a half, a quarter and an eighth of the size, by textures in KTX2; all pixels that are not white are covered.
 
@@ -128,7 +128,7 @@ def test_three_shows_mip_levels_as_dense_as_the_views_from_afar(
 
 
 def test_three_computes_the_mip_levels_that_were_scored(
-    three: ThreeViewer, fits: dict[str, BillboardCloud], files: dict[str, Path], views: ViewDataset
+    three: BrowserViewer, fits: dict[str, BillboardCloud], files: dict[str, Path], views: ViewDataset
 ) -> None:
     """Of PNG textures, as plain averages. Measured: 33.3, 31.4 and 27.4 dB from bbfit's own, and without levels at most 18.4."""
     cards = shipped_model(fits["mask"], THREE).cards
@@ -149,7 +149,7 @@ def test_blender_shows_what_was_scored(fits: dict[str, BillboardCloud], views: V
 
 
 def test_three_shows_each_level_of_detail_as_its_own_file(
-    three: ThreeViewer, files: dict[str, Path], views: ViewDataset, tmp_path: Path
+    three: BrowserViewer, files: dict[str, Path], views: ViewDataset, tmp_path: Path
 ) -> None:
     """Levels are nodes, the coarser ones beside the scene, which alone is shown by itself."""
     paths = [files["mask"], files["blend"]]

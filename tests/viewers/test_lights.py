@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from browser_viewer import BrowserViewer
 from glb_edit import with_min_filter
 from noise_scene import noise_cloud
-from three_viewer import ThreeViewer
 
 from bbfit.evaluation.metrics import psnr
 from bbfit.exporting.config import ExportConfig
@@ -27,7 +27,7 @@ BILINEAR = 9729
 
 @pytest.mark.parametrize("two_sided", [False, True])
 @pytest.mark.parametrize("alpha", ["mask", "blend"])
-def test_three_lights_maps_as_bbfit_does(alpha: str, two_sided: bool, three: ThreeViewer, around: Camera, tmp_path: Path) -> None:
+def test_three_lights_maps_as_bbfit_does(alpha: str, two_sided: bool, three: BrowserViewer, around: Camera, tmp_path: Path) -> None:
     """Five views under five suns, from both sides of each plane.
 
     Measured: mask at least 35.5 dB, blend 53.9 dB; with the sun on the other side at most 23.5 dB.

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from browser_viewer import BrowserViewer
 from glb_edit import edit_glb, with_min_filter
 from glb_viewer import read_glb
 from noise_scene import expected, noise_cloud
 from numpy.typing import NDArray
-from three_viewer import ThreeViewer
 
 from bbfit.evaluation.metrics import psnr
 from bbfit.exporting.config import ExportConfig
@@ -35,7 +35,7 @@ SIDES = {False: "double", True: "front"}
 
 
 @pytest.mark.parametrize("two_sided", [False, True])
-def test_three_shows_crossing_masked_billboards(two_sided: bool, three: ThreeViewer, around: Camera, tmp_path: Path) -> None:
+def test_three_shows_crossing_masked_billboards(two_sided: bool, three: BrowserViewer, around: Camera, tmp_path: Path) -> None:
     (exported,) = export(noise_cloud(3, texels=32, two_sided=two_sided), tmp_path / "model.glb", ExportConfig(alpha="mask"))
     glb = with_min_filter(exported, BILINEAR)
     show = three.show(glb, around)
@@ -52,7 +52,7 @@ def test_three_shows_crossing_masked_billboards(two_sided: bool, three: ThreeVie
 
 
 @pytest.mark.parametrize("two_sided", [False, True])
-def test_three_shows_a_blended_billboard(two_sided: bool, three: ThreeViewer, around: Camera, tmp_path: Path) -> None:
+def test_three_shows_a_blended_billboard(two_sided: bool, three: BrowserViewer, around: Camera, tmp_path: Path) -> None:
     cloud, config = noise_cloud(1, texels=32, two_sided=two_sided), ExportConfig(alpha="blend")
     (pieces,) = export(cloud, tmp_path / "pieces.glb", config)
     (exported,) = export(cloud, tmp_path / "model.glb", config.comparable())
@@ -68,14 +68,14 @@ def test_three_shows_a_blended_billboard(two_sided: bool, three: ThreeViewer, ar
 
 
 @pytest.mark.parametrize("alpha", ["mask", "blend"])
-def test_three_shows_enlarged_textures_as_they_are_exported(alpha: str, three: ThreeViewer, around: Camera, tmp_path: Path) -> None:
+def test_three_shows_enlarged_textures_as_they_are_exported(alpha: str, three: BrowserViewer, around: Camera, tmp_path: Path) -> None:
     """With the exporter's own filter, where texels are larger than pixels."""
     count = 3 if alpha == "mask" else 1
     (glb,) = export(noise_cloud(count, texels=16), tmp_path / "model.glb", ExportConfig(alpha=alpha))  # type: ignore[arg-type]
     assert psnr(expected(glb, around), three.render(glb, around)) >= 33  # measured 35.8 and 44.6
 
 
-def test_three_shows_a_parallel_projection(three: ThreeViewer, around: Camera, tmp_path: Path) -> None:
+def test_three_shows_a_parallel_projection(three: BrowserViewer, around: Camera, tmp_path: Path) -> None:
     """The independent viewer has none; bbfit's reference renderer has."""
     cloud = noise_cloud(1, texels=32)
     intrinsics = orthographic_intrinsics(2.6, 64, 56) + torch.tensor([[0.0, 0, 3.3], [0, 0, -2.6], [0, 0, 0]])
@@ -85,7 +85,7 @@ def test_three_shows_a_parallel_projection(three: ThreeViewer, around: Camera, t
     assert psnr(target, three.render(with_min_filter(glb, BILINEAR), camera)) >= 45  # measured 55.3; half a pixel of shift leaves 35
 
 
-def test_three_shows_one_node_alone(three: ThreeViewer, around: Camera, tmp_path: Path) -> None:
+def test_three_shows_one_node_alone(three: BrowserViewer, around: Camera, tmp_path: Path) -> None:
     """In the scene, or beside it as levels of detail are, which a viewer without MSFT_lod never sees."""
     parts = [noise_cloud(2, texels=32), noise_cloud(2, texels=32, two_sided=True)]
     config = ExportConfig(alpha="mask")
@@ -108,7 +108,7 @@ def test_three_shows_one_node_alone(three: ThreeViewer, around: Camera, tmp_path
     np.testing.assert_array_equal(three.render(levels, around, node=names[1]), alone[1])
 
 
-def test_three_shows_textures_in_ktx2(three: ThreeViewer, around: Camera, tmp_path: Path) -> None:
+def test_three_shows_textures_in_ktx2(three: BrowserViewer, around: Camera, tmp_path: Path) -> None:
     """Blocks of 4 x 4 texels of one color each, which Basis Universal holds without loss, look as they do in a PNG."""
     (glb,) = export(noise_cloud(1, texels=32), tmp_path / "model.glb", ExportConfig(alpha="mask"))
     blocks = np.ascontiguousarray(read_glb(glb)[2][::4, ::4])
@@ -146,7 +146,7 @@ def ktx2(blocks: NDArray[np.uint8]) -> bytes:
     return (head + form).ljust(first, b"\0") + data
 
 
-def test_what_three_cannot_read_is_an_error(three: ThreeViewer, around: Camera, tmp_path: Path) -> None:
+def test_what_three_cannot_read_is_an_error(three: BrowserViewer, around: Camera, tmp_path: Path) -> None:
     (glb,) = export(noise_cloud(1, texels=16), tmp_path / "model.glb")
 
     def spoil(tree: dict[str, Any], views: list[bytes]) -> None:

@@ -1,4 +1,4 @@
-// Loads GLBs with three.js and draws them from given cameras; three_viewer.py calls load() once a GLB and then draw() once a view.
+// Loads GLBs with three.js and draws them from given cameras; browser_viewer.py calls load() once a GLB and then draw() once a view.
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { KTX2Loader } from "three/addons/loaders/KTX2Loader.js";

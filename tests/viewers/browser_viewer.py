@@ -1,4 +1,4 @@
-"""What the real three.js shows of a GLB: its WebGLRenderer and GLTFLoader in a headless Chromium, by a software GPU."""
+"""What the real three.js and Babylon.js show of a GLB: their renderers and loaders in a headless Chromium, by a software GPU."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
-class ThreeMaterial:
-    """A material as three.js's loader made it."""
+class BrowserMaterial:
+    """A material as the program's loader made it."""
 
     name: str
     """As in the file."""
     kind: str
-    """three.js's class: MeshBasicMaterial is unlit, MeshStandardMaterial lit."""
+    """The program's class. In three.js, MeshBasicMaterial is unlit and MeshStandardMaterial lit."""
     alpha_test: float
     """Least alpha drawn; 0 draws all."""
     transparent: bool
@@ -52,8 +52,8 @@ class ThreeMaterial:
 
 
 @dataclass(frozen=True)
-class ThreeShow:
-    """What three.js shows of a model."""
+class BrowserShow:
+    """What a program shows of a model."""
 
     images: NDArray[np.float64]
     """Display-referred RGB over white in [0, 1], one sample a pixel, [V, H, W, 3]."""
@@ -61,17 +61,17 @@ class ThreeShow:
     """Draw calls of each view; a blended material that shows both sides takes two a mesh, the back faces first."""
     triangles: tuple[int, ...]
     """Triangles drawn in each view, counted once a draw call."""
-    materials: tuple[ThreeMaterial, ...]
+    materials: tuple[BrowserMaterial, ...]
     """Materials of the meshes that are shown."""
     warnings: tuple[str, ...]
-    """What three.js warned of."""
+    """What the program warned of."""
 
 
-class ThreeViewer:
-    """A page with three.js, which shows one model after another; made by :func:`open_three`."""
+class BrowserViewer:
+    """A page with a program, which shows one model after another; made by :func:`open_three` and :func:`open_babylon`."""
 
-    def __init__(self, browser: Browser, thread: ThreadPoolExecutor, query: str = "") -> None:
-        self._browser, self._thread, self._query = browser, thread, query
+    def __init__(self, browser: Browser, thread: ThreadPoolExecutor, page: str) -> None:
+        self._browser, self._thread, self._address = browser, thread, page
         self._page: Page | None = None
         self._glb = Path()
         self._errors, self._warnings = list[str](), list[str]()
@@ -80,7 +80,7 @@ class ThreeViewer:
         """Pictures over white of a batch of cameras, [V, H, W, 3]; see :meth:`show`."""
         return self.show(glb, camera, node=node, light=light).images
 
-    def show(self, glb: Path, camera: Camera, *, node: str | None = None, light: Light | None = None) -> ThreeShow:
+    def show(self, glb: Path, camera: Camera, *, node: str | None = None, light: Light | None = None) -> BrowserShow:
         """Load a GLB and draw it from a batch of V cameras, in V lights if there are any.
 
         ``node`` shows only the node of that name with its descendants, in the scene or beside it, as levels of detail are.
@@ -88,7 +88,7 @@ class ThreeViewer:
         """
         return self._thread.submit(self._show, glb, camera.batch(), node, light).result()
 
-    def _show(self, glb: Path, camera: Camera, node: str | None, light: Light | None) -> ThreeShow:
+    def _show(self, glb: Path, camera: Camera, node: str | None, light: Light | None) -> BrowserShow:
         self._glb = glb
         self._warnings.clear()
         page = self._page = self._page or self._open()
@@ -101,7 +101,7 @@ class ThreeViewer:
             self._close()
             raise
         images, calls, triangles = zip(*views, strict=True)
-        return ThreeShow(np.stack(images), calls, triangles, tuple(map(_material, found["materials"])), tuple(self._warnings))
+        return BrowserShow(np.stack(images), calls, triangles, tuple(map(_material, found["materials"])), tuple(self._warnings))
 
     def _open(self) -> Page:
         page = self._browser.new_page()
@@ -110,7 +110,7 @@ class ThreeViewer:
         page.on("pageerror", lambda error: self._errors.append(str(error)))
         page.route("**/*", lambda route: _answer(route, self._glb))
         try:
-            page.goto(f"{ORIGIN}/three.html{self._query}")
+            page.goto(f"{ORIGIN}/{self._address}")
             assert not self._errors, self._errors
         except BaseException:
             page.close()
@@ -120,7 +120,7 @@ class ThreeViewer:
     def _hear(self, message: ConsoleMessage) -> None:
         if message.type == "error":
             self._errors.append(message.text)
-        elif message.type == "warning" and message.text.startswith("THREE."):  # others are the GPU driver's, on speed
+        elif message.type == "warning" and message.text.startswith(("THREE.", "BJS")):  # others are the GPU driver's, on speed
             self._warnings.append(message.text)
 
     def _close(self) -> None:
@@ -134,11 +134,24 @@ class ThreeViewer:
 
 
 @contextmanager
-def open_three(browser: Browser, thread: ThreadPoolExecutor, query: str = "") -> Iterator[ThreeViewer]:
+def open_three(browser: Browser, thread: ThreadPoolExecutor, query: str = "") -> Iterator[BrowserViewer]:
     """A page for as many GLBs as wanted; the test fails where there is no three.js. three_page.js says what a ``query`` is."""
-    if not (NODE / "node_modules" / "three").is_dir():
-        pytest.fail(f"three.js is not installed: install Node.js and run `npm ci` in {NODE}")
-    with closing(ThreeViewer(browser, thread, query)) as viewer:
+    with _open(browser, thread, "three", f"three.html{query}") as viewer:
+        yield viewer
+
+
+@contextmanager
+def open_babylon(browser: Browser, thread: ThreadPoolExecutor, query: str = "") -> Iterator[BrowserViewer]:
+    """The same with Babylon.js; babylon_page.js says what a ``query`` is."""
+    with _open(browser, thread, "@babylonjs", f"babylon.html{query}") as viewer:
+        yield viewer
+
+
+@contextmanager
+def _open(browser: Browser, thread: ThreadPoolExecutor, package: str, page: str) -> Iterator[BrowserViewer]:
+    if not (NODE / "node_modules" / package).is_dir():
+        pytest.fail(f"{package} is not installed: install Node.js and run `npm ci` in {NODE}")
+    with closing(BrowserViewer(browser, thread, page)) as viewer:
         yield viewer
 
 
@@ -181,9 +194,9 @@ def light_values(light: Light) -> dict[str, Any]:
     }
 
 
-def _material(found: dict[str, Any]) -> ThreeMaterial:
+def _material(found: dict[str, Any]) -> BrowserMaterial:
     picture = found["map"] or {}
-    return ThreeMaterial(
+    return BrowserMaterial(
         name=found["name"],
         kind=found["type"],
         alpha_test=found["alphaTest"],
@@ -197,11 +210,11 @@ def _material(found: dict[str, Any]) -> ThreeMaterial:
 
 
 def _answer(route: Route, glb: Path) -> None:
-    """Serve the page, three.js and the model under the page's own origin; refuse everything else."""
+    """Serve the page, the program and the model under the page's own origin; refuse everything else."""
     path = route.request.url.removeprefix(ORIGIN).partition("?")[0]
     if path == "/model.glb":
         file = glb
-    elif path.startswith("/three/"):
+    elif path.startswith(("/three/", "/@babylonjs/")):
         file = NODE / "node_modules" / path.removeprefix("/")
     else:
         file = HERE / path.removeprefix("/")
