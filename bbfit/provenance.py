@@ -23,7 +23,7 @@ VERSIONS: Mapping[str, int] = {
     "views": 6,
     "budget": 10,
     "fit": 21,
-    "export": 8,
+    "export": 9,
     "evaluate": 13,
     "report": 7,
     "lod": 3,

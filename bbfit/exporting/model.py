@@ -53,7 +53,7 @@ class ShippedModel:
         They are those of the files, so they do not depend on whether a program smooths the edges of masks.
         """
         cloud = replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=False))
-        cards = cloud_cards(cloud, self.config.padding << self.halvings)
+        cards = cloud_cards(cloud, self.config.padding << self.halvings, traced=self.config.traced)
         if self.config.split and cards.alpha.kind == "blend":
             cards = split(cards)
         cards = reduced(cards, self.halvings)

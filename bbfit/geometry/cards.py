@@ -47,7 +47,8 @@ class Card:
     normal: NDArray[np.float64]
     """Unit normal, [3]."""
     culled: bool
-    """Whether only the front is drawn, the side that the normal points to; otherwise both sides show the same."""
+    """Whether only the front is drawn, the side that the normal points to; otherwise both sides show the same. Seen from behind, the
+    normals of such a card's texture turn as a whole (glTF 2.0, section 3.9.6)."""
     rectangle: int
     """Index of its texture in the atlas."""
     tangent: NDArray[np.float64] | None = None
@@ -80,6 +81,9 @@ class Cards:
     """The same of ``atlas.surface``."""
     light: Light | None = None
     """The light in which cards with a surface are drawn unless another is given, a batch of one."""
+    traced: bool = False
+    """Whether the cards are for a path tracer, such as Blender's Cycles. There, light reaches a card from its visible side only, also where
+    the normals of its texture lean to the other side, and occlusion has no effect."""
 
     @property
     def vertex_count(self) -> int:

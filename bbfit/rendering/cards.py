@@ -112,7 +112,8 @@ def draw_cards(cards: Cards, camera: Camera, light: Light | None = None) -> Tens
     interpolated (LINEAR_MIPMAP_LINEAR), straight color and alpha separately, and the result is tested or blended. Beyond its border the
     atlas is clamped.
 
-    Cards with maps are shaded after filtering, per pixel, as graphics cards do (:mod:`bbfit.operators.shading` shades texels instead).
+    Cards with maps are shaded after filtering, per pixel, as graphics cards do (:mod:`bbfit.operators.shading` shades texels instead), or
+    as a path tracer does (``cards.traced``). From behind, a card that shows both sides has opposite normals.
 
     A pixel shows a card if its center lies in the polygon. Layers are ordered by depth in every pixel, as in
     :func:`~bbfit.operators.drawing.compositing.composite`. A plane shows nothing edge-on and behind the camera.
@@ -153,7 +154,8 @@ class CardRenderer:
                 met, straight = self._shown(cameras[index])
                 colors = straight[:, :3]
                 if light is not None:
-                    colors = _lit(colors, straight[:, 4:], self._sheets.axes[met.sheet], light[[index if len(light) > 1 else 0]])
+                    own, axes = light[[index if len(light) > 1 else 0]], _axes(self._sheets, cameras[index])[met.sheet]
+                    colors = _lit(colors, straight[:, 4:], axes, own, traced=self._cards.traced)
                 pictures.append(self._composited(colors, straight[:, 3], met, cameras[index]))
             image = torch.stack(pictures)
         return image if camera.batched else image[0]
@@ -164,7 +166,7 @@ class CardRenderer:
         with torch.no_grad():
             met, straight = self._shown(camera)
             normals = normalize(2 * straight[:, 4:7] - 1, dim=-1)
-            in_world = (normals[:, None] @ self._sheets.axes[met.sheet].float())[:, 0]
+            in_world = (normals[:, None] @ _axes(self._sheets, camera)[met.sheet].float())[:, 0]
             return self._composited(torch.cat([straight[:, :3], in_world], -1), straight[:, 3], met, camera)
 
     def _shown(self, camera: Camera) -> tuple[Hits, Tensor]:
@@ -328,17 +330,20 @@ def _bilinear(levels: MipChain, uv: Tensor, level: Tensor) -> Tensor:
     return upper + (lower - upper) * y
 
 
-def _lit(colors: Tensor, maps: Tensor, axes: Tensor, light: Light) -> Tensor:
+def _lit(colors: Tensor, maps: Tensor, axes: Tensor, light: Light, *, traced: bool) -> Tensor:
     """Shade base colors of fragments, [M, 3], given their filtered maps, [M, 4 or 5], and the axes of the normals, [M, 3, 3].
 
-    The formula is that of :func:`~bbfit.operators.shading.reference.shade_reference`.
+    The formula is that of :func:`~bbfit.operators.shading.reference.shade_reference`. ``traced`` light comes from the visible side of
+    the plane only: no sun from behind it, and of an even sky the share (1 + cos a) / 2 where the normal leans by the angle a.
     """
     normals = normalize(2 * maps[:, :3] - 1, dim=-1)
-    cosine = (normals * (axes @ light.sun_directions[0]).float()).sum(-1, keepdim=True)
-    occlusion, translucency = maps[:, 3:4], maps[:, 4:] if maps.shape[1] > 4 else 0
+    towards, open_sky, translucency = (axes @ light.sun_directions[0]).float(), maps[:, 3:4], maps[:, 4:] if maps.shape[1] > 4 else 0
+    cosine = (normals * towards).sum(-1, keepdim=True)
     of_sun = (1 - translucency) * cosine.clamp_min(0) + translucency * (-cosine).clamp_min(0)
+    if traced:
+        of_sun, open_sky = of_sun * (towards[:, 2:] > 0), (1 + normals[:, 2:]) / 2
     sun = (light.sun_colors[0] * light.sun_strengths / math.pi).float()
-    return encode(decode(colors) * (of_sun * sun + float(light.ambients) * occlusion)).clamp_max(1)
+    return encode(decode(colors) * (of_sun * sun + float(light.ambients) * open_sky)).clamp_max(1)
 
 
 def _beside(met: Hits) -> list[Tensor]:
@@ -349,11 +354,22 @@ def _beside(met: Hits) -> list[Tensor]:
     return [place[:, :2] / place[:, 2:] for place in found]
 
 
+def _axes(sheets: Sheets, camera: Camera) -> Tensor:
+    """The axes of the normals of each plane as a single camera sees them, [S, 3, 3]: from behind, those of both sides turn."""
+    behind = (_distances(sheets, camera.to("cpu").to(torch.float64))[0] < 0) & ~sheets.culled
+    return torch.where(behind[:, None, None], -sheets.axes, sheets.axes)
+
+
 def _faced(sheets: Sheets, camera: Camera) -> Tensor:
     """Whether the camera sees a side of each plane that is shown, and not edge-on, bool [S]."""
+    distance, farthest = _distances(sheets, camera)
+    return (distance.abs() > EDGE_ON * farthest) & ((distance > 0) | ~sheets.culled)
+
+
+def _distances(sheets: Sheets, camera: Camera) -> tuple[Tensor, Tensor]:
+    """How far the camera is in front of each plane (negative: behind it), and how far from its center, [S] each."""
     towards = -camera.forward.expand(len(sheets), 3) if camera.orthographic else camera.position - sheets.centers
-    distance = (towards * sheets.normals).sum(-1)
-    return (distance.abs() > EDGE_ON * towards.norm(dim=-1)) & ((distance > 0) | ~sheets.culled)
+    return (towards * sheets.normals).sum(-1), towards.norm(dim=-1)
 
 
 def _boxes(sheets: Sheets, camera: Camera, shown: Tensor) -> tuple[Tensor, Tensor]:

@@ -67,6 +67,38 @@ def test_cards_show_what_the_cloud_shows_in_every_light(clouds: dict[str, Billbo
     assert all(card.culled for card in model.cards.cards) and len(model.cards.cards) == 2 * len(cloud)
 
 
+def test_a_model_for_blender_has_one_card_for_both_sides(clouds: dict[str, BillboardCloud], orbit: Camera, tmp_path: Path) -> None:
+    """From the front it shows what a pair shows but for a sun behind the plane. From behind, its normals turn as a whole."""
+    cloud = with_maps(clouds["one"])
+    cloud = replace(cloud.take([0]), surface=torch.tensor([0.5, 0.9, 1.0, 0.0]).double().repeat(len(cloud.take([0]).texels), 1))
+    single, pair = (shipped_model(cloud, replace(PLAIN, profile=profile)) for profile in ("blender", None))
+    assert [card.culled for card in single.cards.cards] == [False] and len(pair.cards.cards) == 2
+    (path,) = single.save(tmp_path / "model.glb")
+    (material,) = split_glb(path.read_bytes())[0]["materials"]
+    assert material["doubleSided"] and messages(path) == []
+
+    normal, up, right = (axis[0] for axis in (cloud.normals, cloud.ups, cloud.rights))
+    leaning = 0.8 * up + 0.6 * normal  # of every texel, seen from the front
+
+    def sun(direction: torch.Tensor) -> Light:
+        return Light.of(direction[None], 1.0, 0.0)
+
+    front = [index for index in range(len(orbit)) if (orbit[index].position - cloud.centers[0]) @ normal > 0]
+    back = [index for index in range(len(orbit)) if index not in front]
+    assert front and back
+    for index in front:
+        torch.testing.assert_close(single.draw(orbit[index], sun(leaning)), pair.draw(orbit[index], sun(leaning)))
+        below = up - 0.1 * normal
+        assert pair.draw(orbit[index], sun(below))[..., :3].sum() > 0 == single.draw(orbit[index], sun(below))[..., :3].sum()
+    for index in back:
+        mirrored = 0.8 * up - 0.6 * normal
+        assert pair.draw(orbit[index], sun(mirrored))[..., :3].sum() > single.draw(orbit[index], sun(mirrored))[..., :3].sum()
+        shown = single.draw(orbit[index], sun(-leaning))
+        torch.testing.assert_close(shown, pair.draw(orbit[index], sun(mirrored)))
+        sky_only = Light.of(right[None], 0.0, 0.8), Light.of(right[None], 0.0, 1.0)
+        torch.testing.assert_close(pair.draw(orbit[index], sky_only[0]), single.draw(orbit[index], sky_only[1]), atol=5e-3, rtol=0)
+
+
 def test_glb_has_three_textures_and_tangents_and_is_valid(
     clouds: dict[str, BillboardCloud], crossed: BillboardCloud, tmp_path: Path
 ) -> None:

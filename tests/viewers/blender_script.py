@@ -31,7 +31,10 @@ def main() -> None:
     scene.camera = bpy.data.objects.new("camera", lens)
     scene.collection.objects.link(scene.camera)
     lens.sensor_fit = "HORIZONTAL"
+    sky = add_light(job) if job["lights"] is not None or job["panorama"] is not None else None
     for index, view in enumerate(job["views"]):
+        if job["lights"] is not None:
+            aim(job["lights"][index], sky)
         scene.camera.matrix_world = Matrix(view["camera_to_world"])
         if job["orthographic"]:
             lens.type, lens.ortho_scale = "ORTHO", view["extent"]
@@ -41,6 +44,44 @@ def main() -> None:
         lens.clip_start, lens.clip_end = view["clip"]
         scene.render.filepath = os.path.join(job["folder"], f"{index:04d}.png")  # noqa: PTH118
         bpy.ops.render.render(write_still=True)
+
+
+def add_light(job: dict[str, Any]) -> Any:
+    """Add a sun and a sky, or a sky with a panorama, and return the sky's node; docs/engines.md says what a user sets."""
+    import bpy
+
+    scene = bpy.context.scene
+    scene.world = bpy.data.worlds.new("sky")
+    scene.world.use_nodes = True
+    tree = scene.world.node_tree
+    sky = tree.nodes["Background"]
+    sky.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    if job["panorama"] is not None:
+        picture = tree.nodes.new("ShaderNodeTexEnvironment")
+        picture.image = bpy.data.images.load(job["panorama"])
+        tree.links.new(picture.outputs["Color"], sky.inputs["Color"])
+    else:
+        lamp = bpy.data.lights.new("sun", "SUN")
+        lamp.angle = 0.0
+        scene.collection.objects.link(bpy.data.objects.new("sun", lamp))
+    if not job["as_it_comes"]:
+        for item in bpy.data.objects:
+            if item.type == "MESH":
+                item.visible_diffuse = item.visible_shadow = False
+        for material in bpy.data.materials:
+            material.cycles.use_bump_map_correction = False
+    return sky
+
+
+def aim(light: dict[str, Any], sky: Any) -> None:
+    """Give the sun and the sky the values of one light."""
+    import bpy
+    from mathutils import Vector
+
+    sun = bpy.data.objects["sun"]
+    sun.rotation_euler = Vector(light["towards"]).to_track_quat("Z", "Y").to_euler()
+    sun.data.energy, sun.data.color = light["strength"], light["color"]
+    sky.inputs["Strength"].default_value = light["ambient"]
 
 
 def unlight() -> None:

@@ -18,14 +18,21 @@ import pytest
 from numpy.typing import NDArray
 
 from bbfit.geometry.camera import Camera, camera_to_nerf
+from bbfit.geometry.light import Light, to_z_up
 
 SCRIPT = Path(__file__).with_name("blender_script.py")
 # Cameras see from this share of their distance to the world's origin to this multiple of it, and a kilometre at least.
 CLIP = (1e-2, 1e2)
 
 
-def render_blender(model: Path, camera: Camera, *, samples: int = 1) -> NDArray[np.float64]:
-    """Display-referred RGB over white in [0, 1] of a batch of V cameras, [V, H, W, 3]; view transform Standard.
+def render_blender(
+    model: Path, camera: Camera, *, samples: int = 1, light: Light | None = None, panorama: Path | None = None, as_it_comes: bool = False
+) -> NDArray[np.float64]:
+    """Display-referred RGB over white in [0, 1] of a batch of V cameras, in V lights or in one panorama if given, [V, H, W, 3];
+    view transform Standard.
+
+    The light reaches billboards as docs/engines.md sets Blender up for it, with no shadows of billboards on each other and with no
+    correction of bumps; ``as_it_comes`` leaves both on. A panorama is an equirectangular picture in linear light.
 
     Every sample lies at the center of its pixel, so more than one only matters where Cycles chooses at random. Blender blends layers in
     linear light; the picture over the white is composited as bbfit does its own, display-referred.
@@ -44,6 +51,9 @@ def render_blender(model: Path, camera: Camera, *, samples: int = 1) -> NDArray[
             "width": camera.width,
             "height": camera.height,
             "samples": samples,
+            "lights": None if light is None else [_lamp(light[[index]]) for index in range(len(light))],
+            "panorama": None if panorama is None else str(panorama),
+            "as_it_comes": as_it_comes,
         }
         # Its own folder for what Blender leaves behind, and no settings or add-ons of the user's.
         environment = os.environ | dict.fromkeys(("TMPDIR", "TEMP", "TMP", "BLENDER_USER_RESOURCES"), folder)
@@ -67,4 +77,14 @@ def _view(camera: Camera) -> dict[str, Any]:
         "extent": width / k[0, 0],
         "shift": [((width - 1) / 2 - k[0, 2]) / width, (k[1, 2] - (height - 1) / 2) / width],
         "clip": [CLIP[0] * distance, max(CLIP[1] * distance, 1000.0)],
+    }
+
+
+def _lamp(light: Light) -> dict[str, Any]:
+    """One light in Blender's terms."""
+    return {
+        "towards": to_z_up(light.sun_directions[0].tolist()),
+        "strength": light.sun_strengths.item(),
+        "color": light.sun_colors[0].tolist(),
+        "ambient": light.ambients.item(),
     }
