@@ -88,6 +88,17 @@ class BrowserViewer:
         """
         return self._thread.submit(self._show, glb, camera.batch(), node, light).result()
 
+    def surround(self, panorama: NDArray[np.float32]) -> None:
+        """Light all models that follow by a panorama, equirectangular and in linear light, [H, W, 3]; three.js only."""
+        values = base64.b64encode(np.concatenate([panorama, np.ones_like(panorama[..., :1])], -1)[::-1].tobytes()).decode()
+        height, width = panorama.shape[:2]
+
+        def work() -> None:
+            self._page = self._page or self._open()
+            self._page.evaluate("sky => window.surround(sky)", {"values": values, "width": width, "height": height})
+
+        self._thread.submit(work).result()
+
     def _show(self, glb: Path, camera: Camera, node: str | None, light: Light | None) -> BrowserShow:
         self._glb = glb
         self._warnings.clear()

@@ -97,6 +97,16 @@ function illuminate({ direction, strength, color, ambient }) {
   scene.updateMatrixWorld(true);
 }
 
+// Lights the scene by an equirectangular picture: 32-bit RGBA in base 64, the bottom row first.
+window.surround = ({ values, width, height }) => {
+  const bytes = Uint8Array.from(atob(values), (letter) => letter.charCodeAt(0));
+  const picture = new THREE.DataTexture(new Float32Array(bytes.buffer), width, height, THREE.RGBAFormat, THREE.FloatType);
+  picture.mapping = THREE.EquirectangularReflectionMapping;
+  picture.minFilter = picture.magFilter = THREE.LinearFilter;
+  picture.needsUpdate = true;
+  scene.environment = picture;
+};
+
 // Draws one view. Matrices are lists of 16 numbers, row after row. Pixels are RGBA bytes in base 64, the bottom row first.
 window.draw = ({ projection, cameraToWorld, width, height, light }) => {
   renderer.setSize(width, height, false);
