@@ -96,7 +96,7 @@ def compare(
 
     Each result is drawn as its authors intended. Billboards, slices and learned meshes are unlit and blended (bbfit's default uses an alpha
     test). Billboards with maps take the light of the views, and Blender renders decimated meshes in it. Billboards are also scored under
-    the suns of held-out views; the systems with maps need such views, which then have at least one sun. Writes ``views/``, a folder for
+    the suns of held-out views; there is at least one other sun, unless a panorama lights the views. Writes ``views/``, a folder for
     each system with its model and its pictures of the held-out views, ``compare.csv``, ``compare.md``, ``compare.json``, ``systems.png``
     and ``quality.png``. A killed comparison continues where it stopped.
 
@@ -124,8 +124,8 @@ def compare(
         fail("billboards", "the comparison sets their numbers", "omit billboards and budgets")
     chosen = config.systems or (SYSTEMS if stages.views.hdri is None else tuple(system for system in SYSTEMS if system not in LIT))
     systems = [system for system in SYSTEMS if system in chosen]
-    if set(systems) & set(LIT) and not stages.views.suns:
-        stages = replace(stages, views=replace(stages.views, suns=1))
+    if set(systems) & set(LIT) or stages.views.hdri is None:
+        stages = replace(stages, views=replace(stages.views, suns=max(stages.views.suns, 1)))
     for system, (fit, budget) in _fits(config, stages.fit).items():
         if system == "bbfit" or system in systems:  # others take its size
             replace(stages, fit=fit, budget=budget).check(mesh=False, rendered=True, blender=False)
