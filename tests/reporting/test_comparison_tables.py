@@ -16,8 +16,8 @@ OVER = Over(*(OverBackground(20.0 + step, 0.7 + step / 100, 0.1 + step / 100) fo
 COLOUR = Colour((40, 50, 20, 100), (20, 25, 10, 50), (40, 50, 20, 100), (16, 20, 8, 50))
 MEASURES = Measures(OVER, Rgba(0.07, 23.5, 0.75), ThesisScale(2e-5, 0.99, 92.6, 17.3), COLOUR, 0.9, 0.4)
 ROWS = [
-    CompareRow("bbfit", "bbfit, 8 billboards", 8, 32, 1000, 2.5, MEASURES, ""),
-    CompareRow("draco", "the tree, with Draco", None, 9000, 500, 0.1, None, "not drawn"),
+    CompareRow("bbfit", "bbfit, 8 billboards", 8, 32, 1000, 2.5, MEASURES, "", {"psnr": 19.5, "flip": 0.2, "low": 25.25, "r2": None}),
+    CompareRow("draco", "the tree, with Draco", None, 9000, 500, 0.1, None, "not drawn", None),
 ]
 
 
@@ -36,18 +36,26 @@ def test_csv_has_means_over_backgrounds_scores_over_white_and_colors() -> None:
     wanted |= {"sharpness": 0.9, "brightness": 0.4, "color_delta_e": 0, "color_chroma": 1, "color_brightness": 0.8, "thesis_psnr": 92.6}
     assert {name: float(drawn[name]) for name in wanted} == pytest.approx(wanted, abs=1e-12)
     assert {other[name] for name in wanted} == {""} and other["note"] == "not drawn"
+    lights = [f"light_{name}" for name in ("psnr", "flip", "low", "r2")]
+    assert [drawn[name] for name in lights] == ["19.5", "0.2", "25.25", ""] and {other[name] for name in lights} == {""}
 
 
 def test_markdown_shows_them_too() -> None:
     head, line, tree, drawn, other = (
         [cell.strip() for cell in text.strip("| ").split("|")]
-        for text in compare_markdown(ROWS, OriginalTree(9000, 10_000)).splitlines()
+        for text in compare_markdown(ROWS, OriginalTree(9000, 10_000)).partition("## Under other suns")[0].splitlines()
         if text.startswith("|")
     )
     shown = dict(zip(head, drawn, strict=True))
     assert (shown["PSNR, dB"], shown["FLIP"], shown["PSNR over white"]) == ("21.50", "0.1150", "20.00")
     assert (shown["color ΔE"], shown["chroma"], shown["brightness"]) == ("0.00", "1.00", "0.80")
     assert set(line) == {"---"} and tree[:2] == ["the tree", ""] and other[0] == "the tree, with Draco"
+
+
+def test_markdown_lists_what_was_scored_under_other_suns() -> None:
+    text = compare_markdown(ROWS, OriginalTree(9000, 10_000)).partition("## Under other suns")[2]
+    assert [line for line in text.splitlines() if line.startswith("| ")][2:] == ["| bbfit, 8 billboards | 19.50 | 0.2000 | 25.25 |  |"]
+    assert "## Under other suns" not in compare_markdown(ROWS[1:], OriginalTree(9000, 10_000))
 
 
 def test_rows_go_through_json() -> None:
