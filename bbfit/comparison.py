@@ -80,8 +80,8 @@ class _SystemResult:
     note: str = ""
     size: int | None = None
     """Size in bytes if there is no GLB file."""
-    lit: Callable[[], LightScore | None] | None = None
-    """Scores it under the suns of held-out views. ``None`` if that is not done."""
+    lit: Callable[[Callable[[int, int], None]], LightScore | None] | None = None
+    """Scores it under the suns of held-out views, and reports finished views and their total. ``None`` if that is not done."""
 
 
 def compare(
@@ -229,7 +229,7 @@ class _Comparison:
             if result.model is not None:
                 write_bytes(folder / "model.glb", result.model)
             measures = None if result.draw is None else self._score(system, result.draw, output_folder("out", folder / "held_out"))
-            score = None if result.lit is None else result.lit()
+            score = None if result.lit is None else result.lit(partial(self._on_progress, f"{system} light"))
             light = None if score is None else score.figures
             size = result.size if result.model is None else len(result.model)
             row = CompareRow(system, title, result.planes, result.vertices, size, round(result.seconds, 1), measures, result.note, light)
@@ -278,15 +278,15 @@ class _Comparison:
 
         result = run(self._folder / "views", folder / "run", replace(stages, tree=self._tree.path), on_progress=report)
         seconds = sum(result.report.seconds.get(stage, 0.0) for stage in ("budget", "fit", "export"))
-        return replace(self._of(result.cloud, self._stages.export.comparable(), seconds), lit=lambda: result.report.light)
+        return replace(self._of(result.cloud, self._stages.export.comparable(), seconds), lit=lambda _: result.report.light)
 
     def _of(self, cloud: BillboardCloud, export: ExportConfig, seconds: float) -> _SystemResult:
         """The result of a system that makes billboards."""
         model = shipped_model(cloud, export)
 
-        def lit() -> LightScore | None:
+        def lit(on_view: Callable[[int, int], None]) -> LightScore | None:
             views, baked = self._views.lit_test, self._views.test.light
-            return None if views is None or baked is None else score_model_light(model, views, baked[[0]])
+            return None if views is None or baked is None else score_model_light(model, views, baked[[0]], on_view)
 
         return _SystemResult(
             model.glb,

@@ -21,8 +21,6 @@ MOST_AVERAGED = 0.25
 
 # Defaults without a profile.
 _OPEN: dict[str, Any] = {"split": False, "material": "unlit", "textures": "png", "outline": "pieces"}
-# Programs that follow rays and cull no back faces.
-_TRACED: tuple[Profile, ...] = ("blender",)
 # Programs that rasterize sort blended geometry node by node, so they need split cards; Blender's Cycles finds the order by itself.
 _SORTS_NODES: dict[Profile, bool] = {"three": True, "babylon": True, "godot": True, "unity": True, "unreal": True, "blender": False}
 
@@ -88,13 +86,13 @@ class ExportConfig:
         """Whether a model with an alpha mode is read with mip levels."""
         if self.mipmaps is not None:
             return self.mipmaps
-        # Blender's Cycles has no mip levels.
-        return self.profile != "blender" and (alpha.kind != "mask" or alpha.cutoff <= MOST_AVERAGED)
+        # Path tracers have no mip levels.
+        return not self.traced and (alpha.kind != "mask" or alpha.cutoff <= MOST_AVERAGED)
 
     @property
     def traced(self) -> bool:
         """Whether the profile's program follows rays and culls nothing (:class:`~bbfit.geometry.cards.Cards`)."""
-        return self.profile in _TRACED
+        return self.profile == "blender"
 
     def resolve(self) -> ResolvedExport:
         """Fill in the choices that depend on the profile and on the installed encoders; a :class:`ResolvedExport` returns itself.

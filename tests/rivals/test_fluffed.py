@@ -30,7 +30,7 @@ def crossing(two_sided: bool) -> BillboardCloud:
 
 def normals(cloud: BillboardCloud) -> list[torch.Tensor]:
     """The normals in each texture, [S, 8, 8, 3]."""
-    return [texture[..., :3] for texture in cloud.textures(torch.nn.functional.pad(cloud.tangent_normals, (0, 1)))]
+    return cloud.textures(cloud.tangent_normals)
 
 
 def tangents(up: float = 0.0) -> torch.Tensor:
