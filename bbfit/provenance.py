@@ -22,7 +22,7 @@ VERSIONS: Mapping[str, int] = {
     "convert": 1,
     "views": 6,
     "budget": 10,
-    "fit": 21,
+    "fit": 22,
     "export": 9,
     "evaluate": 13,
     "report": 7,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
 from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.levels import Targets
@@ -66,14 +66,18 @@ def fit_maps(
     assert views.lit_train is not None and views.train.light is not None
     sunny = views.lit_train.under(*SUNNY)
     others = views.lit_train.other_suns(views.train.light[[0]]) or list(range(len(sunny)))
-    exposures, cloud = ViewSet.joined([views.train, sunny.take(others)]), cloud.to(config.device)
+    # Half of the exposures are in the baked light, however many suns there are.
+    own = list(range(len(views.train))) * max(1, round(len(others) / len(views.train)))
+    exposures, cloud = ViewSet.joined([views.train.take(own), sunny.take(others)]), cloud.to(config.device)
     assert exposures.light is not None
     texels, surface = baked_maps(cloud, views.lit_train, config.backend)
     shade, pull_back = _shading(config.backend)
     alpha = BLEND if config.alpha != "mask" else AlphaMode("mask", config.alpha_cutoff, math.inf, config.antialiased)
     passes: Any = pass_of(config)(cloud.without_textures(), Targets.at(exposures, 0), config, None, 1)
     base, maps = (passes.adam.start(passes.adam.padded(values)) for values in (texels, surface))
-    lights = [_padded(light, len(base.texels)) for light in texture_lights(cloud, exposures.cameras, exposures.light)]
+    lights = texture_lights(cloud, exposures.cameras, exposures.light)
+    texture = pad(lights[0].texture, (0, len(base.texels) - len(lights[0].texture)))  # one for all, because it is large
+    lights = [replace(light, texture=texture) for light in lights]
     gradient = torch.zeros_like(base.texels)
     for step in range(config.map_steps):
         rate = _LEARNING_RATE * 0.5 * (1 + math.cos(math.pi * step / config.map_steps))
@@ -159,13 +163,6 @@ def _sample(count: int, step: int, seed: int) -> list[int]:
     batch = min(_BATCH, count)
     batches = count // batch
     return np.random.default_rng([seed, step // batches, 1]).permutation(count)[step % batches * batch :][:batch].tolist()
-
-
-def _padded(light: TextureLight, count: int) -> TextureLight:
-    """The light for as many texels as an optimizer has, which may be more than a cloud has."""
-    texture = light.texture.new_zeros(count)
-    texture[: len(light.texture)] = light.texture
-    return replace(light, texture=texture)
 
 
 def _shading(backend: Backend) -> tuple[Callable[..., Tensor], Callable[..., None]]:
