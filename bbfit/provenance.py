@@ -26,7 +26,7 @@ VERSIONS: Mapping[str, int] = {
     "export": 9,
     "evaluate": 13,
     "report": 7,
-    "lod": 3,
+    "lod": 4,
     "compare": 5,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""

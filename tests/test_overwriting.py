@@ -70,7 +70,8 @@ def state(folder: Path) -> dict[str, str]:
 )
 def test_a_file_in_the_way_is_refused_at_once(folder: Path, command: str, file: str, capsys: pytest.CaptureFixture[str]) -> None:
     if command.endswith("--work ."):
-        (folder / "lod.json").write_text("mine")
+        (folder / "levels").mkdir()
+        (folder / "levels" / "lod.json").write_text("mine")
     if not file:
         (folder / "new_mip0.png").write_text("mine")
         file = "new_mip0.png"

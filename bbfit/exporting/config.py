@@ -141,6 +141,9 @@ class LodConfig:
     error_pixels: Annotated[float, Range(0, 100, open_low=True)] = 1.0
     """Largest error of a level's silhouette, gaps included, where the level takes over, in pixels of the screen.
     It holds for 95 % of the silhouette's pixels, in every training view."""
+    color_error: Annotated[float, Range(0, 1, open_low=True)] = 0.1
+    """Largest perceived difference (FLIP) of a level's colors where the level takes over, over its pixels, in every training view.
+    0.1 is that of two even colors of which one sees that they differ."""
     original: bool = True
     """Keep the tree itself as the finest level."""
     triangles: Count | None = None

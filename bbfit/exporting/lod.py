@@ -42,10 +42,22 @@ class LodLevel:
     """Smallest distance of the tree from the camera at which the level is shown, on the screen of the configuration."""
     screen_coverage: float
     """Smallest share of the screen that the tree's bounding sphere covers where the level is shown; 0 for the coarsest level."""
+    file: str
+    """Name of the level's own GLB file."""
+    silhouette_distance_meters: float
+    """Distance from which the error of its silhouette is within the bound."""
+    color_distance_meters: float
+    """Distance from which its colors are (:func:`bbfit.evaluation.color_error.color_error`)."""
+    color_error: float
+    """Error of its colors where the level takes over, in the worst training view, in [0, 1]; 0 for the tree itself."""
+    held_out_color_error: float
+    """The same error in the worst held-out view."""
 
 
-def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel]) -> bytes:
+def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel], profile: str | None = None) -> bytes:
     """Join GLB models, the finest first, into one GLB whose first node lists the others as its coarser levels; ``levels`` describes them.
+
+    For the ``profile`` babylon it is the first model alone: Babylon.js takes MSFT_lod for stages of loading, and may show two of them.
 
     The first model may be any file that :func:`is_self_contained` accepts, and keeps its items and their indices. The others are those of
     :func:`~bbfit.exporting.gltf.glb_bytes`.
@@ -55,6 +67,8 @@ def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel]) -> bytes:
     level (``MSFT_screencoverage``) and its smallest distance in meters (``lod_distances``).
     """
     assert len(models) == len(levels) > 0
+    if profile == "babylon":
+        models, levels = models[:1], levels[:1]
     tree, views = split_glb(models[0])
     roots = [_rooted(tree, levels[0].name, _scene(tree)["nodes"])]
     for level, model in zip(levels[1:], models[1:], strict=True):

@@ -24,7 +24,7 @@ from bbfit.stages.stage import RECORD_FILE
 from bbfit.viewing.levels import ViewerLevel
 from bbfit.viewing.originals import MAX_BYTES, Original, find_original
 
-LOD_FILE, CLOUD_FILE = "lod.json", "cloud.safetensors"
+LOD_FILE, CLOUD_FILE = "levels/lod.json", "cloud.safetensors"
 """Files of a folder of levels of detail and of a run's folder."""
 
 

@@ -496,7 +496,7 @@ _RECORDS: dict[str, Any] = {
     "pareto.json": _CHOICE,
     "run.json": _STAGES,
     "key.json": {"outcome": _OUTCOME},
-    "lod.json": _LOD,
+    "levels/lod.json": _LOD,
 }
 _RECORDS |= {".bbfit.json": {"written": {"a": {"by": "fit", "sha256": "0"}}, "begun": {"fit": ["b*"]}}, REQUEST_FILE: _request}
 
@@ -512,9 +512,8 @@ def _record(draw: st.DrawFn) -> Files:
     name = draw(st.sampled_from(list(_RECORDS)))
     valid = _RECORDS[name]() if callable(_RECORDS[name]) else _RECORDS[name]
     data = dumped(draw(documents(json.loads(json.dumps(valid)))))
-    more = (
-        {"2/cloud.safetensors": _cloud_file()} if name == "lod.json" else {"cloud.safetensors": _cloud_file()} if name == "run.json" else {}
-    )
+    clouds = {"levels/lod.json": "2/cloud.safetensors", "run.json": "cloud.safetensors"}
+    more = {clouds[name]: _cloud_file()} if name in clouds else {}
     return {
         **(views_files() if name == REQUEST_FILE else {}),
         name: draw(changed_bytes(data)) if draw(st.integers(0, 9)) == 0 else data,
@@ -531,7 +530,7 @@ def _read_record(folder: Path) -> None:
         Results(folder).get("key")
     elif (folder / REQUEST_FILE).is_file():
         ViewDataset.load(folder)
-    elif (folder / "lod.json").is_file():
+    elif (folder / "levels/lod.json").is_file():
         open_results(folder)
     else:
         record = Record(folder)

@@ -107,7 +107,8 @@ def lod_folder(folder: Path, cloud: BillboardCloud, *, original: bool = True) ->
         (folder / str(planes) / "run.json").write_text(json.dumps(record))
         levels.append({"planes": planes, "distance_meters": distance})
     config = {"screen_height": 2000, "screen_fov_degrees": 90.0}
-    (folder / "lod.json").write_text(json.dumps({"config": config, "levels": levels}))
+    (folder / "levels").mkdir()
+    (folder / "levels" / "lod.json").write_text(json.dumps({"config": config, "levels": levels}))
     return folder
 
 
@@ -127,7 +128,7 @@ def test_levels_of_detail_without_the_tree_begin_with_billboards(tmp_path: Path,
 @pytest.mark.parametrize("text", ["{", "{}", '{"config": {"screen_height": 1, "screen_fov_degrees": 50}, "levels": []}'])
 def test_damaged_levels_of_detail_are_an_error(tmp_path: Path, known_cloud: BillboardCloud, text: str) -> None:
     folder = lod_folder(tmp_path / "lod", known_cloud)
-    (folder / "lod.json").write_text(text)
+    (folder / "levels" / "lod.json").write_text(text)
     with pytest.raises(InputError, match=r"lod\.json"):
         open_results(folder)
 

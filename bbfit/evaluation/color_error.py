@@ -1,0 +1,60 @@
+"""How different a tree and its billboards look at a size on the screen, and the size from which nobody sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from bbfit.evaluation.backgrounds import mean_flip_map
+from bbfit.evaluation.scoring import held_out
+from bbfit.evaluation.sizes import shrunk
+from bbfit.geometry.camera import Camera
+from bbfit.views.view_set import ViewSet
+
+# FLIP's filters reach 10 pixels at 67 pixels a degree; so far, the background around the tree counts.
+_AROUND = 10
+# Sizes that are tried one after another.
+_STEP = 2**-0.25
+
+
+def color_error(target: Tensor, image: Tensor) -> float:
+    """Perceived difference of two premultiplied RGBA pictures [H, W, 4] at their size on the screen, in [0, 1]; 0 for two empty ones.
+
+    It is FLIP (:func:`~bbfit.evaluation.metrics.flip_map`), the mean over :data:`~bbfit.evaluation.backgrounds.BACKGROUNDS` and over the
+    pixels of the tree, each weighted by the larger alpha of both. FLIP is made for pictures that replace each other, as levels of detail
+    do. It filters them as the eye does, so that the difference of a small tree is faint.
+    """
+    target, image = (torch.nn.functional.pad(picture.double(), (0, 0, *[_AROUND] * 4)) for picture in (target, image))
+    weights = torch.maximum(target[..., 3], image[..., 3]).numpy()
+    total = float(weights.sum())
+    return float((mean_flip_map(target, image) * weights).sum()) / total if total else 0.0
+
+
+def worst_color(draw: Callable[[Camera], Tensor], views: ViewSet, share: float) -> float:
+    """The largest :func:`color_error` of a model in views that are reduced to a ``share`` of their size, in (0, 1]; 0 without views.
+
+    ``draw`` is as for :func:`~bbfit.evaluation.scoring.held_out`. Pictures are drawn at the views' size and averaged by area, as a screen
+    with many samples a pixel shows them.
+    """
+    pairs = (held_out(draw, views, index) for index in range(len(views)))
+    return max((color_error(*(_reduced(picture, share) for picture in pair)) for pair in pairs), default=0.0)
+
+
+def share_within(draw: Callable[[Camera], Tensor], views: ViewSet, most: float, share: float = 1.0) -> float:
+    """The largest share of the views' size, at most ``share``, at which no view's :func:`color_error` is above ``most``.
+
+    Each view begins at the size that all before it allow. This relies on smaller pictures differing less. Pictures of one pixel are taken
+    to differ by less than anybody sees.
+    """
+    for index in range(len(views)):
+        pair = held_out(draw, views, index)
+        while share * max(pair[0].shape[:2]) > 1 and color_error(*(_reduced(picture, share) for picture in pair)) > most:
+            share *= _STEP
+    return share
+
+
+def _reduced(picture: Tensor, share: float) -> Tensor:
+    height, width = (max(1, round(share * side)) for side in picture.shape[:2])
+    return shrunk(picture, width, height)

@@ -1,0 +1,109 @@
+"""Levels of detail in real programs, by the files that bbfit writes for them: each shows one level at a time, the one for the distance."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser_viewer import HERE, NODE, ORIGIN, TYPES
+from numpy.typing import NDArray
+from playwright.sync_api import Browser, Error, Page, Route
+
+from bbfit.exporting.config import ExportConfig, LodConfig
+from bbfit.exporting.lod import LodLevel, lod_glb
+from bbfit.exporting.lod_files import LOD_FILE, level_file, lod_document, program_files
+from bbfit.exporting.model import shipped_model
+from bbfit.geometry.cloud import BillboardCloud, even_upright
+
+# The page's screen: distances are for it, so that the scripts' conversion must be the identity or close to it.
+CONFIG = LodConfig(planes=(2, 1), screen_height=96, screen_width=96, screen_fov_degrees=2.0)
+DISTANCES = (0.0, 100.0, 200.0)
+BOUNDS = ((-1.0, 0.0, -1.0), (1.0, 2.0, 1.0))
+# Distances at which each level is shown alone, also where programs fade or measure from elsewhere.
+SHOWN = (90.0, 150.0, 300.0)
+
+
+def colored(channel: int) -> BillboardCloud:
+    """Two upright squares of 2 m that cross, opaque in one color."""
+    axis, sides = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([1.0, 1.0])
+    cloud = even_upright(2, axis=axis, half_extents=sides, texture_sizes=torch.tensor([16, 16]))
+    return cloud.with_texels(torch.eye(4)[[channel, 3]].sum(0).expand_as(cloud.texels))
+
+
+def levels_folder(folder: Path, profile: str) -> Path:
+    """A red, a green and a blue level."""
+    folder.mkdir()
+    models = [shipped_model(colored(channel), ExportConfig(alpha="mask")).glb for channel in range(3)]
+    levels = [
+        LodLevel(f"oak_LOD{n}", 2, 0, 0, 0, 0.0, 0.0, 0.0, None, None, distance, 0.5**n, level_file("oak", n), distance, 0.0, 0.0, 0.0)
+        for n, distance in enumerate(DISTANCES)
+    ]
+    document = lod_document("oak", levels, CONFIG, BOUNDS)
+    (folder / LOD_FILE).write_text(json.dumps(document))
+    for level, model in zip(levels, models, strict=True):
+        (folder / level.file).write_bytes(model)
+    for name, data in program_files(profile, document).items():
+        (folder / name).write_bytes(data)
+    (folder / "joined.glb").write_bytes(lod_glb(models, levels))
+    (folder / "babylon.glb").write_bytes(lod_glb(models, levels, "babylon"))
+    return folder
+
+
+class Levels:
+    """A page that shows a folder of levels in a program."""
+
+    def __init__(self, browser: Browser, thread: ThreadPoolExecutor, folder: Path, query: str) -> None:
+        self._thread, self._errors = thread, list[str]()
+        self._page = thread.submit(self._open, browser, folder, query).result()
+
+    def _open(self, browser: Browser, folder: Path, query: str) -> Page:
+        page = browser.new_page()
+        page.on("pageerror", lambda error: self._errors.append(str(error)))
+        page.on("console", lambda message: self._errors.append(message.text) if message.type == "error" else None)
+        page.route("**/*", lambda route: _answer(route, folder))
+        page.goto(f"{ORIGIN}/lod.html?{query}")
+        return page
+
+    def shares(self, distance: float) -> NDArray[np.float64]:
+        """Shares of the picture that are red, green and blue at a distance."""
+        try:
+            values = self._thread.submit(self._page.evaluate, "distance => window.look(distance)", distance).result()
+        except Error as error:
+            raise AssertionError(self._errors) from error
+        assert not self._errors, self._errors
+        bright = np.array(values, np.uint8).reshape(96, 96, 4)[..., :3] > 100
+        assert bright.sum(-1).max() == 1, "one color in each pixel"
+        return bright.mean((0, 1))
+
+    def close(self) -> None:
+        """Close the page."""
+        self._thread.submit(self._page.close).result()
+
+
+def _answer(route: Route, folder: Path) -> None:
+    path = route.request.url.removeprefix(f"{ORIGIN}/").partition("?")[0]
+    kind, _, name = path.partition("/")
+    file = {"levels": folder / name, "node_modules": NODE / path}.get(kind, HERE / path)
+    if file.is_file():
+        route.fulfill(path=file, content_type=TYPES.get(file.suffix, "application/octet-stream"))
+    else:
+        route.abort()
+
+
+def share(distance: float) -> float:
+    """Share of the picture that a square of 2 m covers at a distance."""
+    return (2.0 * 48 / np.tan(np.radians(1)) / distance / 96) ** 2
+
+
+@pytest.mark.parametrize("program", ["three", "babylon", "playcanvas", "cesium"])
+def test_programs_show_the_level_of_the_distance_alone(program: str, chromium: tuple[Browser, ThreadPoolExecutor], tmp_path: Path) -> None:
+    with closing(Levels(*chromium, levels_folder(tmp_path / "levels", program), f"program={program}")) as page:
+        for distance in (*SHOWN, *SHOWN[::-1]):
+            found, level = page.shares(distance), sum(distance >= start for start in DISTANCES) - 1
+            assert found[level] == pytest.approx(share(distance), rel=0.15)
+            assert found.sum() == found[level]
