@@ -33,6 +33,8 @@ ORIGINAL = "original.glb"
 """The file of the converted tree."""
 LEVELS = "levels"
 """The folder of the levels' files and their description."""
+# Profiles whose program loads no model with KTX2 textures, although there is a PNG beside them, unless it is given a decoder.
+_WITHOUT_KTX2: frozenset[str | None] = frozenset({"playcanvas"})
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ def build_lod(
     inversely proportional to the distance. The colors must look the same too: the error of the worst training view at its size on the
     screen (:func:`~bbfit.evaluation.color_error.color_error`) is at most ``config.color_error``. No level is shown larger than the views
     of its fit. The textures of a level have the resolution of the screen at its distance. The default format of textures is ``auto``: KTX2
-    with mip levels if its encoder is installed, and PNG.
+    with mip levels if its encoder is installed, and PNG; for PlayCanvas it is PNG.
 
     A killed build continues where it stopped. Stages with current results are skipped.
 
@@ -122,7 +124,7 @@ def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: R
     runs = [_fitted(folder, stages, planes, on_progress) for planes in config.planes]
     export = export_config(views, stages.export)
     if export.textures is None:
-        export = replace(export, textures="auto")  # distant levels need mip levels
+        export = replace(export, textures="png" if export.profile in _WITHOUT_KTX2 else "auto")  # distant levels need mip levels
     record.run(_join_stage(folder, out, original, runs, views, config, export), on_progress)
     description = folder / LEVELS / LOD_FILE
     stored = read_json("levels of detail", description)

@@ -276,8 +276,9 @@ def lod_command(
     export: ExportConfig = ExportConfig(),  # noqa: B008
     limits: InputLimits = InputLimits(),  # noqa: B008
 ) -> None:
-    """Make levels of detail: the tree and fewer and fewer billboards in one GLB, with the distance from which each looks the same.
+    """Make levels of detail: the tree and fewer and fewer billboards, with the distance from which each looks the same.
 
+    They come in one GLB, and as a file each with lod.json, which describes them, and with --profile what that program needs to switch.
     Interrupted and started again, it resumes where it stopped.
 
     For example: bbfit lod tree.glb --out lod.glb
@@ -285,7 +286,7 @@ def lod_command(
     Args:
         tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
         out: The file, ending in .glb.
-        work: Folder for views, a run for each level, lod.json and lod.png. Default: the file without its ending.
+        work: Folder for views, a run for each level, the levels' files and lod.png. Default: the file without its ending.
         seed: Seed of all stages; --views.seed and --fit.seed override it for one of them.
         lod: The levels.
         views: How the tree is rendered.
@@ -293,7 +294,7 @@ def lod_command(
         export: How they are written.
         limits: What the tree and the views may refer to, and how large they may be.
     """
-    from bbfit.lod import build_lod
+    from bbfit.lod import LEVELS, build_lod
     from bbfit.pipeline import RunConfig
     from bbfit.reporting.tables import lod_table
 
@@ -303,5 +304,6 @@ def lod_command(
     out_console.print(lod_table(result.levels))
     show_missing_encoder(export)
     out_console.print(
-        f"levels of detail in {result.path}, {result.path.stat().st_size:,} bytes; measures in {result.folder}", soft_wrap=True
+        f"levels of detail in {result.path}, {result.path.stat().st_size:,} bytes; one by one with lod.json in {result.folder / LEVELS}",
+        soft_wrap=True,
     )

@@ -25,6 +25,10 @@ def color_error(target: Tensor, image: Tensor) -> float:
     It is FLIP (:func:`~bbfit.evaluation.metrics.flip_map`), the mean over :data:`~bbfit.evaluation.backgrounds.BACKGROUNDS` and over the
     pixels of the tree, each weighted by the larger alpha of both. FLIP is made for pictures that replace each other, as levels of detail
     do. It filters them as the eye does, so that the difference of a small tree is faint.
+
+    What is visible? Measured on 60 pairs of even colors of leaves and bark: pairs 2.3 dE*ab apart, just noticeable (Mahy et al. 1994,
+    "Evaluation of uniform color spaces developed after the adoption of CIELAB and CIELUV"), have a mean of 0.10; 3 dE, hardly perceptible,
+    0.11; 6 dE, the end of what is acceptable side by side (Hardeberg 1999, "Acquisition and reproduction of colour images"), 0.19.
     """
     target, image = (torch.nn.functional.pad(picture.double(), (0, 0, *[_AROUND] * 4)) for picture in (target, image))
     weights = torch.maximum(target[..., 3], image[..., 3]).numpy()

@@ -134,16 +134,16 @@ class ResolvedExport(ExportConfig):
 
 @dataclass(frozen=True)
 class LodConfig:
-    """How a tree and billboard clouds of it become levels of detail in one file."""
+    """How a tree and billboard clouds of it become levels of detail."""
 
     planes: tuple[Count, ...] = (16, 8, 4, 2)
     """Number of billboards of each level, the finest first."""
     error_pixels: Annotated[float, Range(0, 100, open_low=True)] = 1.0
     """Largest error of a level's silhouette, gaps included, where the level takes over, in pixels of the screen.
     It holds for 95 % of the silhouette's pixels, in every training view."""
-    color_error: Annotated[float, Range(0, 1, open_low=True)] = 0.1
-    """Largest perceived difference (FLIP) of a level's colors where the level takes over, over its pixels, in every training view.
-    0.1 is that of two even colors of which one sees that they differ."""
+    color_error: Annotated[float, Range(0, 1, open_low=True)] = 0.2
+    """Largest perceived difference (FLIP) of a level's pixels where the level takes over, in every training view, in (0, 1].
+    Even colors side by side have 0.1 where the difference is just noticeable, 0.2 where it is no longer acceptable."""
     original: bool = True
     """Keep the tree itself as the finest level."""
     triangles: Count | None = None

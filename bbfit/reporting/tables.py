@@ -126,13 +126,19 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
 
 
 def lod_table(levels: Sequence[LodLevel]) -> Table:
-    """A ``rich`` table of levels of detail: costs, distance and error of each."""
-    table = _table(["level"], ["planes", "vertices", "bytes", "from, m", "tree, px", "error, px", "held out"], no_wrap=True)
+    """A ``rich`` table of levels of detail: costs, the distance of each and those that silhouette and colors ask for, and errors."""
+    columns = ["planes", "vertices", "bytes", "from, m", "silhouette", "colors", "tree, px", "error, px", "FLIP"]
+    table = _table(["level"], columns, no_wrap=True)
+    table.caption, table.caption_justify = "silhouette and colors: the distance, m, that each asks for; errors in (held-out) views", "left"
     for level in levels:
-        below = "-" if level.tree_pixels is None else f"{level.tree_pixels:.0f}"
-        errors = ["-"] * 2 if level.planes is None else [f"{level.error_pixels:.2f}", f"{level.held_out_error_pixels:.2f}"]
-        counts = ["tree" if level.planes is None else str(level.planes), _count(level.vertices), _count(level.bytes)]
-        table.add_row(level.name.rsplit("_", 1)[-1], *counts, f"{level.distance_meters:.1f}", below, *errors)
+        costs = ["tree" if level.planes is None else str(level.planes), _count(level.vertices), _count(level.bytes)]
+        cells = [f"{level.distance_meters:.1f}", *["-"] * 5]
+        if level.planes is not None:
+            below = "-" if level.tree_pixels is None else f"{level.tree_pixels:.0f}"
+            reasons = [f"{level.silhouette_distance_meters:.1f}", f"{level.color_distance_meters:.1f}", below]
+            silhouette = f"{level.error_pixels:.2f} ({level.held_out_error_pixels:.2f})"
+            cells[1:] = [*reasons, silhouette, f"{level.color_error:.2f} ({level.held_out_color_error:.2f})"]
+        table.add_row(level.name.rsplit("_", 1)[-1], *costs, *cells)
     return table
 
 

@@ -14,6 +14,7 @@ from PIL import Image
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import InputError
+from bbfit.evaluation.color_error import worst_color
 from bbfit.evaluation.metrics import silhouette_distance
 from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.config import ExportConfig, LodConfig
@@ -89,6 +90,21 @@ def test_levels_take_over_where_their_error_is_within_the_bound(built: LodResult
     assert before.screen_coverage == 0
 
 
+def test_colors_count_too(built: LodResult) -> None:
+    """The distance is the larger of both, or that of the views' size; from there on, the colors of no training view are further off."""
+    views = ViewDataset.load(built.folder / "views")
+    assert views.request and views.request.camera
+    focal, axis = 1080 / 2 / np.tan(np.radians(25)), views.request.camera["distance"]
+    scale = float(views.train.cameras.intrinsics[0, 0, 0]) / axis
+    least = focal / scale
+    for level in built.levels[1:]:
+        draw = shipped_model(BillboardCloud.load(built.folder / str(level.planes) / "cloud.safetensors")).draw
+        least = max(least, level.silhouette_distance_meters, level.color_distance_meters)
+        assert level.distance_meters == pytest.approx(least, rel=1e-6)
+        errors = [worst_color(draw, split, focal / level.distance_meters / scale) for split in (views.train, views.test)]
+        assert (level.color_error, level.held_out_color_error) == pytest.approx(errors, rel=0.05) and 0 < errors[0] <= LEVELS.color_error
+
+
 def test_textures_are_as_fine_as_the_screen_shows(built: LodResult) -> None:
     """One to two texels a pixel where the level takes over, by the file alone, as textures are halved."""
     tree, views = split_glb(built.path.read_bytes())
@@ -111,9 +127,17 @@ def test_textures_are_as_fine_as_the_screen_shows(built: LodResult) -> None:
         assert 0.95 < texels_a_pixel.min() and texels_a_pixel.max() < 2.05
 
 
-def test_what_was_measured_is_written_down(built: LodResult) -> None:
-    told = json.loads((built.folder / "lod.json").read_text())
+def test_what_was_measured_is_written_down_beside_a_file_for_each_level(built: LodResult) -> None:
+    folder = built.folder / "levels"
+    told = json.loads((folder / "lod.json").read_text())
     assert [LodLevel(**level) for level in told["levels"]] == list(built.levels) and told["config"]["error_pixels"] == 0.5
+    points = trimesh.load(TREE, force="mesh").vertices
+    np.testing.assert_allclose([told["extent"]["low"], told["extent"]["high"]], [points.min(0), points.max(0)], atol=1e-3)
+    assert sorted(path.name for path in folder.iterdir()) == ["lod.json", *(level.file for level in built.levels)]
+    assert (folder / "oak_LOD0.glb").read_bytes() == TREE.read_bytes()
+    for level in built.levels:
+        data = (folder / level.file).read_bytes()
+        assert glb_counts(data) == (level.vertices, level.triangles) and len(data) == level.bytes
     picture = np.asarray(Image.open(built.folder / "lod.png"))
     assert picture.shape[1] > picture.shape[0] * 0.8 and np.ptp(picture) > 100
 
@@ -132,6 +156,22 @@ def test_without_the_tree_the_finest_cloud_is_shown_from_the_start(built: LodRes
     assert [level.planes for level in result.levels] == [4, 2] and result.levels[0].distance_meters == 0
     assert result.levels[1].distance_meters == built.levels[2].distance_meters
     assert result.path.stat().st_size < built.path.stat().st_size - TREE.stat().st_size / 2
+
+
+def test_a_profile_adds_what_its_program_needs(built: LodResult, tmp_path: Path) -> None:
+    """Beside other levels in the same folder, and without replacing a file of the user."""
+    config = replace(SMALL, export=ExportConfig(profile="babylon", textures="png"))
+    (script := built.folder / "levels" / "lod_babylon.js").write_text("mine")
+    with pytest.raises(InputError, match=r"lod_babylon\.js exists, and is a file that bbfit did not write"):
+        build_lod(TREE, tmp_path / "oak.glb", LEVELS, config, work=built.folder)
+    script.unlink()
+    strict = replace(LEVELS, color_error=0.02)
+    result = build_lod(TREE, tmp_path / "oak.glb", strict, config, work=built.folder)
+    finer, level = built.levels[1], result.levels[1]
+    assert level.distance_meters == level.color_distance_meters > level.silhouette_distance_meters == finer.silhouette_distance_meters
+    assert "addLODLevel" in script.read_text()
+    tree, _ = split_glb(result.path.read_bytes())  # Babylon.js shows several levels of one GLB at once
+    assert "MSFT_lod" not in tree.get("extensionsUsed", []) and glb_counts(result.path.read_bytes()) == glb_counts(TREE.read_bytes())
 
 
 def test_a_thinned_tree_goes_through_blender(built: LodResult) -> None:

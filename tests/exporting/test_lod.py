@@ -21,7 +21,7 @@ from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.model import export, shipped_model
 from bbfit.geometry.cloud import BillboardCloud
 
-BLANK = LodLevel("", 1, 0, 0, 0, 0.1, 1.0, 1.0, 20.0, 50.0, 10.0, 0.0)
+BLANK = LodLevel("", 1, 0, 0, 0, 0.1, 1.0, 1.0, 20.0, 50.0, 10.0, 0.0, "", 10.0, 5.0, 0.05, 0.06)
 CONFIGS = (
     ExportConfig(alpha="blend", split=True),
     ExportConfig(textures="webp", fallback=False),

@@ -4,7 +4,8 @@ const SIZE = 96;
 const FOV = 2;
 const center = [0, 1, 0];
 const canvas = document.getElementById("canvas");
-const program = new URLSearchParams(location.search).get("program");
+const query = new URLSearchParams(location.search);
+const program = query.get("program");
 
 const programs = {
   async three() {
@@ -34,9 +35,9 @@ const programs = {
     scene.clearColor = new Color4(0, 0, 0, 1);
     const camera = new FreeCamera("camera", Vector3.Zero(), scene);
     Object.assign(camera, { fov: (FOV * Math.PI) / 180, minZ: 1, maxZ: 10000 });
-    if (new URLSearchParams(location.search).has("joined")) {
+    if (query.has("joined")) {
       const { LoadAssetContainerAsync } = await at("Loading/sceneLoader");
-      (await LoadAssetContainerAsync("/levels/joined.glb", scene)).addAllToScene();
+      (await LoadAssetContainerAsync(`/levels/${query.get("joined")}`, scene)).addAllToScene();
     } else {
       await (await import("/levels/lod_babylon.js")).loadLod("/levels/lod.json", scene, { height: SIZE, fov: camera.fov });
     }

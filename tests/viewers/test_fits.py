@@ -154,7 +154,7 @@ def test_three_shows_each_level_of_detail_as_its_own_file(
     """Levels are nodes, the coarser ones beside the scene, which alone is shown by itself."""
     paths = [files["mask"], files["blend"]]
     coverages = {"tree_LOD0": 0.1, "tree_LOD1": 0.0}
-    levels = [LodLevel(name, 4, 0, 0, 0, 0.0, 0.0, 0.0, None, 0.0, None, coverage) for name, coverage in coverages.items()]
+    levels = [LodLevel(name, 4, 0, 0, 0, *[0.0] * 6, coverage, "", *[0.0] * 4) for name, coverage in coverages.items()]
     (both := tmp_path / "both.glb").write_bytes(lod_glb([path.read_bytes() for path in paths], levels))
     alone = [three.render(path, views.test.cameras) for path in paths]
     np.testing.assert_array_equal(three.render(both, views.test.cameras), alone[0])

@@ -20,25 +20,28 @@ from bbfit.exporting.lod_files import LOD_FILE, level_file, lod_document, progra
 from bbfit.exporting.model import shipped_model
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 
-# The page's screen: distances are for it, so that the scripts' conversion must be the identity or close to it.
+SUFFIXES = TYPES | {".mjs": TYPES[".js"]}
+# The page's screen, for which the distances are.
 CONFIG = LodConfig(planes=(2, 1), screen_height=96, screen_width=96, screen_fov_degrees=2.0)
 DISTANCES = (0.0, 100.0, 200.0)
 BOUNDS = ((-1.0, 0.0, -1.0), (1.0, 2.0, 1.0))
+# In meters. Coarser levels are larger, so that each would be seen behind another.
+SIDES = (2.0, 2.2, 2.4)
 # Distances at which each level is shown alone, also where programs fade or measure from elsewhere.
 SHOWN = (90.0, 150.0, 300.0)
 
 
-def colored(channel: int) -> BillboardCloud:
-    """Two upright squares of 2 m that cross, opaque in one color."""
-    axis, sides = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([1.0, 1.0])
-    cloud = even_upright(2, axis=axis, half_extents=sides, texture_sizes=torch.tensor([16, 16]))
+def colored(channel: int, side: float) -> BillboardCloud:
+    """Two upright squares that cross, opaque in one color."""
+    axis, half = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([side / 2, side / 2])
+    cloud = even_upright(2, axis=axis, half_extents=half, texture_sizes=torch.tensor([16, 16]))
     return cloud.with_texels(torch.eye(4)[[channel, 3]].sum(0).expand_as(cloud.texels))
 
 
-def levels_folder(folder: Path, profile: str) -> Path:
+def levels_folder(folder: Path, profile: str, sides: tuple[float, float, float] = SIDES) -> Path:
     """A red, a green and a blue level."""
     folder.mkdir()
-    models = [shipped_model(colored(channel), ExportConfig(alpha="mask")).glb for channel in range(3)]
+    models = [shipped_model(colored(channel, side), ExportConfig(alpha="mask")).glb for channel, side in enumerate(sides)]
     levels = [
         LodLevel(f"oak_LOD{n}", 2, 0, 0, 0, 0.0, 0.0, 0.0, None, None, distance, 0.5**n, level_file("oak", n), distance, 0.0, 0.0, 0.0)
         for n, distance in enumerate(DISTANCES)
@@ -90,14 +93,14 @@ def _answer(route: Route, folder: Path) -> None:
     kind, _, name = path.partition("/")
     file = {"levels": folder / name, "node_modules": NODE / path}.get(kind, HERE / path)
     if file.is_file():
-        route.fulfill(path=file, content_type=TYPES.get(file.suffix, "application/octet-stream"))
+        route.fulfill(path=file, content_type=SUFFIXES.get(file.suffix, "application/octet-stream"))
     else:
         route.abort()
 
 
-def share(distance: float) -> float:
-    """Share of the picture that a square of 2 m covers at a distance."""
-    return (2.0 * 48 / np.tan(np.radians(1)) / distance / 96) ** 2
+def share(distance: float, side: float = 2.0) -> float:
+    """Share of the picture that a square covers at a distance."""
+    return (side * 48 / np.tan(np.radians(1)) / distance / 96) ** 2
 
 
 @pytest.mark.parametrize("program", ["three", "babylon", "playcanvas", "cesium"])
@@ -105,5 +108,25 @@ def test_programs_show_the_level_of_the_distance_alone(program: str, chromium: t
     with closing(Levels(*chromium, levels_folder(tmp_path / "levels", program), f"program={program}")) as page:
         for distance in (*SHOWN, *SHOWN[::-1]):
             found, level = page.shares(distance), sum(distance >= start for start in DISTANCES) - 1
-            assert found[level] == pytest.approx(share(distance), rel=0.15)
+            assert found[level] == pytest.approx(share(distance, SIDES[level]), rel=0.15)
             assert found.sum() == found[level]
+
+
+def test_levels_fade_into_each_other_in_three(chromium: tuple[Browser, ThreadPoolExecutor], tmp_path: Path) -> None:
+    """Half of the way through the fade, which is a tenth of the distance, each shows about half of the pixels and none is left out."""
+    with closing(Levels(*chromium, levels_folder(tmp_path / "levels", "three", (2.0, 2.0, 2.0)), "program=three")) as page:
+        for portion in (0.25, 0.5, 0.75):
+            distance = 100.0 * (1 + 0.1 * portion)
+            red, green, blue = page.shares(distance)
+            assert red + green == pytest.approx(share(distance), rel=0.1) and blue == 0
+            assert green / (red + green) == pytest.approx(portion, abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["joined.glb", "babylon.glb"])
+def test_babylon_never_switches_levels_of_one_file(name: str, chromium: tuple[Browser, ThreadPoolExecutor], tmp_path: Path) -> None:
+    """Its loader takes the levels of MSFT_lod for stages of loading; with the profile there are none, so it cannot show two of them."""
+    folder = levels_folder(tmp_path / "levels", "babylon")
+    assert (b"MSFT_lod" in (folder / name).read_bytes()) == (name == "joined.glb")
+    with closing(Levels(*chromium, folder, f"program=babylon&joined={name}")) as page:
+        for distance in SHOWN:
+            assert page.shares(distance)[0] == pytest.approx(share(distance), rel=0.15)
