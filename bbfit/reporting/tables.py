@@ -127,17 +127,16 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
 
 def lod_table(levels: Sequence[LodLevel]) -> Table:
     """A ``rich`` table of levels of detail: costs, the distance of each and those that silhouette and colors ask for, and errors."""
-    columns = ["planes", "vertices", "bytes", "from, m", "silhouette", "colors", "tree, px", "error, px", "FLIP"]
+    columns = ["planes", "vertices", "bytes", "from, m", "outline", "colors", "tree, px", "error, px", "FLIP"]
     table = _table(["level"], columns, no_wrap=True)
-    table.caption, table.caption_justify = "silhouette and colors: the distance, m, that each asks for; errors in (held-out) views", "left"
+    table.caption, table.caption_justify = "outline, colors: the distance that each asks for, in meters", "left"
     for level in levels:
         costs = ["tree" if level.planes is None else str(level.planes), _count(level.vertices), _count(level.bytes)]
         cells = [f"{level.distance_meters:.1f}", *["-"] * 5]
         if level.planes is not None:
+            asked = [f"{distance:.1f}" for distance in (level.silhouette_distance_meters, level.color_distance_meters)]
             below = "-" if level.tree_pixels is None else f"{level.tree_pixels:.0f}"
-            reasons = [f"{level.silhouette_distance_meters:.1f}", f"{level.color_distance_meters:.1f}", below]
-            silhouette = f"{level.error_pixels:.2f} ({level.held_out_error_pixels:.2f})"
-            cells[1:] = [*reasons, silhouette, f"{level.color_error:.2f} ({level.held_out_color_error:.2f})"]
+            cells[1:] = [*asked, below, f"{level.error_pixels:.2f}", f"{level.color_error:.2f}"]
         table.add_row(level.name.rsplit("_", 1)[-1], *costs, *cells)
     return table
 

@@ -22,13 +22,7 @@ HERE = Path(__file__).parent
 NODE = HERE.parent / "node"
 # No such host: every request is answered from the disk.
 ORIGIN = "https://viewer.invalid"
-TYPES = {
-    ".html": "text/html",
-    ".js": "text/javascript",
-    ".mjs": "text/javascript",
-    ".wasm": "application/wasm",
-    ".glb": "model/gltf-binary",
-}
+TYPES = {".html": "text/html", ".js": "text/javascript", ".wasm": "application/wasm", ".glb": "model/gltf-binary"}
 # OpenCV's camera axes to OpenGL's: +Y up, -Z forward.
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
