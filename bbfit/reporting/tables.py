@@ -127,9 +127,10 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
 
 def lod_table(levels: Sequence[LodLevel]) -> Table:
     """A ``rich`` table of levels of detail: costs, the distance of each and those that silhouette and colors ask for, and errors."""
-    columns = ["planes", "vertices", "bytes", "from, m", "outline", "colors", "tree, px", "error, px", "FLIP"]
+    columns = ["planes", "vertices", "bytes", "from, m", "outline", "colors", "px", "error", "FLIP"]
     table = _table(["level"], columns, no_wrap=True)
-    table.caption, table.caption_justify = "outline, colors: the distance that each asks for, in meters", "left"
+    table.caption = "outline, colors: distances that they ask for, m; px: height of the tree; error: of the outline, px"
+    table.caption_justify = "left"
     for level in levels:
         costs = ["tree" if level.planes is None else str(level.planes), _count(level.vertices), _count(level.bytes)]
         cells = [f"{level.distance_meters:.1f}", *["-"] * 5]
