@@ -10,7 +10,7 @@ from pathlib import Path
 
 from bbfit.blender.requirements import check_blender
 from bbfit.checks import check_output_file, check_record, fail
-from bbfit.evaluation.color_error import share_within, worst_color
+from bbfit.evaluation.color_error import mean_color_error, share_within
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
@@ -65,8 +65,8 @@ def build_lod(
 
     Each level replaces the next finer one at the distance from which its error stays below ``config.error_pixels``. The error is that of
     its silhouette in the worst training view, in meters at the tree's axis, with a margin for the views in between. In pixels, it is
-    inversely proportional to the distance. The colors must look the same too: the error of the worst training view at its size on the
-    screen (:func:`~bbfit.evaluation.color_error.color_error`) is at most ``config.color_error``. No level is shown larger than the views
+    inversely proportional to the distance. The colors must look the same too: their mean error at the size on the
+    screen (:func:`~bbfit.evaluation.color_error.mean_color_error`) is at most ``config.color_error`` in the training views. No level is shown larger than the views
     of its fit. The textures of a level have the resolution of the screen at its distance. The default format of textures is ``auto``: KTX2
     with mip levels if its encoder is installed, and PNG; for PlayCanvas it is PNG.
 
@@ -186,7 +186,7 @@ class _Switch:
     errors: tuple[float, float] = (0.0, 0.0)
     """The error of its silhouette in the worst training view and in the worst held-out view, in meters."""
     color_errors: tuple[float, float] = (0.0, 0.0)
-    """The error of its colors at ``scale`` in the same views."""
+    """The mean error of its colors at ``scale`` in the training views and in the held-out views."""
     halvings: int = 0
     """How many times its textures can be halved and still have a texel for each pixel at that scale."""
 
@@ -222,7 +222,7 @@ def _switches(views: ViewDataset, runs: list[RunResult], config: LodConfig, on_l
         silhouette = scale_within(error, config.error_pixels)
         color = view_scale * share_within(draw, views.train, config.color_error)
         scale = min([view_scale, silhouette, color, *(switch.scale for switch in switches)])
-        colors, held_out_colors = (worst_color(draw, split, scale / view_scale) for split in splits)
+        colors, held_out_colors = (mean_color_error(draw, split, scale / view_scale) for split in splits)
         halvings = max(0, math.floor(math.log2(fitted.cloud.texel_density / scale)))
         switches.append(_Switch(scale, silhouette, color, (error, held_out_error), (colors, held_out_colors), halvings))
         on_level(len(switches))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left
 from collections.abc import Callable
 
 import torch
@@ -15,8 +17,8 @@ from bbfit.views.view_set import ViewSet
 
 # FLIP's filters reach 10 pixels at 67 pixels a degree; so far, the background around the tree counts.
 _AROUND = 10
-# Sizes that are tried one after another.
-_STEP = 2**-0.25
+# Most views to compare, and the ratio of neighboring sizes.
+_VIEWS, _STEP = 24, 2**0.25
 
 
 def color_error(target: Tensor, image: Tensor) -> float:
@@ -36,27 +38,26 @@ def color_error(target: Tensor, image: Tensor) -> float:
     return float((mean_flip_map(target, image) * weights).sum()) / total if total else 0.0
 
 
-def worst_color(draw: Callable[[Camera], Tensor], views: ViewSet, share: float) -> float:
-    """The largest :func:`color_error` of a model in views that are reduced to a ``share`` of their size, in (0, 1]; 0 without views.
+def mean_color_error(draw: Callable[[Camera], Tensor], views: ViewSet, share: float) -> float:
+    """The mean :func:`color_error` of a model in views that are reduced to a ``share`` of their size, in (0, 1]; 0 without views.
 
-    ``draw`` is as for :func:`~bbfit.evaluation.scoring.held_out`. Pictures are drawn at the views' size and averaged by area, as a screen
-    with many samples a pixel shows them.
+    At most 24 views count, evenly spaced. ``draw`` is as for :func:`~bbfit.evaluation.scoring.held_out`. Pictures are drawn at the views'
+    size and averaged by area, as a screen with many samples a pixel shows them.
     """
-    pairs = (held_out(draw, views, index) for index in range(len(views)))
-    return max((color_error(*(_reduced(picture, share) for picture in pair)) for pair in pairs), default=0.0)
+    count = min(_VIEWS, len(views))
+    pairs = (held_out(draw, views, number * len(views) // count) for number in range(count))
+    return sum(color_error(*(_reduced(picture, share) for picture in pair)) for pair in pairs) / max(1, count)
 
 
 def share_within(draw: Callable[[Camera], Tensor], views: ViewSet, most: float, share: float = 1.0) -> float:
-    """The largest share of the views' size, at most ``share``, at which no view's :func:`color_error` is above ``most``.
+    """The largest share of the views' size, at most ``share``, at which the mean :func:`color_error` is at most ``most``.
 
-    Each view begins at the size that all before it allow. This relies on smaller pictures differing less. Pictures of one pixel are taken
-    to differ by less than anybody sees.
+    Shares are a fourth root of 2 apart. This relies on smaller pictures differing less. Pictures of one pixel are taken to differ by less
+    than anybody sees.
     """
-    for index in range(len(views)):
-        pair = held_out(draw, views, index)
-        while share * max(pair[0].shape[:2]) > 1 and color_error(*(_reduced(picture, share) for picture in pair)) > most:
-            share *= _STEP
-    return share
+    side = max(views.cameras.width, views.cameras.height)
+    steps = range(max(0, math.ceil(math.log(share * side, _STEP))))
+    return share / _STEP ** bisect_left(steps, True, key=lambda step: mean_color_error(draw, views, share / _STEP**step) <= most)
 
 
 def _reduced(picture: Tensor, share: float) -> Tensor:

@@ -142,7 +142,7 @@ class LodConfig:
     """Largest error of a level's silhouette, gaps included, where the level takes over, in pixels of the screen.
     It holds for 95 % of the silhouette's pixels, in every training view."""
     color_error: Annotated[float, Range(0, 1, open_low=True)] = 0.2
-    """Largest perceived difference (FLIP) of a level's pixels where the level takes over, in every training view, in (0, 1].
+    """Largest perceived difference (FLIP) of a level's pixels where the level takes over, the mean over training views, in (0, 1].
     Even colors side by side have 0.1 where the difference is just noticeable, 0.2 where it is no longer acceptable."""
     original: bool = True
     """Keep the tree itself as the finest level."""

@@ -47,11 +47,11 @@ class LodLevel:
     silhouette_distance_meters: float
     """Distance from which the error of its silhouette is within the bound."""
     color_distance_meters: float
-    """Distance from which its colors are (:func:`bbfit.evaluation.color_error.color_error`)."""
+    """Distance from which its colors are (:func:`bbfit.evaluation.color_error.mean_color_error`)."""
     color_error: float
-    """Error of its colors where the level takes over, in the worst training view, in [0, 1]; 0 for the tree itself."""
+    """Mean error of its colors in the training views where the level takes over, in [0, 1]; 0 for the tree itself."""
     held_out_color_error: float
-    """The same error in the worst held-out view."""
+    """The same error in the held-out views."""
 
 
 def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel], profile: str | None = None) -> bytes:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import InputError
-from bbfit.evaluation.color_error import worst_color
+from bbfit.evaluation.color_error import mean_color_error
 from bbfit.evaluation.metrics import silhouette_distance
 from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.config import ExportConfig, LodConfig
@@ -101,7 +101,7 @@ def test_colors_count_too(built: LodResult) -> None:
         draw = shipped_model(BillboardCloud.load(built.folder / str(level.planes) / "cloud.safetensors")).draw
         least = max(least, level.silhouette_distance_meters, level.color_distance_meters)
         assert level.distance_meters == pytest.approx(least, rel=1e-6)
-        errors = [worst_color(draw, split, focal / level.distance_meters / scale) for split in (views.train, views.test)]
+        errors = [mean_color_error(draw, split, focal / level.distance_meters / scale) for split in (views.train, views.test)]
         assert (level.color_error, level.held_out_color_error) == pytest.approx(errors, rel=0.05) and 0 < errors[0] <= LEVELS.color_error
 
 

@@ -10,7 +10,7 @@ import torch
 from skimage.color import lab2rgb
 from torch import Tensor
 
-from bbfit.evaluation.color_error import color_error, share_within, worst_color
+from bbfit.evaluation.color_error import color_error, mean_color_error, share_within
 from bbfit.evaluation.metrics import silhouette_distance
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.orbit import Orbit
@@ -69,11 +69,11 @@ def test_colors_count_although_the_silhouette_is_the_same() -> None:
 
 def test_the_share_is_the_largest_at_which_no_view_differs_visibly(views: ViewSet) -> None:
     draw = drawn([disc(seed) for seed in (0, 7, 8)], views)  # the first is as it should be
-    errors = [worst_color(draw, views, share) for share in (1.0, 0.5, 0.25)]
+    errors = [mean_color_error(draw, views, share) for share in (1.0, 0.5, 0.25)]
     assert errors[0] > errors[1] > errors[2] > 0
     most = errors[1]
     share = share_within(draw, views, most)
-    assert 0.4 < share < 1 and worst_color(draw, views, share) <= most < worst_color(draw, views, share * 2**0.25)
+    assert 0.4 < share < 1 and mean_color_error(draw, views, share) <= most < mean_color_error(draw, views, share * 2**0.25)
     assert share_within(draw, views, most, share=0.3) == 0.3 and share_within(draw, views, 1.0) == 1
     assert share_within(draw, views.take([0]), 0.02) == 1  # but for rounding
 
