@@ -45,6 +45,6 @@ def test_values_of_a_resolved_fit_go_together() -> None:
 def test_a_resolved_export_has_every_choice_but_the_clouds(profile: Profile | None) -> None:
     resolved = ExportConfig(profile=profile, textures="auto").resolve()
     assert type(resolved) is ResolvedExport and resolved.resolve() is resolved
-    assert resolved.textures in ("png", "ktx2") and resolved.split == (profile not in (None, "blender"))
+    assert resolved.textures in ("png", "ktx2") and resolved.split == (profile not in (None, "vtk", "blender"))
     assert {name for name, value in asdict(resolved).items() if value is None} - {"profile"} == {"alpha", "alpha_cutoff", "mipmaps"}
     assert not ExportConfig(profile="three", split=False).resolve().split

@@ -10,7 +10,9 @@ from bbfit.checks import Count, Range, check_fields, fail
 from bbfit.geometry.alpha import AlphaKind, AlphaMode, Cutoff
 
 Up = Literal["auto", "y", "z"]
-Profile = Literal["three", "babylon", "godot", "unity", "unreal", "blender"]
+Profile = Literal[
+    "three", "babylon", "playcanvas", "model-viewer", "cesium", "filament", "godot", "unity", "unreal", "vtk", "panda3d", "blender"
+]
 Encoding = Literal["png", "webp", "ktx2"]
 Textures = Literal["auto"] | Encoding
 Material = Literal["unlit", "pbr"]
@@ -19,10 +21,36 @@ Outline = Literal["pieces", "hull", "rectangle"]
 MOST_AVERAGED = 0.25
 """The largest cutoff of a mask with which plain averages of alpha, the mip levels that programs compute, keep most of a tree's leaves."""
 
-# Defaults without a profile.
-_OPEN: dict[str, Any] = {"split": False, "material": "unlit", "textures": "png", "outline": "pieces"}
-# Programs that rasterize sort blended geometry node by node, so they need split cards; Blender's Cycles finds the order by itself.
-_SORTS_NODES: dict[Profile, bool] = {"three": True, "babylon": True, "godot": True, "unity": True, "unreal": True, "blender": False}
+
+@dataclass(frozen=True)
+class _Program:
+    """What a program needs of a model."""
+
+    split: bool = True
+    """Whether it sorts blended geometry node by node, so that cards must be split; otherwise it finds the order of each pixel by itself."""
+    material: Material = "unlit"
+    """The material that it shows as it is."""
+    transmits: bool = False
+    """Whether it reads light that passes through leaves (KHR_materials_diffuse_transmission)."""
+    traced: bool = False
+    """Whether it follows rays and culls nothing (:class:`~bbfit.geometry.cards.Cards`)."""
+
+
+_PROGRAMS: dict[Profile | None, _Program] = {
+    None: _Program(split=False),
+    "three": _Program(),
+    "babylon": _Program(transmits=True),
+    "playcanvas": _Program(),
+    "model-viewer": _Program(),
+    "cesium": _Program(),
+    "filament": _Program(),
+    "godot": _Program(),
+    "unity": _Program(),
+    "unreal": _Program(),
+    "vtk": _Program(split=False),  # depth peeling
+    "panda3d": _Program(),
+    "blender": _Program(split=False, traced=True),
+}
 
 
 @dataclass(frozen=True)
@@ -76,7 +104,7 @@ class ExportConfig:
     @property
     def transmits(self) -> bool:
         """Whether the program reads light that passes through leaves (KHR_materials_diffuse_transmission)."""
-        return self.profile == "babylon"
+        return _PROGRAMS[self.profile].transmits
 
     def comparable(self) -> ExportConfig:
         """The same options with rectangles unless they ask for outlines: all models have as many vertices for each billboard."""
@@ -92,7 +120,7 @@ class ExportConfig:
     @property
     def traced(self) -> bool:
         """Whether the profile's program follows rays and culls nothing (:class:`~bbfit.geometry.cards.Cards`)."""
-        return self.profile == "blender"
+        return _PROGRAMS[self.profile].traced
 
     def resolve(self) -> ResolvedExport:
         """Fill in the choices that depend on the profile and on the installed encoders; a :class:`ResolvedExport` returns itself.
@@ -101,7 +129,8 @@ class ExportConfig:
         """
         if isinstance(self, ResolvedExport):
             return self
-        chosen = _OPEN | ({"split": _SORTS_NODES[self.profile]} if self.profile else {})
+        program = _PROGRAMS[self.profile]
+        chosen: dict[str, Any] = {"split": program.split, "material": program.material, "textures": "png", "outline": "pieces"}
         chosen |= {name: value for name, value in vars(self).items() if value is not None or name not in chosen}
         if chosen["textures"] == "auto":
             chosen["textures"] = "png" if ktx2_missing() else "ktx2"
