@@ -15,7 +15,7 @@ Profile = Literal[
 ]
 Encoding = Literal["png", "webp", "ktx2"]
 Textures = Literal["auto"] | Encoding
-Material = Literal["unlit", "pbr"]
+Material = Literal["unlit", "pbr", "emissive"]
 Outline = Literal["pieces", "hull", "rectangle"]
 
 MOST_AVERAGED = 0.25
@@ -30,6 +30,8 @@ class _Program:
     """Whether it sorts blended geometry node by node, so that cards must be split; otherwise it finds the order of each pixel by itself."""
     material: Material = "unlit"
     """The material that it shows as it is."""
+    masks: bool = True
+    """Whether it cuts masks off at their alpha cutoff; otherwise they are blended (:func:`~bbfit.exporting.smoothing.smoothed`)."""
     transmits: bool = False
     """Whether it reads light that passes through leaves (KHR_materials_diffuse_transmission)."""
     traced: bool = False
@@ -47,7 +49,8 @@ _PROGRAMS: dict[Profile | None, _Program] = {
     "godot": _Program(),
     "unity": _Program(),
     "unreal": _Program(),
-    "vtk": _Program(split=False),  # depth peeling
+    # It drops alpha with KHR_materials_unlit, and sorts each pixel's layers by depth peeling.
+    "vtk": _Program(split=False, material="emissive", masks=False),
     "panda3d": _Program(),
     "blender": _Program(split=False, traced=True),
 }
@@ -91,7 +94,8 @@ class ExportConfig:
     """Also write the mip levels as PNG files beside the model, for programs that import them."""
     material: Material | None = None
     """unlit: colors as they are, with the light that the tree was rendered in. pbr: a rough dielectric that the program lights again.
-    Default: unlit. A cloud with maps has a matte material of its own, which takes the program's light."""
+    emissive: a black metal that emits the colors, for programs that do not show unlit right.
+    Default: unlit; emissive for VTK. A cloud with maps has a matte material of its own, which takes the program's light."""
     padding: Count = 8
     """Free texels around each texture in the atlas, at least 1; with 8 the mip levels 1 to 3 never mix two textures."""
     up: Up = "auto"
@@ -105,6 +109,11 @@ class ExportConfig:
     def transmits(self) -> bool:
         """Whether the program reads light that passes through leaves (KHR_materials_diffuse_transmission)."""
         return _PROGRAMS[self.profile].transmits
+
+    @property
+    def masks(self) -> bool:
+        """Whether the profile's program cuts masks off; otherwise they become blended textures with sharp edges."""
+        return _PROGRAMS[self.profile].masks
 
     def comparable(self) -> ExportConfig:
         """The same options with rectangles unless they ask for outlines: all models have as many vertices for each billboard."""

@@ -75,7 +75,7 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
         place = None if origin is None else trimesh.transformations.translation_matrix(origin)
         scene.add_geometry(mesh, node_name=name, geom_name=name, transform=place)
     # Without light nothing reads normals, which are a third of a vertex.
-    lit = cards.atlas.surface is not None or resolved.material != "unlit"
+    lit = cards.atlas.surface is not None or resolved.material == "pbr"
     pictures = _pictures(cards)
     glb = glb_of_scene(scene, lambda tree: _complete(tree, cards, list(pictures), resolved), normals=lit)
     tree, views = split_glb(glb)
@@ -132,6 +132,10 @@ def _complete(tree: dict[str, Any], cards: Cards, pictures: list[str], config: R
                 }
         elif config.material == "unlit":
             material["extensions"] = {"KHR_materials_unlit": {}}
+        elif config.material == "emissive":
+            # A black metal reflects nothing, and emission is blended by the alpha of the base color.
+            material["pbrMetallicRoughness"] |= {"baseColorFactor": [0.0, 0.0, 0.0, 1.0], "metallicFactor": 1.0}
+            material |= {"emissiveTexture": {"index": 0}, "emissiveFactor": [1.0, 1.0, 1.0]}
         used |= set(material.get("extensions", ()))
         if cards.alpha.kind == "hash":
             material["extras"] = {"alphaMode": "HASH"}

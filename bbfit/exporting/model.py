@@ -18,6 +18,7 @@ from bbfit.exporting.mip_matching import reduced, with_mips
 from bbfit.exporting.mips import plain_chain, surface_chain
 from bbfit.exporting.obj import mtl_bytes, obj_bytes
 from bbfit.exporting.outlines import with_pieces
+from bbfit.exporting.smoothing import smoothed
 from bbfit.exporting.splitting import split
 from bbfit.files import write_bytes
 from bbfit.geometry.alpha import AlphaMode
@@ -133,11 +134,11 @@ def shipped_model(cloud: BillboardCloud, config: ExportConfig | None = None, hal
     ``halvings`` halves the sides of the textures that many times, for a model that is only seen from afar.
     """
     resolved = (config or ExportConfig()).resolve()
-    if cloud.surface is not None and config is not None and config.material == "unlit":
+    if cloud.surface is not None and config is not None and config.material in ("unlit", "emissive"):
         fail("material", "the cloud has maps, whose colors contain no light", "leave out --material, or fit with --light baked")
     alpha = AlphaMode(resolved.alpha or cloud.alpha.kind, resolved.alpha_cutoff or cloud.alpha.cutoff)
-    cloud = cloud if resolved.transmits else cloud.opaque()
-    return ShippedModel(replace(cloud, alpha=alpha), resolved, halvings)
+    cloud = replace(cloud if resolved.transmits else cloud.opaque(), alpha=alpha)
+    return ShippedModel(cloud if resolved.masks else smoothed(cloud), resolved, halvings)
 
 
 def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None = None) -> list[Path]:
