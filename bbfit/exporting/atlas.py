@@ -7,15 +7,20 @@ from functools import lru_cache
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+from torch.nn import functional
 
 from bbfit.exporting.packing import packed
-from bbfit.fitting.palette import few_colors
+from bbfit.fitting.palette import few_colors, nearest_means
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cards import Atlas
-from bbfit.images import PALETTE, bleed_color, distinct
+from bbfit.images import PALETTE, bleed_color, distinct, premultiply
 
 # Side of the blocks in which graphics cards compress textures, in texels.
 BLOCK = 4
+# Fewest colors that a palette must leave to transparent texels, and the most that they get of those that are left.
+_LEAST_FREE, _MOST_HIDDEN = 8, 16
 # What lies in the gaps between cells of a surface: the plane's own normal, in the open, opaque.
 _PLAIN = (128, 128, 255, 255, 0)
 
@@ -25,9 +30,9 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int, surfaces: list[N
 
     Each texture gets a cell that is at least ``padding`` >= 1 texels larger on every side, which the fade to transparent at a billboard's
     rim needs. Cells are aligned to blocks of n x n texels, where n is the largest power of two up to ``padding`` (at least 4), so no texel
-    of a mip level up to log2(n) mixes two textures. Alpha is 0 outside the textures; transparent texels have the color of a neighbor
-    (:func:`fill_cell`). If that makes more than 256 colors of fewer visible ones, the transparent texels' colors are rounded, so that the
-    atlas fits into the palette of a PNG.
+    of a mip level up to log2(n) mixes two textures. Alpha is 0 outside the textures; transparent texels continue the visible colors
+    (:func:`fill_cell`), so that programs which ignore alpha show no patches. If that makes more than 256 colors of fewer visible ones,
+    similar colors of transparent texels become one, so that the atlas fits into the palette of a PNG.
 
     ``surfaces`` are further channels of each texture, uint8 [h, w, 4 or 5], packed in the same way; their padding repeats their rims.
     """
@@ -37,10 +42,11 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int, surfaces: list[N
     places = _places(cells.tobytes())
     width, height = ((places + cells).max(0) * unit).tolist()
     image = np.zeros((height, width, 4), np.uint8)
-    image[..., :3] = _mean_color(textures)  # for the gaps between cells, which only the smallest mip levels mix in
+    image[..., :3] = _mean_color(textures)  # for empty textures and the gaps between cells, which only the smallest mip levels mix in
     for texture, place, cell in zip(textures, places * unit, cells * unit, strict=True):
         (x, y), (w, h) = place.tolist(), cell.tolist()
-        image[y : y + h, x : x + w] = fill_cell(texture, padding, w, h)
+        if texture[..., 3].any():
+            image[y : y + h, x : x + w] = fill_cell(texture, padding, w, h)
     image[image[..., 3] == 0, :3] = _within_palette(image)
     surface = None
     if surfaces is not None:
@@ -61,27 +67,46 @@ def _places(cells: bytes) -> NDArray[np.int64]:
 def fill_cell(texture: NDArray[np.uint8], padding: int, width: int, height: int) -> NDArray[np.uint8]:
     """Place a texture in its cell, uint8 [height, width, 4], with its top-left texel at (``padding``, ``padding``).
 
-    Visible texels are unchanged; transparent texels and the padding get their neighbors' color (:func:`~bbfit.images.bleed_color`).
+    Visible texels are unchanged. Transparent texels next to them, which bilinear filtering mixes in, get the color of the nearest opaque
+    one (:func:`~bbfit.images.bleed_color`). Others get a mean over a neighborhood that grows with their distance, as the mip levels of the
+    visible texels have it (:func:`_spread`).
     """
     h, w = texture.shape[:2]
-    cell = np.pad(texture, ((padding, height - h - padding), (padding, width - w - padding), (0, 0)))
-    cell = bleed_color(torch.from_numpy(cell)).numpy()
+    straight = np.pad(texture, ((padding, height - h - padding), (padding, width - w - padding), (0, 0)))
+    cell = bleed_color(torch.from_numpy(straight)).numpy()
+    away = ~ndimage.binary_dilation(straight[..., 3] > 0, np.ones((3, 3)))
+    spread = _spread(premultiply(torch.from_numpy(straight).double() / 255).permute(2, 0, 1))
+    cell[away, :3] = np.rint(255 * spread.permute(1, 2, 0).numpy()[away])
     # The rim fades out in its own color, as in the reference renderer.
     inner = cell[padding : padding + h, padding : padding + w, :3]
     cell[padding - 1 : padding + h + 1, padding - 1 : padding + w + 1, :3] = np.pad(inner, ((1, 1), (1, 1), (0, 0)), "edge")
     return cell
 
 
+def _spread(sums: Tensor) -> Tensor:
+    """Straight color everywhere, [3, h, w], of a picture with some visible texels, whose premultiplied RGBA is given, [4, h, w].
+
+    Where alpha is below 1, the same of the picture at half the size fills in (pull-push; Gortler et al. 1996, "The Lumigraph").
+    """
+    weight = sums[3:]
+    share = weight.clamp(max=1)
+    color = sums[:3] / weight.clamp_min(1e-9)
+    if max(sums.shape[1:]) == 1:
+        return color
+    _, height, width = sums.shape
+    even = functional.pad(sums, (0, width % 2, 0, height % 2))
+    halved = even.reshape(4, -1, 2, (width + 1) // 2, 2).sum((2, 4))
+    return share * color + (1 - share) * functional.interpolate(_spread(halved)[None], sums.shape[1:], mode="bilinear")[0]
+
+
 def _within_palette(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The colors of the transparent texels of a picture, [T, 3], rounded to as many bits as a palette leaves to them."""
+    """The colors of the transparent texels of a picture, [T, 3]; the means of some clusters of them, if all do not fit into a palette."""
     colors = image[image[..., 3] == 0][:, :3]
     free = PALETTE - len(distinct(image[image[..., 3] > 0]))
-    for bits in range(8, 0, -1) if free >= 8 else ():  # the fewest bits leave eight colors
-        step = 1 << (8 - bits)
-        fewer = np.minimum(colors // step * step + step // 2, 255).astype(np.uint8)
-        if len(distinct(np.pad(fewer, ((0, 0), (0, 1))))) <= free:
-            return fewer
-    return colors
+    if not _LEAST_FREE <= free < len(distinct(np.pad(colors, ((0, 0), (0, 1))))):
+        return colors
+    all_of_them = torch.ones(len(colors), dtype=torch.bool)
+    return np.rint(nearest_means(torch.from_numpy(colors), all_of_them, min(free, _MOST_HIDDEN)).numpy()).astype(np.uint8)
 
 
 def palettized_picture(image: NDArray[np.uint8], alpha: AlphaMode) -> NDArray[np.uint8]:

@@ -69,18 +69,21 @@ def few_surfaces(cloud: BillboardCloud, count: int) -> Tensor:
     assert cloud.surface is not None
     visible, across = cloud.texels[:, 3] >= _VISIBLE, cloud.surface[:, :2]
     if visible.any():
-        normals = _few(cloud.tangent_normals, visible, count - 1)
+        normals = nearest_means(cloud.tangent_normals, visible, count - 1)
         across = ((normalize(normals, dim=-1)[:, :2] + 1) / 2).clamp(0, 1).to(across)
     if cloud.translucent and visible.any():
-        return torch.cat([across, _few(cloud.surface[:, 2:], visible, count - 1).to(across)], 1)
+        return torch.cat([across, nearest_means(cloud.surface[:, 2:], visible, count - 1).to(across)], 1)
     occlusion = (cloud.surface[:, 2:3] * _OCCLUSIONS).round() / _OCCLUSIONS
     return torch.cat([across, occlusion, cloud.surface[:, 3:]], 1)
 
 
-def _few(points: Tensor, visible: Tensor, count: int) -> Tensor:
-    """Points, float32 [P, C], at the nearest of the means of at most ``count`` clusters of the visible ones."""
+def nearest_means(points: Tensor, chosen: Tensor, count: int) -> Tensor:
+    """Points, [P, C], each moved to the nearest mean of at most ``count`` clusters (k-means) of those that ``chosen``, [P], selects.
+
+    The result is float32 [P, C]. At least one point must be chosen.
+    """
     values = points.float().numpy()
-    means = _clustered(values[visible.numpy()], count)
+    means = _clustered(values[chosen.numpy()], count)
     return torch.from_numpy(means[vq(values, means)[0]])
 
 
