@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from khronos import messages
 from PIL import Image
+from scipy import ndimage
 
 from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
@@ -144,10 +146,37 @@ def test_mip_files_are_written_on_request(crossed: BillboardCloud, tmp_path: Pat
 
 
 def test_the_materials_light_is_as_asked(crossed: BillboardCloud, tmp_path: Path) -> None:
-    for material, extensions in (("unlit", ["KHR_materials_unlit"]), ("pbr", None)):
+    for material, extensions in (("unlit", ["KHR_materials_unlit"]), ("pbr", None), ("emissive", None)):
         (path,) = export(crossed, tmp_path / f"{material}.glb", ExportConfig(material=material))  # type: ignore[arg-type]
         assert tree_of(path)[0].get("extensionsUsed") == extensions
         assert not messages(path)
+
+
+def test_an_emissive_material_reflects_nothing_and_emits_the_colors(crossed: BillboardCloud, tmp_path: Path) -> None:
+    for profile, emits in (("vtk", True), ("three", False)):
+        (path,) = export(crossed, tmp_path / "model.glb", ExportConfig(profile=profile))  # type: ignore[arg-type]
+        (material,) = tree_of(path)[0]["materials"]
+        assert ("emissiveTexture" in material) == emits
+    (path,) = export(crossed, tmp_path / "model.glb", ExportConfig(material="emissive"))
+    (material,) = tree_of(path)[0]["materials"]
+    surface = material["pbrMetallicRoughness"]
+    assert (surface["baseColorFactor"], surface["metallicFactor"]) == ([0, 0, 0, 1], 1)
+    assert material["emissiveTexture"] == surface["baseColorTexture"] and material["emissiveFactor"] == [1, 1, 1]
+
+
+def test_masks_become_blended_where_programs_blend_them(crossed: BillboardCloud) -> None:
+    """With opaque insides, clear outsides, and edges one texel wide."""
+    masked = replace(crossed, alpha=AlphaMode("mask", 0.3))
+    model = shipped_model(masked, ExportConfig(profile="vtk"))
+    assert model.cloud.alpha.kind == model.cards.alpha.kind == "blend"
+    for before, after in zip(masked.textures(), model.cloud.textures(), strict=True):
+        old, new = before[0, ..., 3], after[0, ..., 3]
+        assert ((new >= 0.5) == (old >= 0.3)).all() and torch.equal(before[..., :3], after[..., :3])
+        inside = torch.from_numpy(ndimage.binary_erosion(old >= 0.3, np.ones((5, 5))))
+        outside = torch.from_numpy(ndimage.binary_erosion(old < 0.3, np.ones((5, 5))))
+        assert (new[inside] > 0.5).all() and (new[outside] < 0.5).all()
+    blended = replace(crossed, alpha=AlphaMode())
+    assert torch.equal(shipped_model(blended, ExportConfig(profile="vtk")).cloud.texels, blended.texels)
 
 
 def test_a_missing_encoder_is_named(crossed: BillboardCloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -95,18 +95,20 @@ def f3d_pictures(job: dict[str, Any]) -> Iterator[NDArray[np.uint8]]:
 
 def panda3d_pictures(job: dict[str, Any]) -> Iterator[NDArray[np.uint8]]:
     """Panda3D with panda3d-gltf, with its axis Z up."""
-    from panda3d.core import Filename, PerspectiveLens, Point3, Vec3, loadPrcFileData
+    from panda3d.core import Filename, PerspectiveLens, Point3, Texture, Vec3, loadPrcFileData
 
     width, height = job["width"], job["height"]
-    screen = ("load-display p3headlessgl", "audio-library-name null", f"win-size {width} {height}", "model-cache-dir")
-    for line in (*screen, "framebuffer-srgb true"):
+    for line in ("load-display p3headlessgl", "audio-library-name null", f"win-size {width} {height}", "model-cache-dir"):
         loadPrcFileData("", line)
     from direct.showbase.ShowBase import ShowBase
 
     base, lens = ShowBase(windowType="offscreen"), PerspectiveLens()
     base.disableMouse()
     base.setBackgroundColor(1, 1, 1, 1)
-    base.loader.loadModel(Filename.fromOsSpecific(job["model"])).reparentTo(base.render)
+    model = base.loader.loadModel(Filename.fromOsSpecific(job["model"]))
+    for texture in model.findAllTextures():
+        texture.setFormat(Texture.FRgba)  # filtered and blended as displayed
+    model.reparentTo(base.render)
     base.cam.node().setLens(lens)
     lens.setFilmSize(width, height)
     for view in job["views"]:

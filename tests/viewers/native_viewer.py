@@ -55,7 +55,7 @@ def render_native(program: Program, model: Path, camera: Camera, *, as_it_comes:
 def _view(camera: Camera) -> dict[str, object]:
     """One camera: its position and axes in the world, and in pixels its focal length and how far its axis is from the picture's middle."""
     k, world = camera.intrinsics.double().numpy(), camera.world_to_camera.double().numpy()
-    right, down, forward = world[:3, :3]
+    _, down, forward = world[:3, :3]
     distance = float(camera.position.norm())
     return {
         "position": camera.position.tolist(),
