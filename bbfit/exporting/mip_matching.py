@@ -26,7 +26,7 @@ from bbfit.geometry.cards import Atlas, Cards
 from bbfit.geometry.orbit import Orbit
 from bbfit.images import PALETTE, distinct
 from bbfit.operators.drawing.compositing import opacity
-from bbfit.rendering.cards import filtered, hits, joined, sheets_of
+from bbfit.rendering.cards import Footprint, filtered, footprint, hits, joined, sampled, sheets_of
 
 # Largest side in pixels of the pictures in which coverage is measured.
 _SIDE = 96
@@ -55,13 +55,19 @@ class _VisibleTexels:
     """Number of pixels of all views."""
 
 
-def with_mips(cards: Cards) -> Cards:
+def with_mips(cards: Cards, on_level: Callable[[int, int], None] = lambda done, total: None) -> Cards:
     """Cards with mip levels that are as dense from afar as the cards are from near, in views from all around.
 
-    This takes some seconds for textures of a million texels.
+    ``on_level`` is that of :func:`matched_chain`.
     """
     surface = None if cards.atlas.surface is None else tuple(surface_chain(cards.atlas.surface, cards.atlas.image[..., 3]))
-    return replace(cards, chain=tuple(matched_chain(cards, _chain(cards), _around(cards))), surface_chain=surface)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # short operations wait for each other's threads: on two busy cores that took several times as long
+    try:
+        chain = matched_chain(cards, _chain(cards), _around(cards), on_level)
+    finally:
+        torch.set_num_threads(threads)
+    return replace(cards, chain=tuple(chain), surface_chain=surface)
 
 
 def reduced(cards: Cards, halvings: int) -> Cards:
@@ -101,7 +107,9 @@ def _around(cards: Cards) -> Camera:
     return _ORBIT.frame(points, target=target, width=_SIDE, height=_SIDE)
 
 
-def matched_chain(cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Camera) -> list[NDArray[np.uint8]]:
+def matched_chain(
+    cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Camera, on_level: Callable[[int, int], None] = lambda done, total: None
+) -> list[NDArray[np.uint8]]:
     """Scale the alpha of each mip level such that the cards cover as much of the picture from afar as with level 0.
 
     ``chain`` holds the levels of :func:`~bbfit.exporting.mips.mip_chain`, with the cutoff if there is one. ``cards`` are in the alpha mode
@@ -111,27 +119,32 @@ def matched_chain(cards: Cards, chain: Sequence[NDArray[np.uint8]], cameras: Cam
 
     For each level there is a distance at which half of the cards' pixels use this or coarser levels. Coverage is measured as seen from
     there, in all views together; the pictures have more pixels than at that distance, so that single pixels matter less. Bisection gives
-    the level's factor. Level 0 stays the same array. Alpha is clipped at 1; colors do not change.
+    the level's factor. Level 0 stays the same array. Alpha is clipped at 1; colors do not change. ``on_level`` is called before the search
+    for each factor with its number and their total.
     """
     cameras = cameras.batch()
-    joined(chain, cards.atlas.image.shape)  # for its checks
+    levels = joined(chain, cards.atlas.image.shape)
     reduction = max(1.0, max(cameras.width, cameras.height) / _SIDE)
     width, height = (max(1, round(side / reduction)) for side in (cameras.width, cameras.height))
     visible, detail = _visible_texels(cards, cameras.resized(width, height))
     # Pictures a quarter as large have a median level of detail that is two more, and so on.
     last = min(len(chain) - 1, math.ceil(detail + math.log2(width / _LEAST_WIDTH)))
     factors = np.ones(len(chain))
-    alphas = [level[..., 3:] for level in chain]
+    alphas, texels = [level[..., 3:] for level in chain], levels.texels[:, 3:].float()
     wanted = _coverage(visible, alphas[:1], 0, cards.alpha)
     if wanted == 0:
         return list(chain)  # nothing shows, near or far
     for sweep in range(_SWEEPS):
         for level in range(1, last + 1):
+            on_level(sweep * last + level, _SWEEPS * last)
             beyond = len(chain) if sweep == 0 or level == last else level + 1
+            place = footprint(levels, visible.uvs, visible.details + level)
 
-            def excess(factor: float, level: int = level, beyond: int = beyond) -> float:
+            def excess(factor: float, level: int = level, beyond: int = beyond, place: Footprint = place) -> float:
                 factors[level:beyond] = factor
-                return _coverage(visible, _scaled(alphas, factors), level, cards.alpha) / wanted - 1
+                for start, alpha in zip(levels.starts[level:beyond], _scaled(alphas[level:beyond], factors[level:beyond]), strict=True):
+                    texels[start : start + alpha.size, 0] = torch.from_numpy(alpha.reshape(-1))
+                return _covered(visible, sampled(texels, place)[:, 0], cards.alpha) / wanted - 1
 
             factors[level:beyond] = _root(excess, factors[level], *(_LATER if sweep else _FIRST))
     scaled = _scaled(alphas, factors)
@@ -159,7 +172,12 @@ def _scaled(alphas: list[NDArray[np.uint8]], factors: NDArray[np.float64]) -> li
 
 def _coverage(visible: _VisibleTexels, alphas: list[NDArray[np.uint8]], level: int, mode: AlphaMode) -> float:
     """Mean alpha of the pictures in [0, 1], with ``level`` as the median level of detail; ``alphas`` are those of the levels, [h, w, 1]."""
-    alpha = filtered(joined(alphas, alphas[0].shape), visible.uvs, visible.details + level)[:, 0] / 255
+    return _covered(visible, filtered(joined(alphas, alphas[0].shape), visible.uvs, visible.details + level)[:, 0], mode)
+
+
+def _covered(visible: _VisibleTexels, alpha: Tensor, mode: AlphaMode) -> float:
+    """Mean alpha of the pictures in [0, 1], given the filtered alpha of the hits in [0, 255], [M]."""
+    alpha = alpha / 255
     alpha = alpha if mode.kind == "hash" else opacity(alpha, mode)
     clear = torch.ones(visible.count).scatter_reduce_(0, visible.pixels, 1 - alpha, "prod")  # in any order of depth
     return 1 - float(clear.double().mean())

@@ -7,7 +7,7 @@ cutoff. See Castano, "Computing alpha mipmaps" (2010).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ from bbfit.images import linear_to_srgb, srgb_to_linear
 # Number of samples of alpha along a texel's side. Castano uses four, which give a single opaque texel a coverage of 0.75 texels; the true
 # value is 0.614, and eight samples give 0.625.
 _POINTS = 8
+# Most samples that are tested at once.
+_AT_ONCE = 1 << 18
 # Relative error of coverage at which a factor is accepted, tolerance of the factor's binary logarithm, and its largest absolute value.
 _TOLERANCE = 0.001
 _EXPONENT_STEP = 2.0**-14
@@ -117,15 +119,23 @@ def coverage(alpha: NDArray[np.uint8], cutoff: float, rectangle: NDArray[np.floa
     sides = np.array(alpha.shape[1::-1])
     first, last = np.ceil(rectangle * _POINTS * sides - 0.5).astype(np.int64)
     last = np.maximum(last, first + 1)
-    start, end = first // _POINTS, -(-last // _POINTS)
-    columns, rows = (np.arange(a - 1, b + 1).clip(0, side - 1) for a, b, side in zip(start, end, sides, strict=True))
-    block = alpha[np.ix_(rows, columns)].astype(np.uint16)  # all values below are integers of at most 255 * 16 * 16
     least = math.ceil(cutoff * 255 * (2 * _POINTS) ** 2 - 1e-6)
-    (left, top), (right, bottom) = first - _POINTS * start, last - _POINTS * start
-    reached = sum(
-        np.count_nonzero(values >= least) for lines in _filtered(block, top, bottom) for values in _filtered(lines.T, left, right)
-    )
+    (left, right, across), (above, below, down) = (_between(*each) for each in zip(first, last, sides, strict=True))
+    # All values are integers of at most 255 * 16 * 16.
+    columns = alpha[:, left[0] : right[-1] + 1].astype(np.uint16)
+    left, right, reached = left - left[0], right - left[0], 0
+    for band in np.array_split(np.arange(len(above)), -(-len(above) * len(left) // _AT_ONCE)):
+        lines = columns[above[band]] * (2 * _POINTS - down[band]) + columns[below[band]] * down[band]
+        lines = np.ascontiguousarray(lines.T)  # so that rows are taken, which is faster
+        reached += np.count_nonzero(lines[left] * (2 * _POINTS - across) + lines[right] * across >= least)
     return reached / int((last - first).prod())
+
+
+def _between(first: int, last: int, side: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint16]]:
+    """For the samples ``first`` to ``last - 1`` along a side: the texels before and after each, and 16 times the weight of the one after."""
+    place = 2 * np.arange(first, last) + 1 - _POINTS
+    before = place // (2 * _POINTS)
+    return before.clip(0, side - 1), (before + 1).clip(0, side - 1), (place % (2 * _POINTS)).astype(np.uint16)[:, None]
 
 
 def _linear(color: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -191,15 +201,3 @@ def _factor(wanted: float, reached: Callable[[float], float]) -> float:
     if error(end) * step >= 0 and end:
         optimize.brentq(error, *sorted((end - step, end)), xtol=_EXPONENT_STEP)
     return 2.0 ** min(errors, key=lambda exponent: abs(errors[exponent]))
-
-
-def _filtered(texels: NDArray[np.uint16], first: int, last: int) -> Iterator[NDArray[np.uint16]]:
-    """Bilinear filtering along the first axis, times 16: one array for each offset of a sample within its texel.
-
-    The samples are those from ``first`` to ``last - 1``, counted from the first one in texel 1.
-    """
-    for place in range(_POINTS):
-        start, end = (-(-(edge - place) // _POINTS) for edge in (first, last))
-        after = 2 * place >= _POINTS  # whether the sample is between its texel's center and the next one
-        weight = (2 * place + 1 + _POINTS) % (2 * _POINTS)
-        yield texels[start + after : end + after] * (2 * _POINTS - weight) + texels[start + after + 1 : end + after + 1] * weight

@@ -99,6 +99,20 @@ class MipChain:
     """In texels, int64 [L]."""
 
 
+@dataclass(frozen=True)
+class Footprint:
+    """The texels that M trilinear samples mix, whatever their values."""
+
+    fine: tuple[Tensor, Tensor]
+    """Indices of the four texels in the finer level, int64 [4, M], and the place between them across and down, float32 [2, M, 1]."""
+    coarse: tuple[Tensor, Tensor]
+    """The same in the coarser level, for the samples between two levels."""
+    mixed: Tensor
+    """Which samples those are, int64."""
+    share: Tensor
+    """The share of the coarser level in each of them, float32 [, 1]."""
+
+
 def draw_cards(cards: Cards, camera: Camera, light: Light | None = None) -> Tensor:
     """Draw cards on the CPU as a graphics card does, with one sample per pixel: premultiplied RGBA in [0, 1], float32 [H, W, 4] for one
     camera and [V, H, W, 4] for a batch.
@@ -306,25 +320,40 @@ def hits(cards: Cards, sheets: Sheets, camera: Camera) -> Hits:
 
 def filtered(levels: MipChain, uv: Tensor, detail: Tensor) -> Tensor:
     """Trilinear samples in [0, 255] at points [M, 2] by level of detail [M]: float32 [M, C]."""
+    return sampled(levels.texels.float(), footprint(levels, uv, detail))
+
+
+def footprint(levels: MipChain, uv: Tensor, detail: Tensor) -> Footprint:
+    """The texels that trilinear samples at points [M, 2] by level of detail [M] mix."""
     detail = detail.clamp(0, len(levels.starts) - 1)
     level = detail.long()
     share = (detail - level).float()
-    sample = _bilinear(levels, uv, level)
-    mixed = share > 0
-    coarser = _bilinear(levels, uv[mixed], level[mixed] + 1)
-    sample[mixed] += (coarser - sample[mixed]) * share[mixed, None]
+    mixed = share.nonzero()[:, 0]
+    return Footprint(_square(levels, uv, level), _square(levels, uv[mixed], level[mixed] + 1), mixed, share[mixed, None])
+
+
+def sampled(texels: Tensor, place: Footprint) -> Tensor:
+    """The samples of a footprint from the texels of all levels, float32 [T, C]: [M, C]."""
+    sample, coarser = (_bilinear(texels, *square) for square in (place.fine, place.coarse))
+    sample[place.mixed] += (coarser - sample[place.mixed]) * place.share
     return sample
 
 
-def _bilinear(levels: MipChain, uv: Tensor, level: Tensor) -> Tensor:
-    """Samples at points [M, 2] of levels int64 [M], clamped to the edge: float32 [M, C]."""
+def _square(levels: MipChain, uv: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
+    """The four texels around points [M, 2] in levels int64 [M], clamped to the edge, [4, M], and the place between them, [2, M, 1]."""
     width, height = levels.widths[level], levels.heights[level]
     x, y = (uv[:, 0] * width - 0.5).clamp_min(0), (uv[:, 1] * height - 0.5).clamp_min(0)
     left, top = torch.minimum(x.long(), width - 1), torch.minimum(y.long(), height - 1)
     right, down = (left + 1 < width).long(), (top + 1 < height).long() * width
-    x, y = (x - left).float()[:, None], (y - top).float()[:, None]  # beyond the last texel both neighbors are that one
     start = levels.starts[level] + top * width + left
-    a, b, c, d = (levels.texels[start + step].float() for step in (0, right, down, down + right))
+    # Beyond the last texel both neighbors are that one.
+    return torch.stack([start, start + right, start + down, start + down + right]), torch.stack([x - left, y - top]).float()[..., None]
+
+
+def _bilinear(texels: Tensor, corners: Tensor, at: Tensor) -> Tensor:
+    """Samples between four texels each, of float32 [T, C]: [M, C]."""
+    a, b, c, d = (texels[corner] for corner in corners)
+    x, y = at
     # In this form equal texels give their own value exactly, whatever the weights: alpha at the cutoff stays at the cutoff.
     upper, lower = a + (b - a) * x, c + (d - c) * x
     return upper + (lower - upper) * y
