@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import platform
+import shutil
 import sys
 import tempfile
 import time
@@ -49,6 +50,13 @@ def output_folder(name: str, path: str | Path) -> Path:
     except OSError as error:
         fail(name, f"{path} cannot be written to ({error.strerror})", f"{_OTHER} or free the disk")
     return path
+
+
+def check_room(name: str, folder: Path, needed: int) -> None:
+    """Require that ``needed`` bytes are free on the disk of an existing folder. ``InputError`` calls the option ``name``."""
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        fail(name, f"{folder} is on a disk with {free:,} free bytes, and {needed:,} may be needed", f"{_OTHER} or free the disk")
 
 
 @contextlib.contextmanager

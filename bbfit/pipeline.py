@@ -1,4 +1,4 @@
-"""A run: grow, views, budget, fit, export, evaluate, report. A stage with current results is skipped."""
+"""A run: grow, views, budget, fit, evaluate, export, report. A stage with current results is skipped."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ from bbfit.fitting.requirements import check_device
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.inputs import InputLimits
 from bbfit.layout import TEST_FILE
-from bbfit.outputs import claimed_folder
+from bbfit.outputs import check_room, claimed_folder
 from bbfit.stages.billboards import BUDGET_OUTPUTS, FIT_OUTPUTS, budget_stage, fit_stage, read_choice
+from bbfit.stages.describing import subject_of
 from bbfit.stages.requirements import check_planned_views, check_training
 from bbfit.stages.results import (
     EVALUATE_OUTPUTS,
@@ -33,6 +34,7 @@ from bbfit.stages.results import (
     export_config,
     export_outputs,
     export_stage,
+    original_tree,
     report_stage,
 )
 from bbfit.stages.stage import OnProgress, Record, Stage, record_head, silent
@@ -41,6 +43,9 @@ from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.species import Species, load_species
 from bbfit.views.dataset import ViewDataset
+
+# Bytes that are free on the disk before a run begins. Runs of three trees with views of 256 x 256 pixels take 4 to 12 MB without the views.
+_ROOM = 1 << 26
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,11 +205,13 @@ def _fitted(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on_s
     limit = None if max_bytes is None else (max_bytes, export)
     record.run(fit_stage(folder, views, tree, fit_config, limit, on_step), on_progress)
     cloud = BillboardCloud.load(folder / "cloud.safetensors")
-    model = shipped_model(cloud, export)
-    record.run(export_stage(folder, model), on_progress)
-    seconds = {name: spent for name, spent in record.seconds.items() if name not in ("evaluate", "report")}
-    record.run(evaluate_stage(folder, model, views, tree, seconds), on_progress)
+    model = shipped_model(cloud, export, on_progress=on_progress)
+    seconds = {name: spent for name, spent in record.seconds.items() if name not in ("export", "evaluate", "report")}
+    grown = record.head["config"]["species"]
+    subject = subject_of(views, folder / "cloud.safetensors", grown and grown["name"])
+    record.run(evaluate_stage(folder, model, views, original_tree(views, tree), subject, seconds, max_bytes), on_progress)
     report = Report.load(folder / "metrics.json")
+    record.run(export_stage(folder, model, report, max_bytes), on_progress)
     record.run(report_stage(folder, report, model, views, _facts(record)), on_progress)
     return RunResult(folder, cloud, report, tuple(record.skipped), missed)
 
@@ -218,6 +225,7 @@ def prepare(
     No other process can write to the folder until the context ends.
     """
     config, on_progress = config or RunConfig(), on_progress or silent
+    config.export.check()  # before a large tree is read
     path = source.path if isinstance(source, TreeFile) else source
     views_folder = Path(path) if path is not None and Path(path).is_dir() else None
     if config.tree is not None and views_folder is None:
@@ -264,6 +272,7 @@ def _record(out: str | Path, head: dict[str, Any], config: RunConfig, inputs: It
     with claimed_folder("out", out) as folder:
         record = Record(folder, head, [path for path in inputs if path is not None])
         record.check(outputs)
+        check_room("out", folder, _ROOM)
         yield record
 
 

@@ -23,10 +23,10 @@ VERSIONS: Mapping[str, int] = {
     "views": 6,
     "budget": 10,
     "fit": 22,
-    "export": 10,
-    "evaluate": 14,
-    "report": 7,
-    "lod": 4,
+    "export": 11,
+    "evaluate": 15,
+    "report": 8,
+    "lod": 5,
     "compare": 5,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""

@@ -26,7 +26,7 @@ from bbfit.views.dataset import ViewDataset
 VIEWS = Path(__file__).resolve().parents[1] / "data" / "views"
 FIT = FitConfig(placement="even", steps=6, views_per_step=1)
 CONFIG = RunConfig(fit=FIT, budget=BudgetConfig(vertices=8))
-STAGES = ("budget", "fit", "export", "evaluate", "report")
+STAGES = ("budget", "fit", "evaluate", "export", "report")
 
 
 class Killed(Exception):

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,8 +22,10 @@ import bbfit
 from bbfit.cli import main
 from bbfit.cli.console import out_console
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.glb import split_glb
 from bbfit.images import write_png
 from bbfit.outputs import single_files
+from bbfit.provenance import digest_file
 from bbfit.reporting.tables import report_table
 from bbfit.stages.results import original_tree
 from bbfit.tree_files.tree_file import TreeFile
@@ -90,11 +93,16 @@ def test_there_is_one_evaluation(kind: str, views_folder: Path, tmp_path: Path, 
     views = bbfit.ViewDataset.load(views_folder)
     cloud, original = BillboardCloud.load(run / "cloud.safetensors"), original_tree(views, TreeFile.open(DATA / "tree.glb"))
     report = dataclasses.replace(bbfit.evaluate(cloud, views.test, export=export, original=original), seconds={})
-    assert report.bytes.model == (run / "model.glb").stat().st_size and report.overdraw and report.sizes and report.vertices.ratio
+    assert report.overdraw and report.sizes and report.vertices.ratio
     for path in (run / "metrics.json", again):
         found = bbfit.Report.load(path)
-        assert dataclasses.replace(found, seconds={}) == report and set(found.seconds) == {"fit", "export", "evaluate"}
-    out_console.print(report_table(report, thesis=False))
+        assert found.subject.cloud == digest_file(run / "cloud.safetensors") and found.bytes.model == (run / "model.glb").stat().st_size
+        assert dataclasses.replace(found, seconds={}, subject=report.subject, bytes=report.bytes) == report and set(found.seconds) == {
+            "fit",
+            "export",
+            "evaluate",
+        }
+    out_console.print(report_table(found, thesis=False))
     expected = [line.rstrip() for line in capsys.readouterr().out.splitlines() if line.strip()]
     assert [line.rstrip() for line in printed.splitlines() if line.strip()][: len(expected)] == expected
 
@@ -104,6 +112,30 @@ def test_export(fitted: Path, tmp_path: Path, name: str, capsys: pytest.CaptureF
     assert main(["export", str(fitted / "cloud.safetensors"), "--out", str(tmp_path / name), "--alpha", "mask"]) == 0
     assert name in capsys.readouterr().out.replace("\n", "")
     assert (tmp_path / name).stat().st_size > 0
+
+
+def test_an_export_knows_the_score_of_its_cloud_alone(fitted: Path, tmp_path: Path) -> None:
+    """A cloud beside the metrics of another cloud, or in another alpha mode, has no score."""
+
+    def facts(cloud: Path, *options: str) -> dict[str, Any]:
+        out = tmp_path / "out.glb"
+        assert main(["export", str(cloud), "--out", str(out), *options]) == 0
+        return split_glb(out.read_bytes())[0]["asset"]["extras"]["bbfit"]
+
+    cloud, report = fitted / "cloud.safetensors", bbfit.Report.load(fitted / "metrics.json")
+    known = facts(cloud)
+    assert known == split_glb((fitted / "model.glb").read_bytes())[0]["asset"]["extras"]["bbfit"]
+    assert known["score"]["psnr"] == pytest.approx(report.mean.over.mean.psnr, rel=1e-4) and known["score"]["views"] == len(report.views)
+    other = facts(cloud, "--alpha", "blend")
+    assert other["alpha"] == {"mode": "blend"} and "score" not in other and "distances" not in other and other["tree"] == known["tree"]
+    alone = tmp_path / "birch.safetensors"
+    shutil.copy(cloud, alone)
+    assert facts(alone)["tree"] == "birch" and "score" not in facts(alone)
+    shutil.copy(fitted / "metrics.json", tmp_path)
+    assert "score" in facts(alone)
+    changed = dataclasses.replace(report, subject=dataclasses.replace(report.subject, cloud="0" * 64))
+    changed.save(tmp_path / "metrics.json")
+    assert "score" not in facts(alone)
 
 
 @pytest.mark.parametrize(

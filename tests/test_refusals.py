@@ -11,12 +11,15 @@ import pytest
 
 from bbfit.checks import InputError
 from bbfit.cli import main
+from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.model import export
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import fit
 from bbfit.fitting.requirements import check_device
 from bbfit.images import write_png
 from bbfit.pipeline import RunConfig, run
 from bbfit.views.dataset import ViewDataset
+from tests.geometry.test_cloud import small_cloud
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 
@@ -129,6 +132,49 @@ def test_evaluate_and_export_make_no_folder(
         before = sorted(tmp_path.rglob("*"))
         assert main([str(part) for part in arguments]) == 2
         assert says in capsys.readouterr().err and sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_missing_encoder_stops_every_command_before_its_work(
+    views_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bbfit.exporting.config.ktx2_missing", lambda: "install it")
+    for work in ("bbfit.pipeline.views_stage", "bbfit.pipeline.grow_stage", "bbfit.pipeline.fit_stage", "bbfit.lod.views_stage"):
+        monkeypatch.setattr(work, lambda *_: pytest.fail("work was begun"))
+    cloud, tree, out = tmp_path / "cloud.safetensors", str(DATA / "tree.glb"), str(tmp_path / "new" / "out")
+    small_cloud().save(cloud)
+    for arguments in (
+        ["run", "--out", out],
+        ["run", tree, "--out", out],
+        ["run", str(views_folder), "--out", out],
+        ["fit", str(views_folder), "--out", out],
+        ["lod", tree, "--out", out + ".glb"],
+        ["compare", tree, "--out", out],
+        ["sweep", "--species", "acer", "--out", out],
+        ["evaluate", str(cloud), str(views_folder), "--out", out + ".json"],
+        ["export", str(cloud), "--out", str(tmp_path / "model.glb")],
+    ):
+        assert main([*arguments, "--textures", "ktx2"]) == 2, arguments
+        assert "the package alktx2, is not installed; install it" in " ".join(capsys.readouterr().err.split()), arguments
+        assert not Path(out).parent.exists() and not (tmp_path / "model.glb").exists()
+
+
+def test_a_missing_encoder_stops_the_library_before_its_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bbfit.exporting.config.ktx2_missing", lambda: "install it")
+    monkeypatch.setattr("bbfit.exporting.model.cloud_cards", lambda *_, **__: pytest.fail("work was begun"))
+    with pytest.raises(InputError, match="alktx2, is not installed; install it"):
+        export(small_cloud(), tmp_path / "model.glb", ExportConfig(textures="ktx2"))
+
+
+def test_a_full_disk_stops_runs_and_exports_before_their_work(
+    views_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr("bbfit.outputs.shutil.disk_usage", lambda _: usage._replace(free=10))
+    refused(views_folder, "is on a disk with 10 free bytes, and 67,108,864 may be needed; choose another output folder or free the disk")
+    small_cloud().save(tmp_path / "cloud.safetensors")
+    assert main(["export", str(tmp_path / "cloud.safetensors"), "--out", str(tmp_path / "model.glb")]) == 2
+    assert "on a disk with 10 free bytes" in " ".join(capsys.readouterr().err.split())
+    assert [path.name for path in tmp_path.iterdir() if path.suffix == ".glb"] == []
 
 
 def test_a_device_is_returned_and_kernels_need_theirs(monkeypatch: pytest.MonkeyPatch) -> None:

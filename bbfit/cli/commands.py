@@ -198,11 +198,13 @@ def evaluate_command(
     """
     from bbfit.checks import check_output_file
     from bbfit.evaluation.report import stage_seconds
-    from bbfit.evaluation.scoring import evaluate
+    from bbfit.evaluation.scoring import evaluate_model
+    from bbfit.exporting.model import shipped_model
     from bbfit.geometry.cloud import BillboardCloud
     from bbfit.outputs import claimed_folder, single_files, used_folder
     from bbfit.reporting.tables import report_table
-    from bbfit.stages.results import original_tree
+    from bbfit.stages.describing import subject_of
+    from bbfit.stages.results import completed, original_tree
     from bbfit.tree_files.tree_file import TreeFile
     from bbfit.views.dataset import ViewDataset
 
@@ -218,16 +220,16 @@ def evaluate_command(
     use = claimed_folder if out == earlier else used_folder  # no other process may be at work in the run's folder
     with use("out", out.parent) as folder, single_files("evaluate", folder, [out.name], inputs):
         with progress() as on_progress:
-            report = evaluate(
-                billboards,
+            model = shipped_model(billboards, export, on_progress=on_progress)
+            report = evaluate_model(
+                model,
                 dataset.test,
-                export=export,
                 original=original,
                 turned=dataset.turned,
                 lit=dataset.lit_test,
                 on_progress=partial(on_progress, "evaluate"),
             )
-        report = replace(report, seconds={**seconds, **report.seconds})
+        report = completed(replace(report, seconds={**seconds, **report.seconds}), model, subject_of(dataset, cloud))
         report.save(out)
     out_console.print(report_table(report, thesis=False))
     out_console.print(f"measures in {out}", soft_wrap=True)
@@ -248,17 +250,19 @@ def export_command(
         out: The model's file, ending in .glb, or in .obj (its .mtl and .png come beside it).
         export: How the model is written.
     """
-    from bbfit.exporting import model
+    from bbfit.exporting.model import shipped_model
     from bbfit.geometry.cloud import BillboardCloud
     from bbfit.model_files import check_model_path, names_beside
-    from bbfit.outputs import single_files
+    from bbfit.outputs import check_room, single_files
+    from bbfit.stages.describing import described_by_run
 
     out = check_model_path("model file", out)
     export.check()
     billboards = BillboardCloud.load(cloud)
     names = names_beside(out, texture=True, normals=billboards.surface is not None, mip_files=export.resolve().mip_files)
-    with single_files("bbfit export", out.parent, names, [cloud]):
-        paths = model.export(billboards, out, export)
+    check_room("out", out.parent, 16 * len(billboards.texels))  # four bytes a texel for up to three pictures and all levels
+    with single_files("bbfit export", out.parent, names, [cloud]), progress() as on_progress:
+        paths = described_by_run(shipped_model(billboards, export, on_progress=on_progress), cloud).save(out)
     for path in paths:
         out_console.print(f"{path}  {path.stat().st_size:,} bytes", soft_wrap=True)
     show_missing_encoder(export)

@@ -53,6 +53,8 @@ def show(result: RunResult, *, thesis: bool) -> None:
     from bbfit.reporting.tables import report_table
 
     out_console.print(report_table(result.report, thesis=thesis))
+    if result.report.distances is not None:
+        out_console.print(result.report.distances.verdict)
     if result.skipped:
         out_console.print(f"unchanged and skipped: {', '.join(result.skipped)}", style="dim")
     if result.missed is not None:

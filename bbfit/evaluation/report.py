@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.checks import check_file, check_record
+from bbfit.evaluation.distances import Distances
 from bbfit.evaluation.light import LightScore
 from bbfit.evaluation.measures import Measures, mean_measures
 from bbfit.evaluation.trunk import TrunkScore
@@ -112,6 +113,36 @@ class Cost:
 
 
 @dataclass(frozen=True)
+class Subject:
+    """What a report is about, as far as it is known."""
+
+    tree: str | None = None
+    """The tree's name."""
+    bounds: tuple[tuple[float, ...], ...] | None = None
+    """Lowest and highest corner of its bounding box in meters, Y up."""
+    sun_direction: tuple[float, ...] | None = None
+    """Unit vector towards the sun of the views, Y up."""
+    sun_strength: float | None = None
+    """Strength of that sun in watts per square meter."""
+    ambient: float | None = None
+    """Strength of the sky."""
+    cloud: str | None = None
+    """SHA-256 of the file of the billboard cloud."""
+
+    def to_json(self) -> dict[str, Any]:
+        """The fields, with lists in place of tuples."""
+        bounds, sun = self.bounds and [list(corner) for corner in self.bounds], self.sun_direction and list(self.sun_direction)
+        return asdict(self) | {"bounds": bounds, "sun_direction": sun}
+
+    @staticmethod
+    def from_json(content: Mapping[str, Any]) -> Subject:
+        """The subject in ``metrics.json``."""
+        bounds, sun = content["bounds"], content["sun_direction"]
+        corners = None if bounds is None else tuple(tuple(corner) for corner in bounds)
+        return Subject(**{**content, "bounds": corners, "sun_direction": None if sun is None else tuple(sun)})
+
+
+@dataclass(frozen=True)
 class Report:
     """How close an exported billboard cloud comes to the held-out views, and what it costs."""
 
@@ -137,6 +168,10 @@ class Report:
     """The trunk below the crown, or ``None`` if no view from near the horizon shows one."""
     light: LightScore | None = None
     """The model under held-out suns, or ``None`` if the views have one light."""
+    distances: Distances | None = None
+    """From which distances it looks like the tree, or ``None`` if the scale of the views is not known."""
+    subject: Subject = field(default_factory=Subject)
+    """The tree, the light and the file of the cloud."""
 
     @property
     def mean(self) -> Measures:
@@ -180,6 +215,8 @@ class Report:
             "trunk": {"iou", "worst_iou", "delta_e", "worst_view", "views": [{"name", "iou", "delta_e"}]} or None,
             "light": {"psnr", "flip", "low", "r2", "drift", "albedo", "normal_degrees", "suns", "cameras", "views"} or None,
             "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
+            "distances": {"silhouette_pixels", "near_meters", "far_meters"} or None,
+            "subject": {"tree", "bounds", "sun_direction", "sun_strength", "ambient", "cloud"},
             "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
             "shimmer": [{"width", "height", "tree", "ratio", "antialiased"}],
             "rings": [{"elevation_degrees", "views", and the same measures, with "antialiased"}],
@@ -194,6 +231,8 @@ class Report:
             "light": None if self.light is None else self.light.to_json(),
             "alpha": {"mode": self.alpha.kind, "cutoff": self.alpha.cutoff},
             "seconds": dict(self.seconds),
+            "distances": None if self.distances is None else asdict(self.distances),
+            "subject": self.subject.to_json(),
             "sizes": [asdict(size) for size in self.sizes],
             "shimmer": [asdict(size) for size in self.shimmer],
             "rings": [ring.to_json() for ring in self.rings],
@@ -234,7 +273,9 @@ class Report:
             shimmer = tuple(ShimmerScore(**size) for size in content["shimmer"])
             light = None if content["light"] is None else LightScore.from_json(content["light"])
             seconds, overdraw = dict(content["seconds"]), content["overdraw"]
-            report = Report(scores, vertices, sizes, seconds, alpha, overdraw, afar, shaded, shimmer, trunk, light)
+            distances = None if content["distances"] is None else Distances(**content["distances"])
+            subject = Subject.from_json(content["subject"])
+            report = Report(scores, vertices, sizes, seconds, alpha, overdraw, afar, shaded, shimmer, trunk, light, distances, subject)
             if not scores:
                 raise ValueError("it has no views")
             check_record("report", report, Report)

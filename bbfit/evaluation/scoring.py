@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from bbfit.checks import check_count, check_shape, fail
+from bbfit.checks import InputError, check_count, check_shape, fail
 from bbfit.evaluation import metrics, thesis_scale
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
+from bbfit.evaluation.distances import Distances, viewing_distances
 from bbfit.evaluation.light import LightScore, score_light
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
-from bbfit.evaluation.report import Cost, Report, ShimmerScore, ViewScore
+from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeScore, ViewScore
 from bbfit.evaluation.shimmer import score_shimmer
 from bbfit.evaluation.sizes import HALVINGS, score_sizes
 from bbfit.evaluation.trunk import TrunkView, measure_trunk, trunk_score
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import ShippedModel, shipped_model
+from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
@@ -104,12 +106,13 @@ def evaluate_model(
     smooth = model.antialiased().draw if model.cloud.alpha.kind == "mask" else None
     baked = views.light[[0]] if views.light is not None else None
     suns = len(lit.other_suns(baked)) if lit is not None and baked is not None else 0
-    total, trunks = len(views) + HALVINGS + 1 + (turned is not None) + suns, list[TrunkView | None]()
+    total, trunks, off = len(views) + HALVINGS + 1 + (turned is not None) + suns, list[TrunkView | None](), list[float]()
     names, elevations = views.names, view_angles(views.cameras)[:, 1].tolist()
 
     def drawn(index: int) -> Tensor:
         target, image = held_out(model.draw, views, index)
         trunks.append(measure_trunk(names[index], elevations[index], target, image))
+        off.append(metrics.silhouette_distance(target.numpy(), image.numpy()))
         return image
 
     scores = score_views(
@@ -137,8 +140,18 @@ def evaluate_model(
         shimmer=shimmer,
         trunk=trunk_score(trunks),
         light=light,
+        distances=_distances(max(off), views, sizes),
         seconds={"evaluate": time.perf_counter() - started},
     )
+
+
+def _distances(silhouette_pixels: float, views: ViewSet, sizes: Sequence[SizeScore]) -> Distances | None:
+    """The verdict on distances; ``None`` if the views do not tell where the tree is."""
+    try:
+        scale = float(pixels_per_meter(views.cameras))
+    except InputError:  # they all look the same way
+        return None
+    return viewing_distances(silhouette_pixels, scale, [(size.width, size.coverage) for size in sizes])
 
 
 def score_model_light(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ _TANGENT = "_TANGENT"
 _EXTENSIONS = {"webp": ("EXT_texture_webp", "image/webp"), "ktx2": ("KHR_texture_basisu", "image/ktx2")}
 
 
-def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
+def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int], None] = lambda done, total: None) -> bytes:
     """A GLB file with one mesh for the cards that show both sides, one for those with back-face culling, and one per card with an origin.
 
     Cards with maps have a matte material (``KHR_materials_specular`` with the factor 0) with textures of base color, normals and occlusion,
@@ -38,7 +39,8 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
 
     The node of a card with an origin is at that origin, and two vertices that no triangle uses center the mesh's bounds on it: programs
     sort blended meshes by one or the other. The sampler uses mip levels if the file includes them (``ktx2``) or if the options let
-    programs compute them (:meth:`~bbfit.exporting.config.ExportConfig.mipmapped`).
+    programs compute them (:meth:`~bbfit.exporting.config.ExportConfig.mipmapped`). ``on_picture`` is called with the number of encoded
+    pictures and their total.
     """
     import trimesh
     from PIL import Image
@@ -79,7 +81,7 @@ def glb_bytes(cards: Cards, config: ExportConfig) -> bytes:
     pictures = _pictures(cards)
     glb = glb_of_scene(scene, lambda tree: _complete(tree, cards, list(pictures), resolved), normals=lit)
     tree, views = split_glb(glb)
-    return joined_glb(tree, _with_pictures(tree, _with_short_indices(tree, views), pictures, resolved))
+    return joined_glb(tree, _with_pictures(tree, _with_short_indices(tree, views), pictures, resolved, on_picture))
 
 
 def _vertices(card: Card) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -171,11 +173,14 @@ def _pictures(cards: Cards) -> _Pictures:
     return pictures
 
 
-def _with_pictures(tree: dict[str, Any], views: list[bytes], pictures: _Pictures, config: ResolvedExport) -> list[bytes]:
+def _with_pictures(
+    tree: dict[str, Any], views: list[bytes], pictures: _Pictures, config: ResolvedExport, on_picture: Callable[[int, int], None]
+) -> list[bytes]:
     """The contents of the buffer views, with the pictures added; the JSON gets the references to them."""
     extension, kind = _EXTENSIONS.get(config.textures, ("", ""))
     images, encoded = list[tuple[str, str]](), list[bytes]()
-    for texture, (name, (levels, is_color)) in zip(tree["textures"], pictures.items(), strict=True):
+    for number, (texture, (name, (levels, is_color))) in enumerate(zip(tree["textures"], pictures.items(), strict=True)):
+        on_picture(number, len(pictures))
         if not extension or config.fallback:
             texture["source"] = len(images)
             images.append((name, "image/png"))
@@ -184,6 +189,7 @@ def _with_pictures(tree: dict[str, Any], views: list[bytes], pictures: _Pictures
             texture["extensions"] = {extension: {"source": len(images)}}
             images.append((name, kind))
             encoded.append(encode_webp(levels[0]) if config.textures == "webp" else encode_ktx2(levels, srgb=is_color))
+    on_picture(len(pictures), len(pictures))
     if extension:
         tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), extension})
         if not config.fallback:

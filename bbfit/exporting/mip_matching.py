@@ -26,7 +26,8 @@ from bbfit.geometry.cards import Atlas, Cards
 from bbfit.geometry.orbit import Orbit
 from bbfit.images import PALETTE, distinct
 from bbfit.operators.drawing.compositing import opacity
-from bbfit.rendering.cards import Footprint, filtered, footprint, hits, joined, sampled, sheets_of
+from bbfit.rendering.cards import hits, sheets_of
+from bbfit.rendering.sampling import Footprint, filtered, footprint, joined, sampled
 
 # Largest side in pixels of the pictures in which coverage is measured.
 _SIDE = 96
@@ -119,7 +120,7 @@ def matched_chain(
 
     For each level there is a distance at which half of the cards' pixels use this or coarser levels. Coverage is measured as seen from
     there, in all views together; the pictures have more pixels than at that distance, so that single pixels matter less. Bisection gives
-    the level's factor. Level 0 stays the same array. Alpha is clipped at 1; colors do not change. ``on_level`` is called before the search
+    the level's factor. Level 0 stays the same array. Alpha is clipped at 1; colors do not change. ``on_level`` is called after the search
     for each factor with its number and their total.
     """
     cameras = cameras.batch()
@@ -136,7 +137,6 @@ def matched_chain(
         return list(chain)  # nothing shows, near or far
     for sweep in range(_SWEEPS):
         for level in range(1, last + 1):
-            on_level(sweep * last + level, _SWEEPS * last)
             beyond = len(chain) if sweep == 0 or level == last else level + 1
             place = footprint(levels, visible.uvs, visible.details + level)
 
@@ -147,6 +147,7 @@ def matched_chain(
                 return _covered(visible, sampled(texels, place)[:, 0], cards.alpha) / wanted - 1
 
             factors[level:beyond] = _root(excess, factors[level], *(_LATER if sweep else _FIRST))
+            on_level(sweep * last + level, _SWEEPS * last)
     scaled = _scaled(alphas, factors)
     return [chain[0], *(np.concatenate([level[..., :3], alpha], -1) for level, alpha in zip(chain[1:], scaled[1:], strict=True))]
 

@@ -132,7 +132,7 @@ def coverage(alpha: NDArray[np.uint8], cutoff: float, rectangle: NDArray[np.floa
 
 
 def _between(first: int, last: int, side: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint16]]:
-    """For the samples ``first`` to ``last - 1`` along a side: the texels before and after each, and 16 times the weight of the one after."""
+    """For samples ``first`` to ``last - 1`` along a side: the texels before and after each, and 16 times the weight of the one after."""
     place = 2 * np.arange(first, last) + 1 - _POINTS
     before = place // (2 * _POINTS)
     return before.clip(0, side - 1), (before + 1).clip(0, side - 1), (place % (2 * _POINTS)).astype(np.uint16)[:, None]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 from bbfit.checks import fail
 from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.config import ExportConfig, ResolvedExport
+from bbfit.exporting.description import Description, described_glb
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import overdraw, with_hulls
 from bbfit.exporting.mip_matching import reduced, with_mips
@@ -31,6 +33,13 @@ from bbfit.model_files import check_model_path, normals_path
 from bbfit.rendering.cards import CardRenderer
 from bbfit.rendering.dispatch import render
 
+OnExport = Callable[[str, int, int], None]
+"""Called with a kind of work (``"mip levels"``, ``"textures"``), the number of the finished parts and their total."""
+
+
+def _silent(work: str, done: int, total: int) -> None:
+    """An :data:`OnExport` that reports nothing."""
+
 
 @dataclass(frozen=True)
 class ShippedModel:
@@ -46,6 +55,10 @@ class ShippedModel:
     """The export options."""
     halvings: int = 0
     """How many times the sides of the textures are halved, for a model that is only seen from afar."""
+    description: Description | None = None
+    """The names and facts in the GLB."""
+    on_progress: OnExport = field(default=_silent, compare=False, repr=False)
+    """Called during long work."""
 
     @cached_property
     def cards(self) -> Cards:
@@ -63,7 +76,7 @@ class ShippedModel:
         elif self.config.outline == "pieces":
             cards = with_pieces(cards, self.config.pieces, self.config.corners, cards.outlined_alpha)
         if self.config.has_mips:
-            return with_mips(cards)
+            return with_mips(cards, partial(self.on_progress, "mip levels"))
         if not self.config.mipmapped(cards.alpha):
             return cards
         surface = None if cards.atlas.surface is None else tuple(surface_chain(cards.atlas.surface, None))
@@ -76,7 +89,20 @@ class ShippedModel:
     @cached_property
     def glb(self) -> bytes:
         """The GLB file."""
-        return glb_bytes(self.cards, self.config)
+        glb = self._plain_glb
+        return glb if self.description is None else described_glb(glb, self.description)
+
+    @cached_property
+    def _plain_glb(self) -> bytes:
+        if self.config.textures != "ktx2":  # which alone takes long
+            return glb_bytes(self.cards, self.config)
+        return glb_bytes(self.cards, self.config, partial(self.on_progress, "textures"))
+
+    def described(self, description: Description) -> ShippedModel:
+        """The same model with names and facts in its GLB."""
+        model = replace(self, description=description)
+        vars(model).update(cards=self.cards, _plain_glb=self._plain_glb)  # so that they are not computed twice
+        return model
 
     @property
     def overdraw(self) -> float:
@@ -128,17 +154,21 @@ class ShippedModel:
         return list(contents)
 
 
-def shipped_model(cloud: BillboardCloud, config: ExportConfig | None = None, halvings: int = 0) -> ShippedModel:
+def shipped_model(
+    cloud: BillboardCloud, config: ExportConfig | None = None, halvings: int = 0, on_progress: OnExport = _silent
+) -> ShippedModel:
     """The model in the exported files of a billboard cloud; an alpha mode or cutoff that ``config`` leaves open is the cloud's own.
 
-    ``halvings`` halves the sides of the textures that many times, for a model that is only seen from afar.
+    ``halvings`` halves the sides of the textures that many times, for a model that is only seen from afar. ``on_progress`` is called during
+    long work. Raises InputError if the encoder of the textures is not installed.
     """
     resolved = (config or ExportConfig()).resolve()
+    resolved.check()  # before the polygons and the mip levels are computed
     if cloud.surface is not None and config is not None and config.material in ("unlit", "emissive"):
         fail("material", "the cloud has maps, whose colors contain no light", "leave out --material, or fit with --light baked")
     alpha = AlphaMode(resolved.alpha or cloud.alpha.kind, resolved.alpha_cutoff or cloud.alpha.cutoff)
     cloud = replace(cloud if resolved.transmits else cloud.opaque(), alpha=alpha)
-    return ShippedModel(cloud if resolved.masks else smoothed(cloud), resolved, halvings)
+    return ShippedModel(cloud if resolved.masks else smoothed(cloud), resolved, halvings, on_progress=on_progress)
 
 
 def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None = None) -> list[Path]:

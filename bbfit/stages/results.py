@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import csv
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bbfit.evaluation.report import Report
+from bbfit.evaluation.report import Report, Subject
 from bbfit.evaluation.scoring import OriginalTree, evaluate_model
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.model import ShippedModel
 from bbfit.files import write_bytes
-from bbfit.provenance import digest_file
+from bbfit.provenance import VERSIONS, digest_file
 from bbfit.reporting.html import RunFacts, report_page
 from bbfit.reporting.plots import comparison_picture
+from bbfit.stages.describing import described
 from bbfit.stages.stage import OnProgress, Stage
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views.dataset import ViewDataset
@@ -32,8 +34,12 @@ def export_outputs(config: ExportConfig, *, normals: bool = False) -> tuple[str,
     return ("model.glb", "model.obj", "model.mtl", "model.png", *optional)
 
 
-def export_stage(folder: Path, model: ShippedModel) -> Stage:
-    """Write ``model.glb`` and ``model.obj`` with its material and texture."""
+def export_stage(folder: Path, model: ShippedModel, report: Report, most_bytes: int | None = None) -> Stage:
+    """Write ``model.glb`` and ``model.obj`` with its material and texture.
+
+    The GLB contains names and facts of the ``report`` on the model, unless it would have more than ``most_bytes`` bytes with them.
+    """
+    model = shipped_with_facts(model, report, most_bytes)
 
     def work(on_progress: OnProgress) -> None:
         for step, suffix in enumerate((".glb", ".obj"), 1):
@@ -41,26 +47,48 @@ def export_stage(folder: Path, model: ShippedModel) -> Stage:
             on_progress("export", step, 2)
 
     outputs = export_outputs(model.config, normals=model.cloud.surface is not None)
-    return Stage("export", (model.config, digest_file(folder / "cloud.safetensors")), outputs, work)
+    return Stage("export", (model.config, digest_file(folder / "cloud.safetensors"), model.description), outputs, work)
 
 
-def evaluate_stage(folder: Path, model: ShippedModel, views: ViewDataset, tree: TreeFile | None, seconds: Mapping[str, float]) -> Stage:
-    """Score the exported model on the held-out views, and write ``metrics.json`` and ``comparison.png``.
+def shipped_with_facts(model: ShippedModel, report: Report, most_bytes: int | None) -> ShippedModel:
+    """The model with the facts of a report, or without if they would make it larger than ``most_bytes``."""
+    with_facts = described(model, report)
+    return model if most_bytes is not None and len(with_facts.glb) > most_bytes else with_facts
 
-    ``folder`` contains the outputs of the fit and of the export. ``tree`` is the original tree, if it is known. ``seconds`` are those of
-    the earlier stages, which the report contains.
+
+def completed(report: Report, model: ShippedModel, subject: Subject, most_bytes: int | None = None) -> Report:
+    """The report with its subject, and the size of the model's file with its facts. ``most_bytes`` is as in :func:`export_stage`."""
+    report = replace(report, subject=subject)
+    return replace(report, bytes=replace(report.bytes, model=len(shipped_with_facts(model, report, most_bytes).glb)))
+
+
+def evaluate_stage(
+    folder: Path,
+    model: ShippedModel,
+    views: ViewDataset,
+    original: OriginalTree,
+    subject: Subject,
+    seconds: Mapping[str, float],
+    most_bytes: int | None = None,
+) -> Stage:
+    """Make the model, score it on the held-out views, and write ``metrics.json`` and ``comparison.png``.
+
+    ``folder`` contains the outputs of the fit. ``original`` is the tree, as far as it is known. ``seconds`` are those of the earlier
+    stages, which the report contains. ``most_bytes`` is as in :func:`export_stage`.
     """
 
     def work(on_progress: OnProgress) -> None:
-        original, progress = original_tree(views, tree), partial(on_progress, "evaluate")
+        started, progress = time.perf_counter(), partial(on_progress, "evaluate")
+        assert model.glb  # makes it
+        spent = {**seconds, "export": time.perf_counter() - started}
         report = evaluate_model(model, views.test, original=original, turned=views.turned, lit=views.lit_test, on_progress=progress)
-        replace(report, seconds={**seconds, **report.seconds}).save(folder / "metrics.json")
+        report = replace(report, seconds={**spent, **report.seconds})
+        completed(report, model, subject, most_bytes).save(folder / "metrics.json")
         comparison_picture(model, views.test, folder / "comparison.png")
 
-    results = [digest_file(folder / name) for name in ("cloud.safetensors", "model.glb")]
     turned = None if views.turned is None else (views.turned.views.fingerprint, views.turned.turned.fingerprint)
     lit = None if views.lit_test is None else views.lit_test.fingerprint
-    inputs = (results, model.cloud.alpha, views.fingerprint, turned, lit, None if tree is None else tree.digest)
+    inputs = (subject, model.config, VERSIONS["export"], model.cloud.alpha, views.fingerprint, turned, lit, original, most_bytes)
     return Stage("evaluate", inputs, EVALUATE_OUTPUTS, work)
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from bbfit.checks import InputError, MissingFileError
+from bbfit.evaluation.distances import Distances
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
-from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeScore, ViewScore, stage_seconds
+from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeScore, Subject, ViewScore, stage_seconds
 from bbfit.evaluation.trunk import TrunkScore, TrunkView
 
 
@@ -26,7 +27,15 @@ SIZES = (SizeScore(64, 48, 20.5, 1.01, 0.1), SizeScore(32, 24, 21.5, None, 0.09)
 SHIMMER = (ShimmerScore(64, 48, 0.02, 1.25, 0.9), ShimmerScore(32, 24, 0.0, None, None))
 TRUNK = TrunkScore((TrunkView("a", 0.9, 2.0), TrunkView("b", 0.5, None)))
 REPORT = Report(
-    (score("a", 1.0), score("b", 1.5, None)), Cost(16, 113_152), Cost(None, 5_000), {"fit": 2.0}, sizes=SIZES, shimmer=SHIMMER, trunk=TRUNK
+    (score("a", 1.0), score("b", 1.5, None)),
+    Cost(16, 113_152),
+    Cost(None, 5_000),
+    {"fit": 2.0},
+    sizes=SIZES,
+    shimmer=SHIMMER,
+    trunk=TRUNK,
+    distances=Distances(1.5, 30.0, None),
+    subject=Subject("acer", ((0.0, 0.0, -1.0), (1.0, 2.0, 3.0)), (0.0, 1.0, 0.0), 2.5, 1.0, "0" * 64),
 )
 MEASURES = {
     "over_white": {"psnr", "ssim", "flip"},
@@ -80,6 +89,8 @@ def test_schema() -> None:
         "light",
         "alpha",
         "seconds",
+        "distances",
+        "subject",
         "sizes",
         "shimmer",
         "rings",
