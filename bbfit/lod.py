@@ -65,10 +65,10 @@ def build_lod(
 
     Each level replaces the next finer one at the distance from which its error stays below ``config.error_pixels``. The error is that of
     its silhouette in the worst training view, in meters at the tree's axis, with a margin for the views in between. In pixels, it is
-    inversely proportional to the distance. The colors must look the same too: their mean error at the size on the
-    screen (:func:`~bbfit.evaluation.color_error.mean_color_error`) is at most ``config.color_error`` in the training views. No level is shown larger than the views
-    of its fit. The textures of a level have the resolution of the screen at its distance. The default format of textures is ``auto``: KTX2
-    with mip levels if its encoder is installed, and PNG; for PlayCanvas it is PNG.
+    inversely proportional to the distance. The colors must look the same too: their mean error at the size on the screen
+    (:func:`~bbfit.evaluation.color_error.mean_color_error`) is at most ``config.color_error`` in the training views. No level is shown
+    larger than the views of its fit. The textures of a level have the resolution of the screen at its distance. The default format of
+    textures is ``auto``: KTX2 with mip levels if its encoder is installed, and PNG; for PlayCanvas it is PNG.
 
     A killed build continues where it stopped. Stages with current results are skipped.
 
