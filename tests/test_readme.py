@@ -331,7 +331,7 @@ def offered() -> set[str]:
 @each(PAGES)
 def test_options_and_commands_that_are_mentioned_exist(page: Path, offered: set[str]) -> None:
     text = prose(page)
-    other = {"--help", "--fast", "--out", "--quick", "--strict", "--every", "--panorama"}  # the last two are of scripts/engines.py
+    other = {"--help", "--fast", "--out", "--quick", "--strict", "--every", "--panorama"}  # the last two are of scripts/viewers.py
     mentioned = {option.rstrip(".") for option in re.findall(r"(?<![\w-])--[a-z][\w.-]*", text)}
     assert mentioned - other <= offered
     assert {name for name in re.findall(r"`bbfit ([a-z]+)", text)} <= set(COMMANDS)

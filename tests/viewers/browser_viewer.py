@@ -1,8 +1,13 @@
-"""What the real three.js and Babylon.js show of a GLB: their renderers and loaders in a headless Chromium, by a software GPU."""
+"""What real programs show of a GLB: their renderers and loaders in a headless Chromium, by a software GPU.
+
+page.js says what a page gives. A further program needs its package in tests/node, a line of ``PACKAGES``, an import in page.html where it
+is a module, and a page.
+"""
 
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
@@ -17,12 +22,23 @@ from playwright.sync_api import Browser, ConsoleMessage, Page, Route
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.light import Light
+from bbfit.glb import gltf_parts
 
 HERE = Path(__file__).parent
 NODE = HERE.parent / "node"
 # No such host: every request is answered from the disk.
 ORIGIN = "https://viewer.invalid"
-TYPES = {".html": "text/html", ".js": "text/javascript", ".wasm": "application/wasm", ".glb": "model/gltf-binary"}
+SCRIPT = "text/javascript"
+TYPES = {".html": "text/html", ".js": SCRIPT, ".mjs": SCRIPT, ".wasm": "application/wasm", ".glb": "model/gltf-binary"}
+# The programs: the name of the page and the package of npm.
+PACKAGES = {
+    "three": "three",
+    "babylon": "@babylonjs/core",
+    "playcanvas": "playcanvas",
+    "model-viewer": "@google/model-viewer",
+    "cesium": "cesium",
+    "filament": "filament",
+}
 # OpenCV's camera axes to OpenGL's: +Y up, -Z forward.
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -58,17 +74,18 @@ class BrowserShow:
     images: NDArray[np.float64]
     """Display-referred RGB over white in [0, 1], one sample a pixel, [V, H, W, 3]."""
     calls: tuple[int, ...]
-    """Draw calls of each view; a blended material that shows both sides takes two a mesh, the back faces first."""
+    """Draw calls of each view; a blended material that shows both sides takes two a mesh, the back faces first. Zeros of most programs,
+    which do not tell."""
     triangles: tuple[int, ...]
-    """Triangles drawn in each view, counted once a draw call."""
+    """Triangles drawn in each view, counted once a draw call; zeros where calls are."""
     materials: tuple[BrowserMaterial, ...]
-    """Materials of the meshes that are shown."""
+    """Materials of the meshes that are shown, if the program's page tells."""
     warnings: tuple[str, ...]
     """What the program warned of."""
 
 
 class BrowserViewer:
-    """A page with a program, which shows one model after another; made by :func:`open_three` and :func:`open_babylon`."""
+    """A page with a program, which shows one model after another; made by :func:`open_program`."""
 
     def __init__(self, browser: Browser, thread: ThreadPoolExecutor, page: str) -> None:
         self._browser, self._thread, self._address = browser, thread, page
@@ -104,15 +121,15 @@ class BrowserViewer:
         self._warnings.clear()
         page = self._page = self._page or self._open()
         try:
-            found = page.evaluate("node => window.load(node)", node)
-            bounds = np.array([found["low"], found["high"]])
+            materials = page.evaluate("node => window.load(node)", node)
+            bounds = extent(glb)
             views = [_draw(page, camera[index], bounds, None if light is None else light[[index]]) for index in range(len(camera))]
             assert not self._errors, self._errors
         except BaseException:
             self._close()
             raise
         images, calls, triangles = zip(*views, strict=True)
-        return BrowserShow(np.stack(images), calls, triangles, tuple(map(_material, found["materials"])), tuple(self._warnings))
+        return BrowserShow(np.stack(images), calls, triangles, tuple(map(_material, materials)), tuple(self._warnings))
 
     def _open(self) -> Page:
         page = self._browser.new_page()
@@ -145,25 +162,36 @@ class BrowserViewer:
 
 
 @contextmanager
-def open_three(browser: Browser, thread: ThreadPoolExecutor, query: str = "") -> Iterator[BrowserViewer]:
-    """A page for as many GLBs as wanted; the test fails where there is no three.js. three_page.js says what a ``query`` is."""
-    with _open(browser, thread, "three", f"three.html{query}") as viewer:
+def open_program(browser: Browser, thread: ThreadPoolExecutor, program: str, query: str = "") -> Iterator[BrowserViewer]:
+    """A page of one of ``PACKAGES`` for as many GLBs as wanted; the test fails where the program is not installed.
+
+    A ``query`` as ``smooth=own`` sets what the program's page says.
+    """
+    version_of(program)
+    with closing(BrowserViewer(browser, thread, f"page.html?program={program}&{query}")) as viewer:
         yield viewer
 
 
-@contextmanager
-def open_babylon(browser: Browser, thread: ThreadPoolExecutor, query: str = "") -> Iterator[BrowserViewer]:
-    """The same with Babylon.js; babylon_page.js says what a ``query`` is."""
-    with _open(browser, thread, "@babylonjs", f"babylon.html{query}") as viewer:
-        yield viewer
+def version_of(program: str) -> str:
+    """The version of one of ``PACKAGES`` that is installed; the test fails where none is."""
+    described = NODE / "node_modules" / PACKAGES[program] / "package.json"
+    if not described.is_file():
+        pytest.fail(f"{PACKAGES[program]} is not installed: install Node.js and run `npm ci` in {NODE}")
+    return str(json.loads(described.read_text(encoding="utf-8"))["version"])
 
 
-@contextmanager
-def _open(browser: Browser, thread: ThreadPoolExecutor, package: str, page: str) -> Iterator[BrowserViewer]:
-    if not (NODE / "node_modules" / package).is_dir():
-        pytest.fail(f"{package} is not installed: install Node.js and run `npm ci` in {NODE}")
-    with closing(BrowserViewer(browser, thread, page)) as viewer:
-        yield viewer
+def extent(glb: Path) -> NDArray[np.float64]:
+    """Least and greatest coordinates of all meshes in a GLB whose nodes are moved, if at all, by a matrix of their own, [2, 3]."""
+    tree, _ = gltf_parts(glb.read_bytes())
+    corners = []
+    for node in tree["nodes"]:
+        assert not {"translation", "rotation", "scale"} & node.keys()
+        matrix = np.reshape(node.get("matrix", np.eye(4)), (4, 4))  # of rows of points
+        np.testing.assert_array_equal(matrix[:3], np.eye(4)[:3], err_msg="the node is turned or scaled")
+        for primitive in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
+            accessor = tree["accessors"][primitive["attributes"]["POSITION"]]
+            corners += [np.add(accessor[end], matrix[3, :3]) for end in ("min", "max")]
+    return np.stack([np.min(corners, 0), np.max(corners, 0)])
 
 
 def projection_matrix(camera: Camera, near: float, far: float) -> NDArray[np.float64]:
@@ -183,16 +211,19 @@ def projection_matrix(camera: Camera, near: float, far: float) -> NDArray[np.flo
 def _draw(page: Page, camera: Camera, bounds: NDArray[np.float64], light: Light | None) -> tuple[NDArray[np.float64], int, int]:
     distance = float(np.linalg.norm(camera.position.double().numpy() - bounds.mean(0)))
     radius = 1.01 * float(np.linalg.norm(bounds[1] - bounds[0])) / 2
+    near, far = max(distance - radius, 1e-3 * distance), distance + radius
     view = {
-        "projection": projection_matrix(camera, max(distance - radius, 1e-3 * distance), distance + radius).ravel().tolist(),
-        "cameraToWorld": (camera.camera_to_world.double().numpy() @ FLIP).ravel().tolist(),
+        "projection": projection_matrix(camera, near, far).T.ravel().tolist(),
+        "cameraToWorld": (camera.camera_to_world.double().numpy() @ FLIP).T.ravel().tolist(),
+        "near": near,
+        "far": far,
         "width": camera.width,
         "height": camera.height,
         "light": None if light is None else light_values(light),
     }
     drawn = page.evaluate("view => window.draw(view)", view)
     pixels = np.frombuffer(base64.b64decode(drawn["pixels"]), np.uint8).reshape(camera.height, camera.width, 4)
-    return pixels[::-1, :, :3] / 255.0, drawn["calls"], drawn["triangles"]
+    return pixels[..., :3] / 255.0, drawn["calls"], drawn["triangles"]
 
 
 def light_values(light: Light) -> dict[str, Any]:
@@ -222,14 +253,11 @@ def _material(found: dict[str, Any]) -> BrowserMaterial:
 
 def _answer(route: Route, glb: Path) -> None:
     """Serve the page, the program and the model under the page's own origin; refuse everything else."""
-    path = route.request.url.removeprefix(ORIGIN).partition("?")[0]
-    if path == "/model.glb":
-        file = glb
-    elif path.startswith(("/three/", "/@babylonjs/")):
-        file = NODE / "node_modules" / path.removeprefix("/")
-    else:
-        file = HERE / path.removeprefix("/")
+    name = route.request.url.removeprefix(f"{ORIGIN}/").partition("?")[0]
+    file = glb if name == "model.glb" else HERE / name
+    if not file.is_file():
+        file = NODE / "node_modules" / name
     if not file.is_file():
         route.abort()
         return
-    route.fulfill(path=file, content_type=TYPES[file.suffix])
+    route.fulfill(path=file, content_type=TYPES.get(file.suffix))

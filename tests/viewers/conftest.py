@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from browser_viewer import BrowserViewer, open_three
+from browser_viewer import BrowserViewer, open_program
 from playwright.sync_api import Browser
 
 from bbfit.geometry.camera import Camera
@@ -22,7 +22,7 @@ sys.path.append(str(Path(__file__).parents[1] / "exporting"))  # for glb_viewer
 @pytest.fixture(scope="session")
 def three(chromium: tuple[Browser, ThreadPoolExecutor]) -> Iterator[BrowserViewer]:
     """three.js in a browser."""
-    with open_three(*chromium) as viewer:
+    with open_program(*chromium, "three") as viewer:
         yield viewer
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from browser_viewer import open_babylon
+from browser_viewer import open_program
 from glb_edit import with_min_filter
 from noise_scene import noise_cloud
 from playwright.sync_api import Browser
@@ -35,7 +35,7 @@ def test_babylon_lights_maps_as_bbfit_does(
     lights = Light.of(sky(5, 40.0), 1.8 * torch.pi, 0.4, (1.0, 0.9, 0.8))
     opposite = Light(lights.sun_directions * torch.tensor([-1.0, 1.0, -1.0]), *list(vars(lights).values())[1:])
     config = ExportConfig(profile="babylon", alpha=alpha, outline="rectangle", mipmaps=False)  # type: ignore[arg-type]
-    with open_babylon(*chromium, f"?handed={handed}&anisotropy=1") as babylon:
+    with open_program(*chromium, "babylon", f"handed={handed}&anisotropy=1") as babylon:
         for two_sided in (False, True):
             model = shipped_model(with_maps(noise_cloud(3 if alpha == "mask" else 1, texels=32, two_sided=two_sided)), config)
             (path,) = model.save(tmp_path / f"{two_sided}.glb")

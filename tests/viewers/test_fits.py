@@ -1,32 +1,35 @@
-"""What is shipped is what was scored: fits to renders of a tree, exported, seen in three.js and Blender from the held-out cameras."""
+"""What is shipped is what was scored: fits to renders of a tree, exported, seen in real programs from the held-out cameras."""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
+import torch
 from blender_viewer import render_blender
-from browser_viewer import BrowserViewer, open_three
+from browser_viewer import PACKAGES, BrowserViewer, open_program
 from numpy.typing import NDArray
 from playwright.sync_api import Browser
 
 from bbfit.evaluation import metrics
 from bbfit.evaluation.scoring import evaluate, held_out
-from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.config import ExportConfig, Profile
 from bbfit.exporting.lod import LodLevel, lod_glb
-from bbfit.exporting.model import export, shipped_model
+from bbfit.exporting.model import ShippedModel, export, shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import fit
+from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import over_color
+from bbfit.images import linear_to_srgb, over_color, srgb_to_linear
 from bbfit.rendering.cards import draw_cards
 from bbfit.views.dataset import ViewDataset
 
 # What a viewer may differ by, in dB: from bbfit's own render, and in its score.
-LEAST, SCORE = 33.0, 0.3
+LEAST, SCORE = 33.0, 0.2
 THREE = ExportConfig(profile="three")
 
 
@@ -50,34 +53,100 @@ def files(fits: dict[str, BillboardCloud], tmp_path_factory: pytest.TempPathFact
     return {alpha: export(cloud, folder / f"{alpha}.glb", THREE)[0] for alpha, cloud in fits.items()}
 
 
+def mean_psnr(pictures: NDArray[np.float64], views: ViewDataset) -> float:
+    """The score over white of pictures of all held-out cameras."""
+    targets = over_color(views.test.targets(range(len(views.test)), torch.float64)).numpy()
+    return float(np.mean([metrics.psnr(*pair) for pair in zip(targets, pictures, strict=True)]))
+
+
 def psnrs(
     pictures: NDArray[np.float64], cloud: BillboardCloud, views: ViewDataset, config: ExportConfig | None = None
 ) -> tuple[float, float, float]:
     """Of a viewer's pictures: against bbfit's own renders, against the targets, and of bbfit's renders against the targets."""
     draw = shipped_model(cloud, config).draw
-    pairs = [[over_color(picture).numpy() for picture in held_out(draw, views.test, index)] for index in range(len(views.test))]
-    against_render = metrics.psnr(np.stack([render for _, render in pairs]), pictures)
-    against_target = float(np.mean([metrics.psnr(target, picture) for (target, _), picture in zip(pairs, pictures, strict=True)]))
-    return against_render, against_target, evaluate(cloud, views.test, export=config).mean.over_white.psnr
+    renders = [over_color(held_out(draw, views.test, index)[1]).numpy() for index in range(len(views.test))]
+    against_render = metrics.psnr(np.stack(renders), pictures)
+    return against_render, mean_psnr(pictures, views), evaluate(cloud, views.test, export=config).mean.over_white.psnr
 
 
-@pytest.mark.parametrize("alpha", ["mask", "blend"])
-def test_three_shows_what_was_scored(
-    three: BrowserViewer, fits: dict[str, BillboardCloud], files: dict[str, Path], views: ViewDataset, alpha: str
+def twice(model: ShippedModel, views: ViewDataset) -> tuple[Camera, NDArray[np.float64]]:
+    """Two held-out cameras at twice the views' size, and bbfit's own pictures over white."""
+    cameras = views.test.cameras.resized(2 * views.test.cameras.width, 2 * views.test.cameras.height)[[0, 3]]
+    return cameras, over_color(model.draw(cameras).double()).numpy()
+
+
+@pytest.mark.parametrize("program", [program for program in PACKAGES if program != "filament"])
+def test_web_programs_show_what_was_scored(
+    program: str, chromium: tuple[Browser, ThreadPoolExecutor], fits: dict[str, BillboardCloud], views: ViewDataset, tmp_path: Path
 ) -> None:
-    """Scores at the views' size, pictures at twice that. Measured: mask 36.5 dB, the score 0.05 dB off; blend 53.3 and 0.002 dB.
+    """The default export and the program's own of a blended fit: scores at the views' size, pictures at twice that.
 
-    A mask differs most where one pixel in hundreds falls to the other side of the cutoff, as graphics cards round places. A default acer
-    at 256 x 256 pixels is at 35.0 dB.
+    Measured for mask and blend, in dB: three.js and Babylon.js 36.6 and 58.1, PlayCanvas 36.2 and 50.1, model-viewer 36.6 and 56.7,
+    CesiumJS 36.9 and 46.2. Scores differ by at most 0.09 dB. A mask differs most where one pixel in hundreds falls to the other side of the
+    cutoff, as graphics cards round places. CesiumJS has no mip levels here, see the test below. In Babylon.js and model-viewer textures are
+    filtered as the file says; with their own anisotropic filters of level 4 see docs/engines.md.
     """
-    path, model = files[alpha], shipped_model(fits[alpha], THREE)
-    show = three.show(path, views.test.cameras)
-    _, score, told = psnrs(show.images, fits[alpha], views, THREE)
-    assert abs(score - told) <= SCORE
-    cameras = views.test.cameras.resized(2 * views.test.cameras.width, 2 * views.test.cameras.height)
-    own = [over_color(model.draw(cameras[index]).double()).numpy() for index in range(len(cameras))]
-    assert metrics.psnr(np.stack(own), three.render(path, cameras)) >= LEAST
-    assert {(material.transparent, material.alpha_test > 0) for material in show.materials} == {(alpha == "blend", alpha == "mask")}
+    own = ExportConfig(profile=program if program in get_args(Profile) else "three")  # type: ignore[arg-type]
+    with open_program(*chromium, program, "anisotropy=1") as viewer:
+        for alpha, config in (("mask", ExportConfig()), ("blend", own)):
+            config = replace(config, mipmaps=False) if program == "cesium" else config
+            model = shipped_model(fits[alpha], config)
+            (path,) = model.save(tmp_path / f"{alpha}.glb")
+            show = viewer.show(path, views.test.cameras)
+            _, score, told = psnrs(show.images, fits[alpha], views, config)
+            assert abs(score - told) <= SCORE
+            cameras, drawn = twice(model, views)
+            assert metrics.psnr(drawn, viewer.render(path, cameras)) >= LEAST
+            modes = {(material.transparent, material.alpha_test > 0) for material in show.materials}
+            assert modes <= {(alpha == "blend", alpha == "mask")} and not show.warnings
+
+
+def test_cesium_scales_textures_with_mip_levels(
+    chromium: tuple[Browser, ThreadPoolExecutor], fits: dict[str, BillboardCloud], views: ViewDataset, tmp_path: Path
+) -> None:
+    """To powers of two, by way of premultiplied colors, which is why the test above leaves mip levels out.
+
+    Measured: 24.9 dB from bbfit's drawing, and 0.13 dB off in score.
+    """
+    model = shipped_model(fits["mask"])
+    (path,) = model.save(tmp_path / "model.glb")
+    cameras, drawn = twice(model, views)
+    with open_program(*chromium, "cesium") as cesium:
+        assert 22 < metrics.psnr(drawn, cesium.render(path, cameras)) < 28
+
+
+@pytest.mark.parametrize(("alpha", "least", "score"), [("mask", 29, 0.2), ("blend", 24, 0.7)])
+def test_filament_mixes_in_linear_light(
+    alpha: str,
+    least: float,
+    score: float,
+    chromium: tuple[Browser, ThreadPoolExecutor],
+    fits: dict[str, BillboardCloud],
+    views: ViewDataset,
+    tmp_path: Path,
+) -> None:
+    """With linear tone mapping it shows what bbfit draws where layers are mixed in linear light: blended ones, and smooth edges of masks.
+
+    Measured for mask and blend: 33.9 and 46.0 dB from that drawing, 32.7 and 26.1 dB from bbfit's own, where layers are mixed as displayed;
+    scores 0.16 and 0.59 dB below bbfit's. It has no setting for that. With hard edges it draws masks fuller than they are.
+    """
+    cloud, config = fits[alpha], ExportConfig(profile="three" if alpha == "blend" else None)
+    colors, alphas = np.split(cloud.texels.numpy(), [3], -1)
+    linear = replace(cloud, texels=torch.from_numpy(np.concatenate([srgb_to_linear(colors), alphas], -1)))
+
+    def smooth(cloud: BillboardCloud) -> ShippedModel:
+        model = shipped_model(cloud, config)
+        return model.antialiased() if alpha == "mask" else model
+
+    model = smooth(cloud)
+    (path,) = model.save(tmp_path / "model.glb")
+    cameras, drawn = twice(model, views)
+    with open_program(*chromium, "filament") as filament:
+        small, large = filament.render(path, views.test.cameras), filament.render(path, cameras)
+    mixed = linear_to_srgb(over_color(smooth(linear).draw(cameras).double()).numpy())
+    assert metrics.psnr(mixed, large) >= LEAST
+    assert metrics.psnr(drawn, large) >= least
+    assert abs(mean_psnr(small, views) - mean_psnr(over_color(model.draw(views.test.cameras).double()).numpy(), views)) <= score
 
 
 def test_three_smooths_the_edges_of_masks(
@@ -92,7 +161,7 @@ def test_three_smooths_the_edges_of_masks(
     own = np.stack([over_color(model.draw(cameras[index]).double()).numpy() for index in range(len(cameras))])
     found = {}
     for smooth in ("centered", "own"):
-        with open_three(*chromium, f"?smooth={smooth}") as three:
+        with open_program(*chromium, "three", f"smooth={smooth}") as three:
             found[smooth] = metrics.psnr(own, three.render(files["mask"], cameras))
     assert found["centered"] >= LEAST
     assert found["own"] < found["centered"] - 6

@@ -1,4 +1,5 @@
-// Loads GLBs with three.js and draws them from given cameras; browser_viewer.py calls load() once a GLB and then draw() once a view.
+// three.js: page.js calls load() once a GLB and draw() once a view.
+import { canvas, query } from "/page.js";
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { KTX2Loader } from "three/addons/loaders/KTX2Loader.js";
@@ -19,14 +20,16 @@ const HIDDEN = 1;
 
 // With ?smooth=centered, masks are drawn with alpha to coverage as docs/engines.md describes: three.js gets the usual ramp around the cutoff.
 // With ?smooth=own it keeps its own, which begins at the cutoff.
-const smooth = new URLSearchParams(location.search).get("smooth");
+const smooth = query.get("smooth");
 if (smooth === "centered") {
   THREE.ShaderChunk.alphatest_fragment = THREE.ShaderChunk.alphatest_fragment.replace(
     "smoothstep( alphaTest, alphaTest + fwidth( diffuseColor.a ), diffuseColor.a )",
     "clamp( ( diffuseColor.a - alphaTest ) / max( fwidth( diffuseColor.a ), 0.0001 ) + 0.5, 0.0, 1.0 )",
   );
 }
-const renderer = new THREE.WebGLRenderer({ antialias: smooth !== null, alpha: false });
+// Without alpha of its own: three.js always asks for one, and what alpha to coverage writes there lets the page through.
+const context = canvas.getContext("webgl2", { alpha: false, antialias: smooth !== null });
+const renderer = new THREE.WebGLRenderer({ canvas, context });
 renderer.setPixelRatio(1);
 renderer.setClearColor(0xffffff, 1);
 renderer.outputColorSpace = THREE.SRGBColorSpace;
@@ -36,9 +39,7 @@ const loader = new GLTFLoader().setKTX2Loader(
   new KTX2Loader().setTranscoderPath("/three/examples/jsm/libs/basis/").detectSupport(renderer),
 );
 
-// Loads the model in place of the one before; node is the name of the only node to show, or null. Tells the extent of what is shown and
-// its materials.
-window.load = async (node) => {
+export async function load(node) {
   scene.traverse(({ geometry, material }) => {
     geometry?.dispose();
     material?.map?.dispose();
@@ -50,17 +51,14 @@ window.load = async (node) => {
   if (node !== null) await showOnly(gltf, node);
   scene.updateMatrixWorld(true);
 
-  const box = new THREE.Box3();
   const materials = new Set();
   scene.traverse((object) => {
     if (!object.isMesh || !object.layers.isEnabled(SHOWN)) return;
-    object.geometry.computeBoundingBox(); // of the vertices; the loader's is what the file says it is
-    box.union(object.geometry.boundingBox.clone().applyMatrix4(object.matrixWorld));
     materials.add(object.material);
     object.material.alphaToCoverage = smooth !== null && object.material.alphaTest > 0;
   });
-  return { low: box.min.toArray(), high: box.max.toArray(), materials: [...materials].map(describe) };
-};
+  return [...materials].map(describe);
+}
 
 // Levels of detail are nodes beside the scene (MSFT_lod), which three.js does not load by itself.
 async function showOnly(gltf, name) {
@@ -98,37 +96,24 @@ function illuminate({ direction, strength, color, ambient }) {
 }
 
 // Lights the scene by an equirectangular picture: 32-bit RGBA in base 64, the bottom row first.
-window.surround = ({ values, width, height }) => {
+export function surround({ values, width, height }) {
   const bytes = Uint8Array.from(atob(values), (letter) => letter.charCodeAt(0));
   const picture = new THREE.DataTexture(new Float32Array(bytes.buffer), width, height, THREE.RGBAFormat, THREE.FloatType);
   picture.mapping = THREE.EquirectangularReflectionMapping;
   picture.minFilter = picture.magFilter = THREE.LinearFilter;
   picture.needsUpdate = true;
   scene.environment = picture;
-};
+}
 
-// Draws one view. Matrices are lists of 16 numbers, row after row. Pixels are RGBA bytes in base 64, the bottom row first.
-window.draw = ({ projection, cameraToWorld, width, height, light }) => {
+export function draw({ projection, cameraToWorld, width, height, light }) {
   renderer.setSize(width, height, false);
   if (light !== null) illuminate(light);
   const camera = new THREE.Camera();
   camera.matrixAutoUpdate = camera.matrixWorldAutoUpdate = false;
-  camera.matrixWorld.set(...cameraToWorld);
+  camera.matrixWorld.fromArray(cameraToWorld);
   camera.matrixWorldInverse.copy(camera.matrixWorld).invert();
-  camera.projectionMatrix.set(...projection);
+  camera.projectionMatrix.fromArray(projection);
   camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
   renderer.render(scene, camera);
-
-  const gl = renderer.getContext();
-  if (gl.drawingBufferWidth !== width || gl.drawingBufferHeight !== height) throw new Error("the canvas has another size");
-  const pixels = new Uint8Array(4 * width * height);
-  gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-  const { calls, triangles } = renderer.info.render;
-  return { calls, triangles, pixels: encode(pixels) };
-};
-
-function encode(bytes) {
-  let text = "";
-  for (let start = 0; start < bytes.length; start += 8192) text += String.fromCharCode(...bytes.subarray(start, start + 8192));
-  return btoa(text);
+  return renderer.info.render;
 }
