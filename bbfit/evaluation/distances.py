@@ -36,13 +36,13 @@ class Distances:
         """The verdict in a sentence, and what to do next."""
         screen, size = f"on a screen of {SCREEN.screen_height} lines", f"{self.near_meters:.3g} m"
         if not self.good:
-            said = f"Not good at any distance {screen}: outlines are right to a pixel from {size} on"
+            said = f"Not right at any distance {screen}: outlines are right to a pixel from {size} on"
             return f"{said}, but its density is off there. Try another --alpha, or --textures ktx2."
+        said = f"Outlines, to a pixel, and density are right from {size}"
         if self.far_meters is None:
-            said = f"Good from {size} {screen}: outlines are right to a pixel, and it is as dense as the tree."
+            said += f" {screen}."
         else:
-            said = f"Good from {size} to {self.far_meters:.3g} m {screen}: outlines are right to a pixel, and it is as dense as the tree."
-            said += " From afar it thins out or fills up: --textures ktx2 has mip levels that keep its density."
+            said += f" to {self.far_meters:.3g} m {screen}. From afar, --textures ktx2 has mip levels that keep the density."
         if self.silhouette_pixels <= SCREEN.error_pixels:
             return f"{said} The views do not show it closer: for that, render them larger (--size)."
         return f"{said} For closer views, allow more --billboards, or make levels with bbfit lod."

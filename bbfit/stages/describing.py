@@ -16,7 +16,7 @@ from bbfit.provenance import digest_file
 from bbfit.views.dataset import ViewDataset
 
 # Names of files and folders that say nothing about a tree.
-_NO_NAMES = ("", "views", "images", "train", "test", "tree", "cloud", "model")
+_NO_NAMES = ("", "views", "images", "train", "test", "tree", "cloud", "model", "data", "runs")
 
 
 def subject_of(views: ViewDataset, cloud: Path, name: str | None = None) -> Subject:
@@ -24,16 +24,16 @@ def subject_of(views: ViewDataset, cloud: Path, name: str | None = None) -> Subj
     tree = views.request.tree if views.request else None
     light = views.test.light
     sun = {} if light is None else _sun(light)
-    folders = views.train.paths[0].resolve().parents
+    folders = views.train.paths[0].resolve().parents[:3]  # images, views, and what they are in
     named = name or plain_name(*([Path(tree.name)] if tree and tree.name else []), *folders)
     bounds = None if tree is None or tree.bounds is None else tuple(tuple(map(float, corner)) for corner in tree.bounds)
     return Subject(named, bounds, cloud=digest_file(cloud), **sun)
 
 
 def plain_name(*paths: Path) -> str:
-    """The name of a tree: that of the first file or folder whose name says something. Bytes that are no text become codes."""
+    """The name of a tree: that of the first file or folder whose name says something, or ``tree``. Bytes that are no text become codes."""
     names = [path.stem.encode(errors="backslashreplace").decode() for path in paths]
-    return next((name for name in names if name.lower() not in _NO_NAMES), "billboards")
+    return next((name for name in names if name.lower() not in _NO_NAMES), "tree")
 
 
 def described(model: ShippedModel, report: Report) -> ShippedModel:
@@ -46,7 +46,7 @@ def described(model: ShippedModel, report: Report) -> ShippedModel:
         distances = {name: value for name, value in asdict(report.distances).items() if name != "silhouette_pixels"}
         distances |= {"screen_height": float(SCREEN.screen_height), "screen_fov_degrees": SCREEN.screen_fov_degrees}
     description = Description(
-        name=subject.tree or "billboards",
+        name=subject.tree or "tree",
         billboards=len(cloud),
         alpha=cloud.alpha,
         light=kind,
@@ -75,7 +75,7 @@ def described_by_run(model: ShippedModel, cloud: Path) -> ShippedModel:
         pass
     kind = "baked" if model.cloud.surface is None else "maps"
     sun = {} if model.cloud.light is None else _sun(model.cloud.light)
-    return model.described(Description(plain_name(cloud, *cloud.resolve().parents), len(model.cloud), model.cloud.alpha, kind, **sun))
+    return model.described(Description(plain_name(cloud, cloud.resolve().parent), len(model.cloud), model.cloud.alpha, kind, **sun))
 
 
 def _sun(light: Light) -> dict[str, Any]:

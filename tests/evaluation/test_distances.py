@@ -30,6 +30,9 @@ def test_the_verdict_says_what_to_do_next() -> None:
         viewing_distances(silhouette, 16.0, sizes).verdict
         for silhouette, sizes in ((1.0, [(256, 1.0)]), (2.0, [(256, 1.0), (128, 0.9), (64, 0.7)]), (1.0, [(256, 0.5)]))
     ]
-    assert verdicts[0].startswith("Good from 72.4 m on a screen of 1080 lines") and "--size" in verdicts[0]
-    assert verdicts[1].startswith("Good from 145 m to 145 m on a screen")
-    assert "--billboards" in verdicts[1] and "ktx2" in verdicts[1] and verdicts[2].startswith("Not good")
+    assert (
+        verdicts[0].startswith("Outlines, to a pixel, and density are right from 72.4 m on a screen of 1080 lines.")
+        and "--size" in verdicts[0]
+    )
+    assert "right from 145 m to 145 m on a screen" in verdicts[1]
+    assert "--billboards" in verdicts[1] and "ktx2" in verdicts[1] and verdicts[2].startswith("Not right")
