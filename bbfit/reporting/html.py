@@ -79,7 +79,7 @@ def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunF
     environment.filters |= {"count": _count, "share": _share, "figure": _figure}
     own = files("bbfit.reporting") / "page"
     return environment.get_template("report.html").render(
-        title=f"{facts.source} as {len(cloud)} {'billboard' if len(cloud) == 1 else 'billboards'}",
+        title=f"{report.subject.tree or facts.source} as {len(cloud)} {'billboard' if len(cloud) == 1 else 'billboards'}",
         generator=generator(),
         style=Markup((own / "report.css").read_text(encoding="utf-8")),
         script=Markup((own / "report.js").read_text(encoding="utf-8")),
