@@ -13,14 +13,15 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import to_bytes
 
 
-def cloud_cards(cloud: BillboardCloud, padding: int, *, traced: bool = False) -> Cards:
+def cloud_cards(cloud: BillboardCloud, padding: int, *, traced: bool = False, paired: bool = False) -> Cards:
     """Rectangles and an atlas for which bilinear filtering gives the picture of :func:`~bbfit.rendering.dispatch.render`.
 
     A billboard's picture fades to transparent over one texel beyond its outermost texel centers, so half a texel beyond its rectangle. Each
     card is therefore half a texel larger than its rectangle on every side and reaches to the centers of the padding texels around its
     texture. A two-sided billboard becomes two cards in the same place, front and back, of opposite winding. So does a one-sided billboard
     with maps, with one texture for both: programs that show a quad from behind turn the whole normal, and one that points up would point
-    down. ``traced`` is for programs that cull nothing (``Cards.traced``): there such a billboard is one card that shows both sides.
+    down. ``traced`` is for programs that cull nothing (``Cards.traced``): there such a billboard is one card that shows both sides. With
+    ``paired``, one without maps becomes a pair as well.
 
     Textures are rounded to 8 bits, which changes a premultiplied color by at most 1/255 per layer. Transparent texels get another color
     (:func:`~bbfit.exporting.atlas.fill_cell`), which changes colors near the silhouette by at most 1/4 per layer, but no alpha. Raises
@@ -42,7 +43,7 @@ def cloud_cards(cloud: BillboardCloud, padding: int, *, traced: bool = False) ->
     corners = np.stack([centers - right - up, centers + right - up, centers + right + up, centers - right + up], 1)
     normals = np.cross(rights, ups)
 
-    culled = two_sided.astype(np.bool_) | (cloud.surface is not None and not traced)
+    culled = two_sided.astype(np.bool_) | paired | (cloud.surface is not None and not traced)
     owner = np.repeat(np.arange(len(cloud)), 1 + culled)
     back = np.diff(owner, prepend=-1) == 0
     textures = 1 + two_sided.astype(np.int64)

@@ -32,13 +32,14 @@ _EXTENSIONS = {"webp": ("EXT_texture_webp", "image/webp"), "ktx2": ("KHR_texture
 
 
 def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int], None] = lambda done, total: None) -> bytes:
-    """A GLB file with one mesh for the cards that show both sides, one for those with back-face culling, and one per card with an origin.
+    """A GLB file with one mesh for the cards that show both sides, one for those with back-face culling, and one per node of split cards.
 
     Cards with maps have a matte material (``KHR_materials_specular`` with the factor 0) with textures of base color, normals and occlusion,
     and tangents. Translucency is the alpha of the occlusion's texture, from which ``KHR_materials_diffuse_transmission`` takes it.
 
-    The node of a card with an origin is at that origin, and two vertices that no triangle uses center the mesh's bounds on it: programs
-    sort blended meshes by one or the other. The sampler uses mip levels if the file includes them (``ktx2``) or if the options let
+    The node of cards with an origin is at that origin, and two vertices that no triangle uses center the mesh's bounds on it: programs
+    sort blended meshes by one or the other. Its triangles are the cards' fronts and backs in the order of ``Card.ranks``, with back-face
+    culling; a front and a back share their vertices. The sampler uses mip levels if the file includes them (``ktx2``) or if the options let
     programs compute them (:meth:`~bbfit.exporting.config.ExportConfig.mipmapped`). ``on_picture`` is called with the number of encoded
     pictures and their total.
     """
@@ -49,31 +50,28 @@ def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int
     placeholder = Image.new("RGBA", (1, 1))  # trimesh writes texture coordinates for textured materials only
     scene = trimesh.Scene(base_frame="billboard_cloud")
     for name, chosen in _meshes(cards).items():
+        origin = chosen[0].origin
+        one_sided = chosen[0].culled or origin is not None
         material = trimesh.visual.material.PBRMaterial(
-            name="billboards_two_sided" if chosen[0].culled else "billboards",
+            name="billboards_two_sided" if one_sided else "billboards",
             baseColorTexture=placeholder,
             alphaMode="MASK" if cards.alpha.kind == "mask" else "BLEND",
             alphaCutoff=float(cards.alpha.cutoff) if cards.alpha.kind == "mask" else None,
-            doubleSided=not chosen[0].culled,
+            doubleSided=not one_sided,
             metallicFactor=0.0,
             roughnessFactor=1.0,
         )
-        vertices = list(map(_vertices, chosen))
-        points, uvs, normals = (np.concatenate(parts) for parts in zip(*vertices, strict=True))
-        first = np.cumsum([0, *(len(card.corners) for card in chosen)])
+        points, uvs, normals, tangents = _vertices(chosen)
         mesh = trimesh.Trimesh(
             points,
-            np.concatenate([card.triangles + start for card, start in zip(chosen, first, strict=False)]),
+            _triangles(chosen),
             vertex_normals=normals,
             # trimesh counts v from the bottom and flips it when it writes.
             visual=trimesh.visual.TextureVisuals(uv=np.stack([uvs[:, 0], 1 - uvs[:, 1]], -1), material=material),
             process=False,
         )
         if cards.atlas.surface is not None:
-            mesh.vertex_attributes[_TANGENT] = np.concatenate(
-                [_tangents(card, len(part[0])) for card, part in zip(chosen, vertices, strict=True)]
-            )
-        origin = chosen[0].origin
+            mesh.vertex_attributes[_TANGENT] = tangents
         place = None if origin is None else trimesh.transformations.translation_matrix(origin)
         scene.add_geometry(mesh, node_name=name, geom_name=name, transform=place)
     # Without light nothing reads normals, which are a third of a vertex.
@@ -84,33 +82,45 @@ def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int
     return joined_glb(tree, _with_pictures(tree, _with_short_indices(tree, views), pictures, resolved, on_picture))
 
 
-def _vertices(card: Card) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Points relative to the card's origin, texture coordinates and normals."""
-    if card.origin is None:
-        points, uvs = card.corners, card.uvs
-    else:
-        points = centered(card) - card.origin
-        uvs = np.concatenate([card.uvs, card.uvs[:1].repeat(len(points) - len(card.uvs), 0)])
-    return points, uvs, np.tile(card.normal, (len(points), 1))
+def _vertices(chosen: list[Card]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
+    """Of a mesh: points relative to its origin, texture coordinates, normals and tangents; two more vertices center it on an origin."""
+    points, uvs = [card.corners for card in chosen], [card.uvs for card in chosen]
+    counts = [len(card.corners) for card in chosen]
+    origin = chosen[0].origin
+    if origin is not None:
+        points, uvs = [*points, centered(chosen)], [*uvs, chosen[-1].uvs[[0, 0]]]
+        counts[-1] += 2
+    normals = np.concatenate([np.tile(card.normal, (count, 1)) for card, count in zip(chosen, counts, strict=True)])
+    tangents = np.concatenate([_tangents(card, count) for card, count in zip(chosen, counts, strict=True)])
+    return np.concatenate(points) - (0.0 if origin is None else origin), np.concatenate(uvs), normals, tangents
 
 
 def _tangents(card: Card, count: int) -> NDArray[np.float32]:
     """The tangents of a card's vertices, [count, 4]: glTF's bitangent, ``cross(normal, tangent) * w``, points up along the texture."""
-    assert card.tangent is not None
     right, up, normal = texture_axes(card)
     handed = np.sign(np.cross(normal, right) @ up)
     return np.tile(np.append(right, handed).astype(np.float32), (count, 1))
+
+
+def _triangles(chosen: list[Card]) -> NDArray[np.int64]:
+    """The triangles of a mesh in the order of drawing, [T, 3]."""
+    first = np.cumsum([0, *(len(card.corners) for card in chosen)]).tolist()
+    if chosen[0].origin is None:
+        return np.concatenate([card.triangles + start for card, start in zip(chosen, first, strict=False)])
+    faces = list[tuple[int, NDArray[np.int64]]]()
+    for card, start in zip(chosen, first, strict=False):
+        front = card.triangles + start
+        faces += [(card.ranks[0], front)] + ([] if card.culled else [(card.ranks[1], front[:, ::-1])])
+    return np.concatenate([triangles for _, triangles in sorted(faces, key=lambda face: face[0])])
 
 
 def _meshes(cards: Cards) -> dict[str, list[Card]]:
     """The cards of each mesh, by the mesh's name."""
     meshes = dict[str, list[Card]]()
     for name, culled in (("billboards", False), ("billboards_two_sided", True)):
-        joined = [card for card in cards.cards if card.culled == culled and card.origin is None]
-        apart = [card for card in cards.cards if card.culled == culled and card.origin is not None]
-        meshes |= {name: joined} if joined else {}
-        meshes |= {f"{name}_{index}": [card] for index, card in enumerate(apart)}
-    return meshes
+        together = [card for card in cards.cards if card.culled == culled and card.origin is None]
+        meshes |= {name: together} if together else {}
+    return meshes | {f"billboards_{index}": node for index, node in enumerate(cards.nodes)}
 
 
 def _complete(tree: dict[str, Any], cards: Cards, pictures: list[str], config: ResolvedExport) -> None:

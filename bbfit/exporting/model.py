@@ -67,8 +67,11 @@ class ShippedModel:
         They are those of the files, so they do not depend on whether a program smooths the edges of masks.
         """
         cloud = replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=False))
-        cards = cloud_cards(cloud, self.config.padding << self.halvings, traced=self.config.traced)
-        if self.config.split and cards.alpha.kind == "blend":
+        splits = self.config.split and cloud.alpha.kind == "blend"
+        # The nodes of a split model cull back faces, so a lit one needs the normals of both sides.
+        paired = splits and self.config.material != "unlit"
+        cards = cloud_cards(cloud, self.config.padding << self.halvings, traced=self.config.traced, paired=paired)
+        if splits:
             cards = split(cards)
         cards = reduced(cards, self.halvings)
         if self.config.outline == "hull":

@@ -40,6 +40,8 @@ class VisibilitySamples:
     """The texture of each hit, [H]."""
     points: NDArray[np.float64]
     """The place of each hit on its texture in texels, [H, 2]."""
+    seen_from: NDArray[np.int64]
+    """The camera of each hit, [H]."""
     camera: NDArray[np.int64]
     """The camera of each pair, [N]."""
     front: NDArray[np.int64]
@@ -51,6 +53,33 @@ class VisibilitySamples:
     This share is wrong if the two are drawn in the other order; all weights together are at most 1."""
 
 
+@dataclass(frozen=True)
+class Overlaps:
+    """N overlaps of two things in the picture of a camera: of two faces, or of two nodes."""
+
+    camera: NDArray[np.int64]
+    """Index of the camera, [N]."""
+    front: NDArray[np.int64]
+    """Index of the thing that is in front, [N]."""
+    back: NDArray[np.int64]
+    """Index of the thing that is behind it, [N]."""
+    weight: NDArray[np.float64]
+    """Share of the visible picture that is wrong in the other order, [N] (:class:`~bbfit.exporting.visibility.VisibilitySamples`)."""
+
+    def take(self, rows: NDArray) -> Overlaps:
+        """Some of the overlaps."""
+        return Overlaps(self.camera[rows], self.front[rows], self.back[rows], self.weight[rows])
+
+    def grouped(self, group: NDArray[np.int64]) -> Overlaps:
+        """The overlaps of different groups of things, given the group of each thing; those of one camera and pair add up."""
+        front, back, count = group[self.front], group[self.back], int(group.max(initial=0)) + 1
+        apart = front != back
+        entry, index = np.unique(((self.camera * count + front) * count + back)[apart], return_inverse=True)
+        rest, back = np.divmod(entry, count)
+        camera, front = np.divmod(rest, count)
+        return Overlaps(camera, front, back, np.bincount(index, self.weight[apart], len(entry)).astype(np.float64))
+
+
 def bounding_sphere(cards: Cards) -> tuple[NDArray[np.float64], float]:
     """The center of the cards' bounding box, [3], and the distance of the farthest corner from it, in meters."""
     corners = np.concatenate([card.corners for card in cards.cards])
@@ -58,11 +87,12 @@ def bounding_sphere(cards: Cards) -> tuple[NDArray[np.float64], float]:
     return center, float(np.linalg.norm(corners - center, axis=-1).max())
 
 
-def fit_rig(cards: Cards, count: int = 420) -> Rig:
+def fit_rig(cards: Cards, count: int = 1000) -> Rig:
     """The cameras that origins are fitted to: from 22 degrees below the horizon to straight above, at 1.5, 2.5 and 6 radii in turn.
 
     The directions form a spiral that turns by the golden angle, so no two have the same elevation or azimuth. An order that was fitted to
-    regular rings is wrong more often between the rings.
+    regular rings is wrong more often between the rings. It takes this many: with 420, eight planes of an aspen had 0.14 % wrong here and
+    0.22 % from elsewhere, with 1000 they had 0.08 % and 0.15 %.
     """
     center, radius = bounding_sphere(cards)
     index = np.arange(count) + 0.5
@@ -89,8 +119,8 @@ def check_rig(cards: Cards) -> Rig:
 def sample_visibility(cards: Cards, cameras: Rig, across: int = 32) -> VisibilitySamples:
     """Trace a grid of ``across`` x ``across`` rays from every camera over the cards.
 
-    Cards of one texture are parts of one sheet, which a ray meets once. Layers whose depths differ by less than a relative
-    :data:`~bbfit.operators.drawing.compositing.TIE` have no order.
+    Cards of one texture are parts of one sheet, which a ray meets once; it is seen from both sides if they are. Layers whose depths differ
+    by less than a relative :data:`~bbfit.operators.drawing.compositing.TIE` have no order.
     """
     eyes = cameras.eyes
     rays, cell = _rays(np.concatenate([card.corners for card in cards.cards]), cameras, across)
@@ -105,7 +135,9 @@ def sample_visibility(cards: Cards, cameras: Rig, across: int = 32) -> Visibilit
         with np.errstate(divide="ignore", invalid="ignore"):
             t = -facing[:, None] / (rays @ normal)
             places = (((eyes - middle) @ to_texel)[:, None] + t[..., None] * (rays @ to_texel)) + at.mean(0)
-        shown = (t > 0) & np.isfinite(t) & (facing > 0 if card.culled else facing != 0)[:, None]
+        others = [other for other in cards.cards if other.rectangle == card.rectangle]
+        from_behind = any(not other.culled or other.normal @ normal < 0 for other in others)
+        shown = (t > 0) & np.isfinite(t) & (facing != 0 if from_behind else facing > 0)[:, None]
         opacity = np.where(shown, bilinear(rimmed_alpha(cards, card.rectangle), places), 0.0)
         depth.append(np.where(opacity > 0, t, np.inf).astype(np.float32))
         alpha.append(opacity.astype(np.float32))
@@ -163,7 +195,7 @@ def _paired(cameras: Rig, cell: NDArray, rectangle: NDArray, depth: NDArray, alp
     index = index.reshape(2, -1)
     layer, at = np.divmod(used, max(len(camera), 1))
     sheet = order[layer, at]
-    return VisibilitySamples(cameras, rectangle[sheet], points[sheet, at], camera[ray], index[0], index[1], weight)
+    return VisibilitySamples(cameras, rectangle[sheet], points[sheet, at], camera[at], camera[ray], index[0], index[1], weight)
 
 
 def visible_cards(cards: Cards, samples: VisibilitySamples) -> NDArray[np.int64]:
@@ -171,9 +203,32 @@ def visible_cards(cards: Cards, samples: VisibilitySamples) -> NDArray[np.int64]
     owners = np.full(len(samples.points), -1)
     for rectangle in {card.rectangle for card in cards.cards}:
         at = np.flatnonzero(samples.rectangle == rectangle)
-        points = samples.points[at]
+        points, eyes = samples.points[at], samples.cameras.eyes[samples.seen_from[at]]
         for index, card in enumerate(cards.cards):
             if card.rectangle == rectangle:
                 normals, offsets = sides(texel_corners(cards, card))
-                owners[at[(points @ normals.T <= offsets + 1e-3).all(-1)]] = index
+                inside = (points @ normals.T <= offsets + 1e-3).all(-1)
+                owners[at[inside & (not card.culled or is_ahead(card, eyes))]] = index
     return owners
+
+
+def visible_faces(cards: Cards, samples: VisibilitySamples) -> NDArray[np.int64]:
+    """The face that each hit lies on, [H]: 2 i is the front of card i, 2 i + 1 its back; -1 for none."""
+    owners = visible_cards(cards, samples)
+    faces = np.where(owners < 0, -1, 2 * owners)
+    for index, card in enumerate(cards.cards):
+        at = np.flatnonzero(owners == index)
+        faces[at] += ~is_ahead(card, samples.cameras.eyes[samples.seen_from[at]])
+    return faces
+
+
+def overlaps_of(samples: VisibilitySamples, thing: NDArray[np.int64]) -> Overlaps:
+    """The overlaps of different things, given the thing that each hit lies on, [H], -1 for none; those of one camera and pair add up."""
+    real = (thing[samples.front] >= 0) & (thing[samples.back] >= 0)
+    hits = Overlaps(samples.camera[real], samples.front[real], samples.back[real], samples.weight[real])
+    return hits.grouped(thing)
+
+
+def is_ahead(card: Card, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which points, [N, 3], lie on the side of a card's plane that its normal points to, [N]."""
+    return (points - card.corners.mean(0)) @ card.normal > 0

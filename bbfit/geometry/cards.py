@@ -55,7 +55,10 @@ class Card:
     """For cards that take light: the unit vector from the texture's left to its right, [3]. The normals of a texture have the axes
     ``tangent``, up along the texture, and ``normal``."""
     origin: NDArray[np.float64] | None = None
-    """Point in meters by which programs sort the card if it is blended, [3]; such a card gets its own node."""
+    """Point in meters by which programs sort the card if it is blended, [3]; cards with the same origin are one node."""
+    ranks: tuple[int, int] = (0, 0)
+    """For a card with an origin: the places of its front and of its back in the order in which its node draws them. A culled card has only
+    the first."""
 
     @property
     def triangles(self) -> NDArray[np.int64]:
@@ -87,8 +90,17 @@ class Cards:
 
     @property
     def vertex_count(self) -> int:
-        """Vertices of all cards, with two more for each card with an origin, which center its bounds."""
-        return sum(len(card.corners) + 2 * (card.origin is not None) for card in self.cards)
+        """Vertices of all cards, with two more for each node of cards with an origin, which center its bounds."""
+        return sum(len(card.corners) for card in self.cards) + 2 * len(self.nodes)
+
+    @property
+    def nodes(self) -> list[list[Card]]:
+        """The cards of each node, for all cards with an origin."""
+        found = dict[tuple[float, ...], list[Card]]()
+        for card in self.cards:
+            if card.origin is not None:
+                found.setdefault(tuple(card.origin.tolist()), []).append(card)
+        return list(found.values())
 
     @property
     def visible_alpha(self) -> float:
