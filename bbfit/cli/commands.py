@@ -262,9 +262,13 @@ def export_command(
     names = names_beside(out, texture=True, normals=billboards.surface is not None, mip_files=export.resolve().mip_files)
     check_room("out", out.parent, 16 * len(billboards.texels))  # four bytes a texel for up to three pictures and all levels
     with single_files("bbfit export", out.parent, names, [cloud]), progress() as on_progress:
-        paths = described_by_run(shipped_model(billboards, export, on_progress=on_progress), cloud).save(out)
+        shipped = described_by_run(shipped_model(billboards, export, on_progress=on_progress), cloud)
+        paths = shipped.save(out)
     for path in paths:
         out_console.print(f"{path}  {path.stat().st_size:,} bytes", soft_wrap=True)
+    if out.suffix.lower() == ".glb":
+        nodes, vertices = shipped.cards.node_count, shipped.cards.vertex_count
+        out_console.print(f"nodes {nodes:,}, draw calls {nodes:,}, vertices {vertices:,}", soft_wrap=True)
     show_missing_encoder(export)
 
 

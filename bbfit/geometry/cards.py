@@ -103,6 +103,11 @@ class Cards:
         return list(found.values())
 
     @property
+    def node_count(self) -> int:
+        """Nodes of a GLB, one draw call each: :attr:`nodes`, one for the other cards that are culled, and one for those that are not."""
+        return len(self.nodes) + len({card.culled for card in self.cards if card.origin is None})
+
+    @property
     def visible_alpha(self) -> float:
         """The least alpha that is visible: the cutoff of mask, and 0 for the other modes, which show any alpha above 0."""
         return self.alpha.cutoff if self.alpha.kind == "mask" else 0.0
