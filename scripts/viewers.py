@@ -133,7 +133,11 @@ def measure(views: Path, run: Path, every: int, programs: list[str], browser: Ch
         if light is None if name == AS_IT_COMES else not (program.lights or light is None):
             continue
         config = bbfit.ExportConfig(profile=program.profile, mipmaps=program.mipmaps)
-        same = str(replace(config.resolve(), profile=None)), config.traced, config.transmits  # what the files depend on
+        same = (
+            str(replace(config.resolve(), profile=None)),
+            config.traced,
+            config.transmits and light is not None,
+        )  # what the files depend on
         if same not in models:
             models[same] = shipped_model(cloud, config)
         model = models[same]

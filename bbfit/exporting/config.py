@@ -34,6 +34,8 @@ class _Program:
     """Whether it cuts masks off at their alpha cutoff; otherwise they are blended (:func:`~bbfit.exporting.smoothing.smoothed`)."""
     transmits: bool = False
     """Whether it reads light that passes through leaves (KHR_materials_diffuse_transmission)."""
+    mipmaps: bool = True
+    """Whether mip levels do it good."""
     traced: bool = False
     """Whether it follows rays and culls nothing (:class:`~bbfit.geometry.cards.Cards`)."""
 
@@ -44,7 +46,8 @@ _PROGRAMS: dict[Profile | None, _Program] = {
     "babylon": _Program(transmits=True),
     "playcanvas": _Program(),
     "model-viewer": _Program(),
-    "cesium": _Program(),
+    # It computes mip levels from textures that it scales to powers of two, without the colors under transparent texels.
+    "cesium": _Program(mipmaps=False),
     "filament": _Program(),
     "godot": _Program(),
     "unity": _Program(),
@@ -52,7 +55,7 @@ _PROGRAMS: dict[Profile | None, _Program] = {
     # It drops alpha with KHR_materials_unlit, and sorts each pixel's layers by depth peeling.
     "vtk": _Program(split=False, material="emissive", masks=False),
     "panda3d": _Program(),
-    "blender": _Program(split=False, traced=True),
+    "blender": _Program(split=False, mipmaps=False, traced=True),
 }
 
 
@@ -89,7 +92,7 @@ class ExportConfig:
     """Keep the PNG beside a texture in another format, for programs that cannot read that format."""
     mipmaps: bool | None = None
     """Read the texture with mip levels from afar, so that the tree does not flicker. Programs compute those of a PNG as plain averages.
-    Default: yes, except for masks with a cutoff above 0.25, whose leaves would vanish; for the preset thesis; and for Blender."""
+    Default: yes, except for masks with a cutoff above 0.25, whose leaves would vanish; for the preset thesis; and for Blender and CesiumJS."""
     mip_files: bool = False
     """Also write the mip levels as PNG files beside the model, for programs that import them."""
     material: Material | None = None
@@ -123,8 +126,7 @@ class ExportConfig:
         """Whether a model with an alpha mode is read with mip levels."""
         if self.mipmaps is not None:
             return self.mipmaps
-        # Path tracers have no mip levels.
-        return not self.traced and (alpha.kind != "mask" or alpha.cutoff <= MOST_AVERAGED)
+        return _PROGRAMS[self.profile].mipmaps and (alpha.kind != "mask" or alpha.cutoff <= MOST_AVERAGED)
 
     @property
     def traced(self) -> bool:
