@@ -92,7 +92,7 @@ class ExportConfig:
     """Keep the PNG beside a texture in another format, for programs that cannot read that format."""
     mipmaps: bool | None = None
     """Read the texture with mip levels from afar, so that the tree does not flicker. Programs compute those of a PNG as plain averages.
-    Default: yes, except for masks with a cutoff above 0.25, whose leaves would vanish; for the preset thesis; and for Blender and CesiumJS."""
+    Default: yes, except for masks with a cutoff above 0.25, whose leaves would vanish; for the preset thesis; for Blender and CesiumJS."""
     mip_files: bool = False
     """Also write the mip levels as PNG files beside the model, for programs that import them."""
     material: Material | None = None
