@@ -214,7 +214,7 @@ def test_few_nodes_draw_many_pieces_in_the_right_order(nodes: int) -> None:
     assert len(few.nodes) <= nodes < len(pieces.nodes) <= len(pieces.cards)
     assert misordered(few, cameras()).mean <= WRONG
     assert max(difference(cards, few, key) for key in ("depth", "distance")) < 5e-4
-    assert misordered(split(cards, WRONG, nodes=1), cameras()).mean > 0.02
+    assert misordered(split(cards, WRONG, most=12, nodes=1), cameras()).mean > 0.02
 
 
 def test_an_order_without_circles_is_found() -> None:
