@@ -83,6 +83,7 @@ PROGRAMS = {
     "model-viewer, anisotropic": Program("model-viewer"),
     "CesiumJS": Program("cesium", mipmaps=False),
     "CesiumJS, mip levels": Program("cesium"),
+    "CesiumJS, order-independent": Program("cesium", "order=independent", mipmaps=False),
     "Filament, smooth edges": Program("filament", smooth=True),
     "Cycles": Program(None, lights=True),
     AS_IT_COMES: Program(None, lights=True),

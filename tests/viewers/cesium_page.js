@@ -1,9 +1,12 @@
-// CesiumJS: a scene without globe and sky. It has no tone mapping unless highDynamicRange is on.
-import { canvas, centered, refuse } from "/page.js";
+// CesiumJS: a scene without globe and sky. It has no tone mapping unless highDynamicRange is on. Layers are drawn from back to front; by
+// default it averages them (order-independent translucency), unless the page has ?order=independent.
+import { canvas, centered, query, refuse } from "/page.js";
 import { Axis, Cartesian3, Color, Matrix4, Model, PerspectiveFrustum, Scene } from "cesium";
 
 window.CESIUM_BASE_URL = "/cesium/Build/Cesium/";
-const scene = new Scene({ canvas, contextOptions: { webgl: { alpha: false, antialias: false } }, msaaSamples: 1 });
+const orderIndependentTranslucency = query.get("order") === "independent";
+const contextOptions = { webgl: { alpha: false, antialias: false } };
+const scene = new Scene({ canvas, orderIndependentTranslucency, contextOptions, msaaSamples: 1 });
 scene.backgroundColor = Color.WHITE;
 scene.highDynamicRange = false;
 scene.postProcessStages.fxaa.enabled = false;

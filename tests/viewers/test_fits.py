@@ -82,7 +82,7 @@ def test_web_programs_show_what_was_scored(
     """The default export and the program's own of a blended fit: scores at the views' size, pictures at twice that.
 
     Measured for mask and blend, in dB: three.js and Babylon.js 35.9 and 58.3, PlayCanvas 35.6 and 50.4, model-viewer 35.9 and 56.7,
-    CesiumJS 36.2 and 46.3. Scores differ by at most 0.09 dB. A mask differs most where one pixel in hundreds falls to the other side of the
+    CesiumJS 36.2 and 54.6. Scores differ by at most 0.09 dB. A mask differs most where one pixel in hundreds falls to the other side of the
     cutoff, as graphics cards round places. CesiumJS has no mip levels here, see the test below. In Babylon.js and model-viewer textures are
     filtered as the file says; with their own anisotropic filters of level 4 see docs/engines.md.
     """
