@@ -24,8 +24,7 @@ def subject_of(views: ViewDataset, cloud: Path, name: str | None = None) -> Subj
     tree = views.request.tree if views.request else None
     light = views.test.light
     sun = {} if light is None else _sun(light)
-    folders = views.train.paths[0].resolve().parents[:3]  # images, views, and what they are in
-    named = name or plain_name(*([Path(tree.name)] if tree and tree.name else []), *folders)
+    named = name or plain_name(*([Path(tree.name)] if tree and tree.name else []))
     bounds = None if tree is None or tree.bounds is None else tuple(tuple(map(float, corner)) for corner in tree.bounds)
     return Subject(named, bounds, cloud=digest_file(cloud), **sun)
 

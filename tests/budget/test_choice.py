@@ -592,7 +592,7 @@ def test_a_trial_is_a_short_fit_measured_on_views_it_has_not_seen(views: ViewDat
         assert trial.max_texels is None
         assert (trial.vertices, trial.texels, trial.bytes) == (cloud.vertex_count, len(cloud.texels), model_bytes(cloud, export))
         assert 0 < trial.texture_bytes < trial.bytes
-        assert trial.psnr == pytest.approx(validation_psnr(shipped_model(cloud), held), abs=6e-4) and trial.seconds >= 0
+        assert trial.psnr == pytest.approx(validation_psnr(shipped_model(cloud, export), held), abs=6e-4) and trial.seconds >= 0
 
 
 @pytest.mark.slow
