@@ -94,7 +94,7 @@ class RunConfig:
             views would not suffice for the fit.
         """
         self.export.check()
-        if self.fit.translucency and not self.export.transmits:
+        if self.fit.translucency and not self.export.program.transmits:
             fail("translucency", "only Babylon.js shows it", "add --profile babylon, or leave out --translucency")
         self.limits.check()
         if rendered:

@@ -136,8 +136,8 @@ def measure(views: Path, run: Path, every: int, programs: list[str], browser: Ch
         config = bbfit.ExportConfig(profile=program.profile, mipmaps=program.mipmaps)
         same = (
             str(replace(config.resolve(), profile=None)),
-            config.traced,
-            config.transmits and light is not None,
+            config.program.traced,
+            config.program.transmits and light is not None,
         )  # what the files depend on
         if same not in models:
             models[same] = shipped_model(cloud, config)

@@ -23,7 +23,7 @@ MOST_AVERAGED = 0.25
 
 
 @dataclass(frozen=True)
-class _Program:
+class Program:
     """What a program needs of a model."""
 
     split: bool = True
@@ -38,24 +38,28 @@ class _Program:
     """Whether mip levels do it good."""
     traced: bool = False
     """Whether it follows rays and culls nothing (:class:`~bbfit.geometry.cards.Cards`)."""
+    culls: bool = True
+    """Whether it culls the back faces of blended meshes that are one-sided; otherwise a node cannot order its fronts and backs."""
+    nearest: bool = False
+    """Whether it sorts nodes by the nearest points of their bounding spheres, not by the centers of their bounds."""
 
 
-_PROGRAMS: dict[Profile | None, _Program] = {
-    None: _Program(split=False),
-    "three": _Program(),
-    "babylon": _Program(transmits=True),
-    "playcanvas": _Program(),
-    "model-viewer": _Program(),
+_PROGRAMS: dict[Profile | None, Program] = {
+    None: Program(split=False),
+    "three": Program(),
+    "babylon": Program(transmits=True),
+    "playcanvas": Program(),
+    "model-viewer": Program(),
     # It computes mip levels from textures that it scales to powers of two, without the colors under transparent texels.
-    "cesium": _Program(mipmaps=False),
-    "filament": _Program(),
-    "godot": _Program(),
-    "unity": _Program(),
-    "unreal": _Program(),
+    "cesium": Program(mipmaps=False, culls=False, nearest=True),
+    "filament": Program(),
+    "godot": Program(),
+    "unity": Program(),
+    "unreal": Program(),
     # It drops alpha with KHR_materials_unlit, and sorts each pixel's layers by depth peeling.
-    "vtk": _Program(split=False, material="emissive", masks=False),
-    "panda3d": _Program(),
-    "blender": _Program(split=False, mipmaps=False, traced=True),
+    "vtk": Program(split=False, material="emissive", masks=False),
+    "panda3d": Program(),
+    "blender": Program(split=False, mipmaps=False, traced=True),
 }
 
 
@@ -109,14 +113,9 @@ class ExportConfig:
         check_fields(self)
 
     @property
-    def transmits(self) -> bool:
-        """Whether the program reads light that passes through leaves (KHR_materials_diffuse_transmission)."""
-        return _PROGRAMS[self.profile].transmits
-
-    @property
-    def masks(self) -> bool:
-        """Whether the profile's program cuts masks off; otherwise they become blended textures with sharp edges."""
-        return _PROGRAMS[self.profile].masks
+    def program(self) -> Program:
+        """What the profile's program needs."""
+        return _PROGRAMS[self.profile]
 
     def comparable(self) -> ExportConfig:
         """The same options with rectangles unless they ask for outlines: all models have as many vertices for each billboard."""
@@ -126,12 +125,7 @@ class ExportConfig:
         """Whether a model with an alpha mode is read with mip levels."""
         if self.mipmaps is not None:
             return self.mipmaps
-        return _PROGRAMS[self.profile].mipmaps and (alpha.kind != "mask" or alpha.cutoff <= MOST_AVERAGED)
-
-    @property
-    def traced(self) -> bool:
-        """Whether the profile's program follows rays and culls nothing (:class:`~bbfit.geometry.cards.Cards`)."""
-        return _PROGRAMS[self.profile].traced
+        return self.program.mipmaps and (alpha.kind != "mask" or alpha.cutoff <= MOST_AVERAGED)
 
     def resolve(self) -> ResolvedExport:
         """Fill in the choices that depend on the profile and on the installed encoders; a :class:`ResolvedExport` returns itself.
@@ -140,8 +134,7 @@ class ExportConfig:
         """
         if isinstance(self, ResolvedExport):
             return self
-        program = _PROGRAMS[self.profile]
-        chosen: dict[str, Any] = {"split": program.split, "material": program.material, "textures": "png", "outline": "pieces"}
+        chosen: dict[str, Any] = {"split": self.program.split, "material": self.program.material, "textures": "png", "outline": "pieces"}
         chosen |= {name: value for name, value in vars(self).items() if value is not None or name not in chosen}
         if chosen["textures"] == "auto":
             chosen["textures"] = "png" if ktx2_missing() else "ktx2"

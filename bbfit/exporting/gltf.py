@@ -38,10 +38,11 @@ def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int
     and tangents. Translucency is the alpha of the occlusion's texture, from which ``KHR_materials_diffuse_transmission`` takes it.
 
     The node of cards with an origin is at that origin, and two vertices that no triangle uses center the mesh's bounds on it: programs
-    sort blended meshes by one or the other. Its triangles are the cards' fronts and backs in the order of ``Card.ranks``, with back-face
-    culling; a front and a back share their vertices. The sampler uses mip levels if the file includes them (``ktx2``) or if the options let
-    programs compute them (:meth:`~bbfit.exporting.config.ExportConfig.mipmapped`). ``on_picture`` is called with the number of encoded
-    pictures and their total.
+    sort blended meshes by one or the other. For programs that sort by the nearest point of a bounding sphere, all spheres have one radius.
+    The node's triangles are the cards' fronts and backs in the order of ``Card.ranks``, with back-face culling; a front and a back share
+    their vertices. For programs that do not cull what is blended, they are the fronts alone, double-sided. The sampler uses mip levels if
+    the file includes them (``ktx2``) or if the options let programs compute them
+    (:meth:`~bbfit.exporting.config.ExportConfig.mipmapped`). ``on_picture`` is called with the number of encoded pictures and their total.
     """
     import trimesh
     from PIL import Image
@@ -49,9 +50,11 @@ def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int
     resolved = config.resolve()
     placeholder = Image.new("RGBA", (1, 1))  # trimesh writes texture coordinates for textured materials only
     scene = trimesh.Scene(base_frame="billboard_cloud")
+    boxes = [centered(node) for node in cards.nodes]
+    radius = max((np.linalg.norm(high - low) / 2 for low, high in boxes), default=None) if resolved.program.nearest else None
     for name, chosen in _meshes(cards).items():
         origin = chosen[0].origin
-        one_sided = chosen[0].culled or origin is not None
+        one_sided = chosen[0].culled or (origin is not None and resolved.program.culls)
         material = trimesh.visual.material.PBRMaterial(
             name="billboards_two_sided" if one_sided else "billboards",
             baseColorTexture=placeholder,
@@ -61,10 +64,10 @@ def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int
             metallicFactor=0.0,
             roughnessFactor=1.0,
         )
-        points, uvs, normals, tangents = _vertices(chosen)
+        points, uvs, normals, tangents = _vertices(chosen, radius)
         mesh = trimesh.Trimesh(
             points,
-            _triangles(chosen),
+            _triangles(chosen, both=one_sided),
             vertex_normals=normals,
             # trimesh counts v from the bottom and flips it when it writes.
             visual=trimesh.visual.TextureVisuals(uv=np.stack([uvs[:, 0], 1 - uvs[:, 1]], -1), material=material),
@@ -82,13 +85,15 @@ def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int
     return joined_glb(tree, _with_pictures(tree, _with_short_indices(tree, views), pictures, resolved, on_picture))
 
 
-def _vertices(chosen: list[Card]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
+def _vertices(
+    chosen: list[Card], radius: float | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
     """Of a mesh: points relative to its origin, texture coordinates, normals and tangents; two more vertices center it on an origin."""
     points, uvs = [card.corners for card in chosen], [card.uvs for card in chosen]
     counts = [len(card.corners) for card in chosen]
     origin = chosen[0].origin
     if origin is not None:
-        points, uvs = [*points, centered(chosen)], [*uvs, chosen[-1].uvs[[0, 0]]]
+        points, uvs = [*points, centered(chosen, radius)], [*uvs, chosen[-1].uvs[[0, 0]]]
         counts[-1] += 2
     normals = np.concatenate([np.tile(card.normal, (count, 1)) for card, count in zip(chosen, counts, strict=True)])
     tangents = np.concatenate([_tangents(card, count) for card, count in zip(chosen, counts, strict=True)])
@@ -102,15 +107,15 @@ def _tangents(card: Card, count: int) -> NDArray[np.float32]:
     return np.tile(np.append(right, handed).astype(np.float32), (count, 1))
 
 
-def _triangles(chosen: list[Card]) -> NDArray[np.int64]:
-    """The triangles of a mesh in the order of drawing, [T, 3]."""
+def _triangles(chosen: list[Card], *, both: bool) -> NDArray[np.int64]:
+    """The triangles of a mesh in the order of drawing, [T, 3]; ``both`` adds the backs of cards with an origin that are not culled."""
     first = np.cumsum([0, *(len(card.corners) for card in chosen)]).tolist()
     if chosen[0].origin is None:
         return np.concatenate([card.triangles + start for card, start in zip(chosen, first, strict=False)])
     faces = list[tuple[int, NDArray[np.int64]]]()
     for card, start in zip(chosen, first, strict=False):
         front = card.triangles + start
-        faces += [(card.ranks[0], front)] + ([] if card.culled else [(card.ranks[1], front[:, ::-1])])
+        faces += [(card.ranks[0], front)] + ([(card.ranks[1], front[:, ::-1])] if both and not card.culled else [])
     return np.concatenate([triangles for _, triangles in sorted(faces, key=lambda face: face[0])])
 
 

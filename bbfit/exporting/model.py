@@ -67,12 +67,13 @@ class ShippedModel:
         They are those of the files, so they do not depend on whether a program smooths the edges of masks.
         """
         cloud = replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=False))
+        program = self.config.program
         splits = self.config.split and cloud.alpha.kind == "blend"
-        # The nodes of a split model cull back faces, so a lit one needs the normals of both sides.
-        paired = splits and self.config.material != "unlit"
-        cards = cloud_cards(cloud, self.config.padding << self.halvings, traced=self.config.traced, paired=paired)
+        # Where the nodes of a split model cull back faces, a lit one needs the normals of both sides.
+        paired = splits and program.culls and self.config.material != "unlit"
+        cards = cloud_cards(cloud, self.config.padding << self.halvings, traced=program.traced, paired=paired)
         if splits:
-            cards = split(cards)
+            cards = split(cards, apart=not program.culls)
         cards = reduced(cards, self.halvings)
         if self.config.outline == "hull":
             cards = with_hulls(cards, self.config.corners, cards.outlined_alpha)
@@ -170,8 +171,8 @@ def shipped_model(
     if cloud.surface is not None and config is not None and config.material in ("unlit", "emissive"):
         fail("material", "the cloud has maps, whose colors contain no light", "leave out --material, or fit with --light baked")
     alpha = AlphaMode(resolved.alpha or cloud.alpha.kind, resolved.alpha_cutoff or cloud.alpha.cutoff)
-    cloud = replace(cloud if resolved.transmits else cloud.opaque(), alpha=alpha)
-    return ShippedModel(cloud if resolved.masks else smoothed(cloud), resolved, halvings, on_progress=on_progress)
+    cloud = replace(cloud if resolved.program.transmits else cloud.opaque(), alpha=alpha)
+    return ShippedModel(cloud if resolved.program.masks else smoothed(cloud), resolved, halvings, on_progress=on_progress)
 
 
 def export(cloud: BillboardCloud, path: str | Path, config: ExportConfig | None = None) -> list[Path]:

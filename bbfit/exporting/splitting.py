@@ -39,13 +39,14 @@ _ACROSS = 22
 _PAIRS = 3000
 
 
-def split(cards: Cards, wrong: float = 1e-3, most: int = 200, nodes: int = 24) -> Cards:
+def split(cards: Cards, wrong: float = 1e-3, most: int = 200, nodes: int = 24, *, apart: bool = False) -> Cards:
     """Split cards and distribute the pieces over nodes, such that programs that sort nodes draw all in the right order.
 
     Programs sort the nodes by the depth or the distance of their origins. A node draws the fronts and backs of its pieces, each culled, in
     one order (``Card.ranks``). ``wrong``, in [0, 1], is the accepted share of the visible picture: the mean of sorting by
     depth and by distance. Splitting also ends at ``most`` >= 1 pieces; cards are never joined, so more cards than this stay as they are.
-    There are at most ``nodes`` >= 1 nodes. InputError if one is out of range. Neighboring pieces of one card share no vertices.
+    There are at most ``nodes`` >= 1 nodes; with ``apart`` each piece is one, for programs that do not cull what is blended. InputError if
+    one is out of range. Neighboring pieces of one card share no vertices.
 
     Two flat convex pieces have an order from every camera if neither passes through the other, so for one pair it is enough to split one
     piece along the other's plane (Fuchs, Kedem and Naylor 1980, "On visible surface generation by a priori tree structures"). One node can
@@ -81,11 +82,11 @@ def split(cards: Cards, wrong: float = 1e-3, most: int = 200, nodes: int = 24) -
             layers = settled(found, layers, fitted.cameras, middles, radius)
         else:
             starts = [middles, _on_a_circle(middles, middle), layers.origins]
-            apart = found.grouped(np.arange(2 * len(pieces)) // 2)
-            layers = replace(layers, origins=fit_origins(fitted.cameras, apart, middles, starts, radius))
+            between = found.grouped(np.arange(2 * len(pieces)) // 2)
+            layers = replace(layers, origins=fit_origins(fitted.cameras, between, middles, starts, radius))
         shares = [misordered_share(each, layers, rig.cameras).mean for each, rig in ((found, fitted), (others, checked))]
         chosen = _cuts(now, fitted, face, layers, found, most) if max(shares) > wrong else {}
-        if not is_joined and (not chosen or len(pieces) > _APART * most):
+        if not apart and not is_joined and (not chosen or len(pieces) > _APART * most):
             layers, is_joined = joined(found, layers, fitted.cameras, nodes), True
         elif not chosen:
             break
@@ -99,14 +100,16 @@ def split(cards: Cards, wrong: float = 1e-3, most: int = 200, nodes: int = 24) -
     return cards.with_cards([side for piece in made for side in (_both_sides(piece) if piece.rectangle in pairs else [piece])])
 
 
-def centered(cards: list[Card]) -> NDArray[np.float64]:
+def centered(node: list[Card], radius: float | None = None) -> NDArray[np.float64]:
     """Two points, which no triangle uses and which center the bounds of a node's cards on its origin, [2, 3].
 
-    Programs that sort by the center of the bounds then sort by the origin. They are opposite corners of the smallest such box.
+    Programs that sort by the center of the bounds then sort by the origin. They are opposite corners of the smallest such box, or of one
+    like it whose half diagonal is ``radius`` meters.
     """
-    origin = cards[0].origin
+    origin = node[0].origin
     assert origin is not None, "only cards with an origin are centered on it"
-    reach = abs(np.concatenate([card.corners for card in cards]) - origin).max(0)
+    reach = abs(np.concatenate([card.corners for card in node]) - origin).max(0)
+    reach *= 1.0 if radius is None else radius / np.linalg.norm(reach)
     return np.stack([origin - reach, origin + reach])
 
 

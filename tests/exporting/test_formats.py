@@ -116,6 +116,16 @@ def test_split_nodes_stand_at_their_origins_and_their_bounds_are_centerd_there(c
     assert not messages(path)
 
 
+def test_nodes_have_equal_spheres_and_both_sides_where_programs_need_them(crossed: BillboardCloud, tmp_path: Path) -> None:
+    """CesiumJS culls nothing that is blended, and sorts by the nearest points of spheres."""
+    (path,) = export(crossed, tmp_path / "tree.glb", ExportConfig(profile="cesium", alpha="blend"))
+    tree, _ = tree_of(path)
+    positions = [tree["accessors"][mesh["primitives"][0]["attributes"]["POSITION"]] for mesh in tree["meshes"]]
+    radii = [np.linalg.norm(np.subtract(each["max"], each["min"])) / 2 for each in positions]
+    np.testing.assert_allclose(radii, radii[0], rtol=1e-6)
+    assert len(radii) > 1 and all(material["doubleSided"] for material in tree["materials"])
+
+
 def test_only_blend_is_split_and_only_where_nodes_are_sorted(crossed: BillboardCloud) -> None:
     def pieces(alpha: str, **options: Any) -> int:
         return len(shipped_model(crossed, ExportConfig(alpha=alpha, outline="hull", **options)).cards.cards)  # type: ignore[arg-type]

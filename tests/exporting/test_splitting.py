@@ -228,6 +228,14 @@ def test_an_order_without_circles_is_found() -> None:
     assert 0 < order_cost(circle, drawing_order(circle)) < circle.sum() / 2
 
 
+def test_pieces_stay_apart_for_programs_that_do_not_cull() -> None:
+    """Each is one node, and the order is as right as in few nodes."""
+    cards, _ = scene("leaning")
+    pieces = split(cards, WRONG, apart=True)
+    assert len(pieces.nodes) == len(pieces.cards) > len(cards.cards)
+    assert max(difference(cards, pieces, key) for key in ("depth", "distance")) < 5e-4
+
+
 def test_pairs_of_a_front_and_a_back_are_cut_alike() -> None:
     """As cards with normals of their own are: each pair is one sheet, in one node, and has both faces in its order."""
     cloud = CLOUDS["crossing"]()
