@@ -51,7 +51,7 @@ def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int
     placeholder = Image.new("RGBA", (1, 1))  # trimesh writes texture coordinates for textured materials only
     scene = trimesh.Scene(base_frame="billboard_cloud")
     boxes = [centered(node) for node in cards.nodes]
-    radius = max((np.linalg.norm(high - low) / 2 for low, high in boxes), default=None) if resolved.program.nearest else None
+    radius = max((float(np.linalg.norm(high - low)) / 2 for low, high in boxes), default=None) if resolved.program.nearest else None
     for name, chosen in _meshes(cards).items():
         origin = chosen[0].origin
         one_sided = chosen[0].culled or (origin is not None and resolved.program.culls)
