@@ -32,9 +32,9 @@ from bbfit.views.dataset import ViewDataset
 
 # Connections that are open at a time, and seconds for which one may wait for the other side.
 _MAX_CONNECTIONS, _TIMEOUT = 64, 10
-# Shares of the sky's and the sun's light that reach a leaf among others, in place of shadows, which models with maps have in their maps.
-# With them the mean color of data/tree.glb in the viewer is that of its views within 6 of 255.
-_SKY, _SUN = 0.3, 0.5
+# Shares of the sky's and the sun's light that an original gets. The page draws the sun's shadows, and finds the sky's share by the views
+# where there are some. 0.8 is about what fits acer, aspen and willow together with shadows: Blender's leaves reflect a part as highlights.
+_SKY, _SUN = 0.6, 0.8
 _FILES = {"/": ("viewer.html", "text/html"), "/viewer.css": ("viewer.css", "text/css"), "/viewer.js": ("viewer.js", "text/javascript")}
 _MODEL = re.compile(r"/([0-9]{1,9})/model/([0-9]{1,4})/([0-4])/(mask|blend|hash)(-split)?\.glb")
 _FIELD = re.compile(r"/([0-9]{1,9})/field/([0-9]{1,5})/([0-9]{1,9})")
@@ -292,5 +292,6 @@ def _state(shown: _Shown | None) -> dict[str, Any] | None:
         "bounds": tree.bounds.tolist(),
         "maps": tree.has_maps,
         "light": light,
+        "colors_seen": [{"azimuth": seen.azimuth, "elevation": seen.elevation, "color": seen.color} for seen in tree.seen],
         "shaded": light | {"sky": _SKY * light["sky"], "sun": _SUN * light["sun"]},
     }

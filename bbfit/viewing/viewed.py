@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from bbfit.blender.config import ViewsConfig
@@ -17,15 +18,30 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.files import read_json
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
-from bbfit.geometry.light import Light, direction
+from bbfit.geometry.light import Light, angles_degrees, direction
 from bbfit.inputs import reading
 from bbfit.layout import REQUEST_FILE
 from bbfit.stages.stage import RECORD_FILE
 from bbfit.viewing.levels import ViewerLevel
 from bbfit.viewing.originals import MAX_BYTES, Original, find_original
+from bbfit.views.dataset import ViewDataset
 
 LOD_FILE, CLOUD_FILE = "levels/lod.json", "cloud.safetensors"
 """Files of a folder of levels of detail and of a run's folder."""
+# The most views whose colors are given, and how far their cameras may be from eye level, in sines of the elevation.
+_SEEN, _LEVEL = 8, 0.1
+
+
+@dataclass(frozen=True)
+class SeenColor:
+    """The mean color of a tree in a view, in which its leaves shade each other."""
+
+    azimuth: float
+    """Of the camera as seen from the tree, in degrees."""
+    elevation: float
+    """The same above the horizon."""
+    color: tuple[float, float, float]
+    """Straight sRGB in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +60,8 @@ class ViewedTree:
     """Lowest and highest corner of what the billboards show in meters, [2, 3]."""
     light: Light
     """The light of the views, as far as it is known, a batch of one."""
+    seen: tuple[SeenColor, ...] = ()
+    """The colors of the original in some views at eye level; empty without views."""
     views: Path | None = None
     """The folder of views that the billboards were fitted to."""
     notes: tuple[str, ...] = ()
@@ -96,13 +114,13 @@ def _open_run(folder: Path, original_bytes: int) -> ViewedTree:
     original = find_original(sources(folder, record), original_bytes)
     tree = live_tree(cloud, folder.resolve().name, original, light_of(views))
     notes = () if record else (f"there is no {RECORD_FILE}, so the tree that it was made from is not known",)
-    return replace(tree, export=_export(record), views=views, notes=notes, live=False)
+    return replace(tree, export=_export(record), seen=seen_colors(views), views=views, notes=notes, live=False)
 
 
-def live_tree(cloud: BillboardCloud, name: str, original: Original, light: Light) -> ViewedTree:
+def live_tree(cloud: BillboardCloud, name: str, original: Original, light: Light, seen: tuple[SeenColor, ...] = ()) -> ViewedTree:
     """A tree whose billboards are being fitted."""
     levels = (ViewerLevel(None, math.inf), ViewerLevel(cloud, None)) if original.glb is not None else (ViewerLevel(cloud, math.inf),)
-    return ViewedTree(name, levels, original, ExportConfig(), shown_bounds(cloud).numpy(), light, live=True)
+    return ViewedTree(name, levels, original, ExportConfig(), shown_bounds(cloud).numpy(), light, seen, live=True)
 
 
 def sources(folder: Path, record: dict[str, Any]) -> list[Path | None]:
@@ -129,6 +147,22 @@ def light_of(views: Path | None) -> Light:
     except InputError:
         config = ViewsConfig()
     return Light.of(direction(config.sun_azimuth, config.sun_elevation)[None], config.sun_strength, config.ambient_strength)
+
+
+def seen_colors(folder: Path | None) -> tuple[SeenColor, ...]:
+    """The colors of the tree in up to eight training views around it, those nearest to eye level; none if there are no readable views."""
+    if folder is None or not folder.is_dir():
+        return ()
+    try:
+        views = ViewDataset.load(folder).train
+        away = -views.cameras.batch().forward
+        found = (away[:, 1].abs() <= away[:, 1].abs().min() + _LEVEL).nonzero()[:, 0].tolist()
+        found = found[:: math.ceil(len(found) / _SEEN)]
+        sums = [views.targets([index], torch.float64).sum((0, 1, 2)) for index in found]
+    except InputError:
+        return ()
+    pairs = [(angles_degrees(away[index]), total.tolist()) for index, total in zip(found, sums, strict=True) if total[3] > 0]
+    return tuple(SeenColor(*angles, (red / alpha, green / alpha, blue / alpha)) for angles, (red, green, blue, alpha) in pairs)
 
 
 def _record(folder: Path) -> dict[str, Any]:
@@ -187,5 +221,6 @@ def _open_lod(folder: Path, original_bytes: int) -> ViewedTree:
         export=_export(records[0]),
         bounds=np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)]),
         light=light_of(folder / "views"),
+        seen=seen_colors(folder / "views"),
         views=folder / "views",
     )

@@ -18,7 +18,7 @@ from bbfit.images import premultiply, unpremultiply
 from bbfit.viewing.models import ModelCache, ModelOptions
 from bbfit.viewing.originals import Original, find_original
 from bbfit.viewing.server import Viewer
-from bbfit.viewing.viewed import light_of, live_tree, open_results
+from bbfit.viewing.viewed import SeenColor, light_of, live_tree, open_results, seen_colors
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Watch:
 
     def __init__(self, viewer: Viewer, run: WatchedRun, *, interval: float = 2.0, share: float = 0.04) -> None:
         self._viewer, self._run, self._interval, self._share = viewer, run, interval, share
-        self._origin: tuple[Original, Light] | None = None
+        self._origin: tuple[Original, Light, tuple[SeenColor, ...]] | None = None
         self._thread: threading.Thread | None = None
         self._next, self._spent = 0.0, 0.0
 
@@ -89,11 +89,12 @@ class Watch:
         self._next = time.monotonic() + max(self._interval, took / self._share)
 
 
-def _origin(run: WatchedRun) -> tuple[Original, Light]:
-    """The original of a run, and its light."""
+def _origin(run: WatchedRun) -> tuple[Original, Light, tuple[SeenColor, ...]]:
+    """The original of a run, its light and its colors in views."""
     if run.source is not None and run.source.is_dir():
-        return find_original([run.tree]), light_of(run.source)
-    return find_original([run.tree or run.source or run.out / "tree.glb"]), light_of(run.out / "views")
+        return find_original([run.tree]), light_of(run.source), seen_colors(run.source)
+    views = run.out / "views"
+    return find_original([run.tree or run.source or run.out / "tree.glb"]), light_of(views), seen_colors(views)
 
 
 def preview(cloud: BillboardCloud, alpha: AlphaKind, *, max_texels: int = 200_000) -> BillboardCloud:

@@ -32,17 +32,19 @@ window.bbfit = (() => {
     return renderer;
   }
 
-  // The light of a scene: a sun at an azimuth and a height in degrees, and an even sky. `light` has their intensities and the sun's color.
+  // The light of a scene: a sun at an azimuth and a height in degrees, and an even sky. A light to shine has the
+  // intensities of `sun` and `sky`, the sun's `color`, and it may have the sky's `tint`.
   function createLight(THREE, scene) {
     const sun = new THREE.DirectionalLight(), sky = new THREE.AmbientLight();
     scene.add(sun, sky);
     return {
       sun,
       aim: (azimuth, height) => sun.position.setFromSphericalCoords(1, ((90 - height) * Math.PI) / 180, (azimuth * Math.PI) / 180),
-      shine(light) {
-        sun.intensity = light.sun;
-        sun.color.setRGB(...light.color);
-        sky.intensity = light.sky;
+      shine({ sun: strength, color, sky: evenly, tint = [1, 1, 1] }) {
+        sun.intensity = strength;
+        sun.color.setRGB(...color);
+        sky.intensity = evenly;
+        sky.color.setRGB(...tint);
       },
     };
   }
