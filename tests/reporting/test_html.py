@@ -34,6 +34,7 @@ from bbfit.reporting.charts import worst_views
 
 # What a folder and a picture may be called.
 EVIL = "<img src=x onerror=alert(1)> & \"tree\" 'of' {{ 7 * 7 }} </script><script>alert(2)<"
+DATA = Path(__file__).resolve().parents[2] / "data"
 CONFIG = RunConfig(fit=FitConfig(billboards=2, candidates=2, refinement_rounds=0, steps=40), views=ViewsConfig())
 Visit = Callable[..., Any]
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's
@@ -41,7 +42,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's
 
 @pytest.fixture(scope="module")
 def result(views_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
-    """A run whose views lie in a folder of an evil name, one of the held-out ones being called so too."""
+    """A run of views of a tree with an evil name, in a folder of that name; one of the held-out views is called so too."""
     folder = tmp_path_factory.mktemp("evil")
     evil = EVIL.replace("/", "\N{DIVISION SLASH}")
     views = Path(shutil.copytree(views_folder, folder / evil))
@@ -50,6 +51,9 @@ def result(views_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> RunR
     (views / f"{frame['file_path']}.png").rename(views / "images" / f"{evil}.png")
     frame["file_path"] = f"images/{evil}"
     (views / "transforms_test.json").write_text(json.dumps(transforms))
+    request = json.loads((DATA / "views" / "views.json").read_text())
+    request["tree"]["name"] = f"{evil}.glb"
+    (views / "views.json").write_text(json.dumps(request))
     return run(views, folder / "run", CONFIG)
 
 
