@@ -81,7 +81,7 @@ def test_at_first_the_light_is_that_of_the_views(lit: tuple[Viewer, Tab]) -> Non
 
 @pytest.mark.parametrize("camera", [0, 180])
 def test_the_side_towards_the_sun_is_the_brighter_one(lit: tuple[Viewer, Tab], camera: int) -> None:
-    """From the front and from behind; the original's trunk, partly in the crown's shadow, is lit alike. Measured: by 25 of 255 or more, the trunk by 8."""
+    """From the front and from behind; the original's trunk, partly shaded, is lit alike. Measured: by 25 of 255 or more, the trunk by 8."""
     _, tab = lit
     look(tab, camera)
     aim(tab, "height", 20)
