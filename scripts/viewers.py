@@ -134,11 +134,11 @@ def measure(views: Path, run: Path, every: int, programs: list[str], browser: Ch
         if light is None if name == AS_IT_COMES else not (program.lights or light is None):
             continue
         config = bbfit.ExportConfig(profile=program.profile, mipmaps=program.mipmaps)
+        # What the files depend on.
         same = (
             str(replace(config.resolve(), profile=None)),
-            config.program.traced,
-            config.program.transmits and light is not None,
-        )  # what the files depend on
+            replace(config.program, transmits=config.program.transmits and light is not None),
+        )
         if same not in models:
             models[same] = shipped_model(cloud, config)
         model = models[same]

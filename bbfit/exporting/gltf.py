@@ -50,8 +50,9 @@ def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int
     resolved = config.resolve()
     placeholder = Image.new("RGBA", (1, 1))  # trimesh writes texture coordinates for textured materials only
     scene = trimesh.Scene(base_frame="billboard_cloud")
-    boxes = [centered(node) for node in cards.nodes]
-    radius = max((float(np.linalg.norm(high - low)) / 2 for low, high in boxes), default=None) if resolved.program.nearest else None
+    radius = None
+    if resolved.program.nearest:
+        radius = max((float(np.linalg.norm(np.ptp(centered(node), 0))) / 2 for node in cards.nodes), default=None)
     for name, chosen in _meshes(cards).items():
         origin = chosen[0].origin
         one_sided = chosen[0].culled or (origin is not None and resolved.program.culls)

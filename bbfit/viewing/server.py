@@ -9,7 +9,7 @@ import re
 import socket
 import sys
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -32,10 +32,11 @@ from bbfit.views.dataset import ViewDataset
 
 # Connections that are open at a time, and seconds for which one may wait for the other side.
 _MAX_CONNECTIONS, _TIMEOUT = 64, 10
-# Shares of the sky's and the sun's light that an original gets. The page draws the sun's shadows, and finds the sky's share by the views
-# where there are some. 0.8 is about what fits acer, aspen and willow together with shadows: Blender's leaves reflect a part as highlights.
-_SKY, _SUN = 0.6, 0.8
-_FILES = {"/": ("viewer.html", "text/html"), "/viewer.css": ("viewer.css", "text/css"), "/viewer.js": ("viewer.js", "text/javascript")}
+# Shares of the sun, of the sky without reflections, and of the sky with them, that an original gets whose views are not known. The page
+# casts the sun's shadows, not the sky's.
+_SHARES = (0.9, 0.3, 0.2)
+_FILES = {"/": ("viewer.html", "text/html"), "/viewer.css": ("viewer.css", "text/css")}
+_FILES |= {f"/{name}": (name, "text/javascript") for name in ("viewer.js", "original.js")}
 _MODEL = re.compile(r"/([0-9]{1,9})/model/([0-9]{1,4})/([0-4])/(mask|blend|hash)(-split)?\.glb")
 _FIELD = re.compile(r"/([0-9]{1,9})/field/([0-9]{1,5})/([0-9]{1,9})")
 _ORIGINAL = re.compile(r"/([0-9]{1,9})/original\.glb")
@@ -292,6 +293,6 @@ def _state(shown: _Shown | None) -> dict[str, Any] | None:
         "bounds": tree.bounds.tolist(),
         "maps": tree.has_maps,
         "light": light,
-        "colors_seen": [{"azimuth": seen.azimuth, "elevation": seen.elevation, "color": seen.color} for seen in tree.seen],
-        "shaded": light | {"sky": _SKY * light["sky"], "sun": _SUN * light["sun"]},
+        "seen": [asdict(seen) for seen in tree.seen],
+        "shares": _SHARES,
     }

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from page_browser import HEIGHT, WIDTH, Browse, Tab, colored, wait_for
 from playwright.sync_api import Page
-from skimage.color import deltaE_ciede2000, rgb2lab
+from skimage.color import rgb2lab
 
 import bbfit
 from bbfit.exporting.lod import glb_counts
@@ -81,16 +81,16 @@ def test_both_trees_are_in_the_same_place_of_their_panes(opened: Opened) -> None
 
 
 def test_both_trees_have_the_same_brightness(opened: Opened) -> None:
-    """The mean colors differ by at most 3 (CIEDE2000), in the sun and from around. Measured: 2.4 and 1.3."""
+    """The mean colors differ by at most 3 (CIE76) as the page begins, and over four sides. Measured: 2.7 and 1.7."""
     _, tab = opened
     means = []
     for degrees in (0, 90, 180, 270):
         tab.evaluate("degrees => { bbfit.viewer.orbit.azimuth = degrees * Math.PI / 180; bbfit.viewer.orbit.update(); }", degrees)
         means.append([(picture[colored(picture)] / 255).mean(0) for picture in map(tab.picture, ("left", "right"))])
-    found = [float(deltaE_ciede2000(*map(rgb2lab, pair))) for pair in (means[0], np.mean(means, 0))]
+    found = [float(np.linalg.norm(np.subtract(*map(rgb2lab, pair)))) for pair in (means[0], np.mean(means, 0))]
     assert max(found) <= 3
-    # Less of the sky's light comes out of the crown than reaches it.
-    assert all(0.1 < value < 1 for value in tab.evaluate("bbfit.viewer.light.tint"))
+    sun, dull, bright = tab.evaluate("bbfit.viewer.shares")
+    assert sun < 1.5 and 0.1 < dull + bright < 1, "less of the sky's light comes out of the crown than reaches it"
 
 
 def test_the_page_is_dark_on_dark_screens(opened: Opened) -> None:

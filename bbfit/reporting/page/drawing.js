@@ -32,19 +32,29 @@ window.bbfit = (() => {
     return renderer;
   }
 
-  // The light of a scene: a sun at an azimuth and a height in degrees, and an even sky. A light to shine has the
-  // intensities of `sun` and `sky`, the sun's `color`, and it may have the sky's `tint`.
+  // The light of a scene: a sun and an even sky. `aim` takes the sun's azimuth and height in degrees; with the center and the radius of what
+  // it shines on, that casts shadows. `shine` takes the intensities of both and the sun's color.
   function createLight(THREE, scene) {
     const sun = new THREE.DirectionalLight(), sky = new THREE.AmbientLight();
-    scene.add(sun, sky);
+    sun.shadow.mapSize.set(2048, 2048);
+    sun.shadow.bias = -0.002;
+    scene.add(sun, sun.target, sky);
     return {
       sun,
-      aim: (azimuth, height) => sun.position.setFromSphericalCoords(1, ((90 - height) * Math.PI) / 180, (azimuth * Math.PI) / 180),
-      shine({ sun: strength, color, sky: evenly, tint = [1, 1, 1] }) {
-        sun.intensity = strength;
-        sun.color.setRGB(...color);
-        sky.intensity = evenly;
-        sky.color.setRGB(...tint);
+      aim(azimuth, height, center, radius) {
+        sun.position.setFromSphericalCoords(1, ((90 - height) * Math.PI) / 180, (azimuth * Math.PI) / 180);
+        if (center === undefined) return;
+        sun.castShadow = true;
+        sun.position.multiplyScalar(2 * radius).add(center);
+        sun.target.position.copy(center);
+        const { camera } = sun.shadow;
+        Object.assign(camera, { left: -radius, right: radius, top: radius, bottom: -radius, near: radius, far: 3 * radius });
+        camera.updateProjectionMatrix();
+      },
+      shine(light) {
+        sun.intensity = light.sun;
+        sun.color.setRGB(...light.color);
+        sky.intensity = light.sky;
       },
     };
   }

@@ -1,8 +1,6 @@
 "use strict";
 // The viewer's page. It asks the server for its state and for models; everything else, such as the choice of levels, happens here.
 (async () => {
-  // How much an error of color a sun of another strength is worth, where both explain the colors of the views.
-  const UNLIKELY = 0.05;
   const SLIDER_STEPS = 200, KEPT_TIMES = 60;
   // Frames that are measured after a change: at most so many, and once there is the least number, only for so many milliseconds.
   const MEASURED_FRAMES = 8, LEAST_FRAMES = 4, MEASURED_TIME = 250;
@@ -18,11 +16,8 @@
   const models = new Map(); // by address: null while it loads, false if that failed
   const intervals = [], durations = [];
   let state = { serial: -1, tree: null }, tree = null, status = "", error = "";
-  let field = null, plantedFor = "", loading = 0, dirty = true, toMeasure = 0, measuredFrom = 0, before = null, fitted = false, shadowsDue = true, mode = "billboards";
+  let field = null, plantedFor = "", loading = 0, dirty = true, toMeasure = 0, measuredFrom = 0, before = null, fitted = false, shadowsDue = true, sunAt = [0, 90], mode = "billboards";
   Object.assign(renderer.shadowMap, { enabled: true, autoUpdate: false });
-  light.sun.castShadow = true;
-  light.sun.shadow.mapSize.set(2048, 2048);
-  light.sun.shadow.bias = -0.002;
   const orbit = bbfit.createOrbit(THREE, canvas, () => { dirty = true; });
   // The picture has the colors of the page, light or dark.
   const dark = matchMedia("(prefers-color-scheme: dark)"), colorOf = (name) => new THREE.Color(getComputedStyle(document.body).getPropertyValue(name).trim());
@@ -44,7 +39,6 @@
   const bytes = (value) => (value >= 1 << 20 ? `${(value / 2 ** 20).toFixed(1)} MiB` : `${count(Math.round(value / 1024))} KiB`);
   const meters = (value) => `${value < 1000 ? Number(value.toPrecision(3)) : count(Math.round(value))} m`;
   const height = () => tree.bounds[1][1] - tree.bounds[0][1];
-  const radius = () => 0.6 * new THREE.Vector3(...tree.bounds[0]).distanceTo(new THREE.Vector3(...tree.bounds[1]));
   const middle = () => new THREE.Vector3(...tree.bounds[0].map((low, axis) => (low + tree.bounds[1][axis]) / 2));
   // The slider's steps are equal factors of the distance.
   const nearest = () => 0.5 * height(), REACH = 400;
@@ -146,7 +140,7 @@
       controls.alpha.value = tree.alpha;
       controls.split.checked = tree.split;
     }
-    const notes = tree.original && tree.colors_seen.length ? ["The original has the mean color that it has in the views."] : [];
+    const notes = tree.original && tree.seen.length ? ["The original has the mean color that it has in the views."] : [];
     $("notes").replaceChildren(...[...tree.notes, ...notes].map((note) => Object.assign(document.createElement("p"), { textContent: note })));
     controls.sun.disabled = !tree.maps || tree.light.sun === 0;
     if (relit) aimSun(tree.light);
@@ -155,9 +149,17 @@
     measure();
   }
 
+  // Turn the sun to where it is due, and the shadows of the original with it.
+  function turnSun() {
+    const { center, radius } = models.get(originalAddress()) || {};
+    light.aim(...sunAt, center, radius);
+    shadowsDue = true;
+  }
+
   // Move the sun to an azimuth and a height in degrees.
   function aimSun({ azimuth, height }) {
-    turnSun(azimuth, height);
+    sunAt = [azimuth, height];
+    turnSun();
     [controls.azimuth.value, controls.height.value] = [azimuth, height];
     $("sun-note").textContent = !tree.maps ? "The light is in the colors. Fit with --light maps to move the sun."
       : tree.light.sun === 0 ? "The views have no sun."
@@ -255,76 +257,17 @@
     pane.firstElementChild.replaceChildren(Object.assign(document.createElement("b"), { textContent: name }), details);
   }
 
-  // Turn the sun, and its shadows with it.
-  function turnSun(azimuth, height) {
-    const { sun } = light, reach = radius(), { camera } = sun.shadow;
-    light.aim(azimuth, height);
-    sun.position.multiplyScalar(2 * reach).add(middle());
-    sun.target.position.copy(middle());
-    sun.target.updateMatrixWorld();
-    Object.assign(camera, { left: -reach, right: reach, top: reach, bottom: -reach, near: reach, far: 3 * reach }).updateProjectionMatrix();
-    shadowsDue = true;
-  }
-
-  // The light in which the original's mean colors, from around and with shadows, are those of the views: the sky is darker between leaves,
-  // and has the tint of what they reflect there. Null where the browser cannot tell.
-  function matchLight(views) {
-    if (!renderer.extensions.get("EXT_color_buffer_float")) return null;
-    const size = 128, target = new THREE.WebGLRenderTarget(size, size, { type: THREE.FloatType }), camera = orbit.camera.clone();
-    const { background } = scene, { azimuth, height: elevation } = tree.light, whole = { color: [1, 1, 1], tint: [1, 1, 1] };
-    for (const group of [...Object.values(groups), ground]) group.visible = group === groups.original;
-    scene.background = null;
-    renderer.setScissorTest(false);
-    renderer.setClearColor(0x000000, 0);
-    renderer.setRenderTarget(target);
-    turnSun(azimuth, elevation);
-    renderer.shadowMap.needsUpdate = true;
-    Object.assign(camera, { aspect: 1, near: radius() / 100, far: 10 * radius() }).updateProjectionMatrix();
-    // The linear colors of covered pixels under the sky alone and under the sun alone, for each view and channel.
-    const seen = views.map((view) => {
-      camera.position.setFromSphericalCoords(3 * radius(), ((90 - view.elevation) * Math.PI) / 180, (view.azimuth * Math.PI) / 180).add(middle());
-      camera.lookAt(middle());
-      const [sky, sun] = [{ ...whole, sky: tree.light.sky, sun: 0 }, { ...tree.shaded, sky: 0 }].map((part) => {
-        const pixels = new Float32Array(4 * size * size);
-        light.shine(part);
-        renderer.render(scene, camera);
-        renderer.readRenderTargetPixels(target, 0, 0, size, size, pixels);
-        return pixels;
-      });
-      const covered = Array.from({ length: size * size }, (_, pixel) => 4 * pixel).filter((start) => sky[start + 3] > 0.5);
-      return [0, 1, 2].map((channel) => covered.map((start) => [sky[start + channel], sun[start + channel]]));
-    });
-    renderer.setRenderTarget(null);
-    target.dispose();
-    scene.background = background;
-    ground.visible = true;
-    aimSun({ azimuth: Number(controls.azimuth.value), height: Number(controls.height.value) });
-    const encode = (value) => (value < 0.0031308 ? 12.92 * value : 1.055 * Math.min(value, 1) ** (1 / 2.4) - 0.055);
-    const mean = (pixels, sky, sun) => pixels.reduce((sum, [a, b]) => sum + encode(sky * a + sun * b), 0) / Math.max(pixels.length, 1);
-    const errors = (channel, sky, sun) => views.map(({ color }, index) => mean(seen[index][channel], sky, sun) - color[channel]);
-    // A factor after one step of Gauss and Newton, with a numeric derivative.
-    const improved = (factor, error, step = 1e-3) => {
-      const now = error(factor), slope = error(factor + step).map((value, index) => (value - now[index]) / step);
-      const dot = (other) => slope.reduce((sum, value, index) => sum + value * other[index], 0);
-      return Math.min(Math.max(factor - dot(now) / (dot(slope) + 1e-6), 0.02), 4);
-    };
-    let tint = [0.5, 0.5, 0.5], sun = 1;
-    for (let round = 0; round < 16; round += 1) {
-      tint = tint.map((sky, channel) => improved(sky, (value) => errors(channel, value, sun)));
-      sun = improved(sun, (value) => [...tint.flatMap((sky, channel) => errors(channel, sky, value)), UNLIKELY * (value - 1)]);
-    }
-    return { ...tree.light, tint, sun: sun * tree.shaded.sun };
-  }
-
   // What is in each pane, and what the panel says about it.
   function update() {
     const distance = orbit.camera.position.distanceTo(middle()), focal = focalLength(), scale = focal / distance;
     const chosen = controls.level.value === "distance" ? chooseLevel(tree.levels, scale) : Number(controls.level.value);
     const level = tree.levels[chosen], original = tree.original ? modelAt(originalAddress(), false) : null;
     if (original !== null && groups.original.children[0] !== original.root) {
+      bbfit.original.prepare(THREE, renderer, original);
+      const matched = tree.seen.length ? bbfit.original.matchLight(THREE, renderer, original, tree.light, tree.seen) : null;
+      original.shares = matched ?? tree.shares;
       groups.original.clear().add(original.root);
-      for (const mesh of original.meshes) mesh.castShadow = mesh.receiveShadow = true;
-      original.light = tree.colors_seen.length ? matchLight(tree.colors_seen) : null;
+      turnSun();
     }
     if (mode === "field") shareOut();
     else if (level.cloud !== null) showBillboards(level);
@@ -365,9 +308,10 @@
       const { left, bottom, width, height: high } = pane.lastElementChild.getBoundingClientRect();
       if (width === 0 || high === 0) return;
       for (const group of Object.values(groups)) group.visible = group === shown[index];
-      const matched = shown[index] === groups.original ? models.get(originalAddress())?.light : null;
-      light.shine(matched ?? (tree.maps && shown[index] !== groups.original ? tree.light : tree.shaded));
-      if (shown[index] === groups.original && shadowsDue) { // a shadow map is drawn with what is visible
+      const original = shown[index] === groups.original ? models.get(originalAddress()) : null;
+      if (original) bbfit.original.shine(original, light, tree.light, original.shares);
+      else light.shine(tree.light);
+      if (original && shadowsDue) { // a shadow map is drawn with what is visible
         renderer.shadowMap.needsUpdate = true;
         shadowsDue = false;
       }
@@ -461,7 +405,7 @@
     get idle() { return tree !== null && loading === 0 && !dirty && toMeasure === 0; },
     get frame() { return { intervals: [...intervals], durations: [...durations], ...renderer.info.render }; },
     get field() { return field; },
-    get light() { return models.get(originalAddress())?.light; },
+    get shares() { return models.get(originalAddress())?.shares; },
   };
   poll();
   requestAnimationFrame(tick);
