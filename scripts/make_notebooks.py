@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 import sys
 from pathlib import Path
@@ -40,6 +41,8 @@ def main() -> None:
                 cell.execution_count = None
             cell.metadata.pop("execution", None)
         notebook.metadata.pop("widgets", None)
+        code = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code")
+        notebook.metadata["pictures_of"] = hashlib.sha256(code.encode()).hexdigest()
         nbformat.write(notebook, path)
         print(f"{path.name}: {path.stat().st_size / 1024:.0f} KiB", flush=True)
 
