@@ -23,7 +23,7 @@ VERSIONS: Mapping[str, int] = {
     "views": 6,
     "budget": 10,
     "fit": 22,
-    "export": 13,
+    "export": 14,
     "evaluate": 16,
     "report": 8,
     "lod": 5,

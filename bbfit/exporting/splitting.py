@@ -39,7 +39,7 @@ _ACROSS = 22
 _PAIRS = 3000
 
 
-def split(cards: Cards, wrong: float = 1e-3, most: int = 200, nodes: int = 24, *, apart: bool = False) -> Cards:
+def split(cards: Cards, wrong: float = 1e-3, most: int = 260, nodes: int = 24, *, apart: bool = False) -> Cards:
     """Split cards and distribute the pieces over nodes, such that programs that sort nodes draw all in the right order.
 
     Programs sort the nodes by the depth or the distance of their origins. A node draws the fronts and backs of its pieces, each culled, in

@@ -92,16 +92,23 @@ def fit_rig(cards: Cards, count: int = 1000) -> Rig:
 
     The directions form a spiral that turns by the golden angle, so no two have the same elevation or azimuth. An order that was fitted to
     regular rings is wrong more often between the rings. It takes this many: with 420, eight planes of an aspen had 0.14 % wrong here and
-    0.22 % from elsewhere, with 1000 they had 0.08 % and 0.15 %.
+    0.22 % from elsewhere, with 1000 they had 0.08 % and 0.15 %. A second spiral looks down from within 12 degrees of the zenith, of which
+    the first has few: without it 0.5 % of an aspen's pixels and 0.6 % of a willow's were wrong from there.
     """
     center, radius = bounding_sphere(cards)
+    lowest, highest = np.sin(np.radians([-22.0, 78.0]))
+    towards = np.concatenate([_spiral(lowest, count), _spiral(highest, max(1, count // 12))])
+    distance = np.resize([1.5, 2.5, 6.0], len(towards)) * radius
+    return Rig(center + distance[:, None] * towards, -towards)
+
+
+def _spiral(lowest: float, count: int) -> NDArray[np.float64]:
+    """Directions that are evenly spread from a sine of the elevation up to the zenith, [count, 3]."""
     index = np.arange(count) + 0.5
-    height = np.sin(np.radians(-22)) + (1 - np.sin(np.radians(-22))) * index / count
+    height = lowest + (1 - lowest) * index / count
     azimuth = index * np.pi * (3 - np.sqrt(5))
     across = np.sqrt(1 - height**2)
-    towards = np.stack([across * np.sin(azimuth), height, across * np.cos(azimuth)], -1)
-    distance = np.resize([1.5, 2.5, 6.0], count) * radius
-    return Rig(center + distance[:, None] * towards, -towards)
+    return np.stack([across * np.sin(azimuth), height, across * np.cos(azimuth)], -1)
 
 
 def check_rig(cards: Cards) -> Rig:
