@@ -65,7 +65,7 @@ MARKED = {
         "operators/test_kernels.py",
         "reporting/test_plots.py",
         "rivals/test_learned_mesh.py",
-        "sweep/test_local.py",
+        "workers/test_local.py",
         "test_budget_runs.py",
         "test_cli.py",
         "test_docs.py",

@@ -32,10 +32,10 @@ from bbfit.layout import REQUEST_FILE, TRAIN_FILE
 from bbfit.stages.stage import Record
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.grid import Grid
-from bbfit.sweep.results import Results
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.species import load_species
 from bbfit.views.dataset import ViewDataset
+from bbfit.workers.results import Results
 
 
 @pytest.fixture(autouse=True)

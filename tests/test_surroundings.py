@@ -188,8 +188,8 @@ def test_a_sweep_that_is_stopped_ends_its_processes_and_removes_their_folders(tm
 import sys, works, bbfit.sweep.scheduling as scheduling
 from pathlib import Path
 from bbfit.cli import main
-from bbfit.sweep.local import LocalWorkers
-from bbfit.sweep.tasks import Task
+from bbfit.workers.local import LocalWorkers
+from bbfit.workers.tasks import Task
 
 def run_sweep(*arguments, **options):
     with LocalWorkers(1) as workers:
@@ -257,8 +257,8 @@ def test_a_fit_from_and_to_a_folder_whose_name_is_not_utf8(views_folder: Path, t
 @pytest.mark.parametrize(("host", "says"), [("nowhere.invalid", "nowhere.invalid"), ("a..b", "it is not a name")])
 def test_hosts_are_refused_in_words(host: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from bbfit.checks import InputError
-    from bbfit.sweep.cluster import _check_address
     from bbfit.viewing.address import listen
+    from bbfit.workers.cluster import _check_address
 
     with pytest.raises(InputError, match="host: ") as refused:
         listen(host, 0, lambda address, family: None)

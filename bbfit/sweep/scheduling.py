@@ -24,15 +24,15 @@ from bbfit.provenance import VERSIONS, cache_key, identity
 from bbfit.reporting.sweep_plots import sweep_plot
 from bbfit.reporting.sweep_tables import SweepRow, table_csv, table_markdown
 from bbfit.stages.stage import OnProgress, silent
-from bbfit.sweep.cluster import RayWorkers
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.grid import Cell, Grid
-from bbfit.sweep.local import LocalWorkers
-from bbfit.sweep.results import Results
-from bbfit.sweep.tasks import Outcome, Task, Workers, fit_tree, prepare_tree
+from bbfit.sweep.tasks import fit_tree, prepare_tree
 from bbfit.tree_files.tree_file import MESH_SUFFIXES, TreeFile
 from bbfit.trees.species import load_species
 from bbfit.views.dataset import ViewDataset
+from bbfit.workers.choice import workers_of
+from bbfit.workers.results import Results
+from bbfit.workers.tasks import Outcome, Task, Workers
 
 TABLES = ("table.csv", "table.md", "table.png")
 """The files that compare the runs of a sweep."""
@@ -117,8 +117,7 @@ def run_sweep(
         written = Written(folder)
         written.begin("tables", TABLES, [*map(Path, trees)])
         sweep = _Sweep(folder, all_sources, cells, config, stages)
-        workers: Workers = LocalWorkers(config.workers, config.retries) if config.ray is None else RayWorkers(config)
-        with workers:
+        with workers_of(config) as workers:
             sweep.run(workers, on_progress or silent)
         result = sweep.result()
         written.finish("tables", written.digests(TABLES))

@@ -56,12 +56,12 @@ from bbfit.stages.billboards import read_choice
 from bbfit.stages.stage import Record
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.grid import Grid
-from bbfit.sweep.results import Results
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.species import figures_file, known_species, load_species
 from bbfit.viewing.viewed import open_results
 from bbfit.views.dataset import ViewDataset
+from bbfit.workers.results import Results
 
 from .hostile import changed_bytes, changed_words, documents, dumped, hostile
 

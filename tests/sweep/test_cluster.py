@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import gated_work
 import pytest
 import ray
-import sweep_works
 from billboard_scene import crossing_billboards, write_views
 from one_at_a_time import one_at_a_time
 from ray.cluster_utils import Cluster
@@ -17,11 +17,11 @@ from ray.cluster_utils import Cluster
 from bbfit.blender.config import ViewsConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.pipeline import RunConfig
-from bbfit.sweep.cluster import RayWorkers
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.scheduling import SweepResult, run_sweep
-from bbfit.sweep.tasks import Task
 from bbfit.trees.config import GrowConfig
+from bbfit.workers.cluster import RayWorkers
+from bbfit.workers.tasks import Task
 
 TREE = Path(__file__).resolve().parents[2] / "data" / "tree.glb"
 # Ray leaves sockets to the garbage collector, and warns of its own coming changes.
@@ -32,7 +32,7 @@ pytestmark = [pytest.mark.filterwarnings("ignore::ResourceWarning"), pytest.mark
 def head() -> Iterator[Cluster]:
     """A node with one core."""
     with one_at_a_time("ray"), pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parent))  # so that nodes can import the work of these tests
+        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))  # so that nodes can import the work of these tests
         made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
         yield made
         ray.shutdown()
@@ -56,17 +56,17 @@ def test_a_node_that_is_killed_costs_only_what_it_was_running(cluster: Cluster, 
     (inputs / "images").mkdir(parents=True)
     (inputs / "images" / "a.txt").write_text("1")
     early, late = [f"early{number}" for number in range(4)], [f"late{number}" for number in range(6)]
-    with RayWorkers(SweepConfig(ray=cluster.address)) as workers, sweep_works.watched(marks) as starts:
+    with RayWorkers(SweepConfig(ray=cluster.address)) as workers, gated_work.watched(marks) as starts:
 
         def submit(name: str, *gates: str) -> None:
-            workers.submit(Task(name, sweep_works.copy, {"views": (inputs,)}, tmp_path / "out" / name, (str(marks), name, *gates)))
+            workers.submit(Task(name, gated_work.copy, {"views": (inputs,)}, tmp_path / "out" / name, (str(marks), name, *gates)))
 
         for name in early:
             submit(name)
         outcomes = {task.name: outcome for task, outcome in (workers.next() for _ in early)}
         # What all tasks read is put into the object store once: the late ones see what the early ones saw.
         (inputs / "images" / "a.txt").write_text("2")
-        with sweep_works.closed(gate):
+        with gated_work.closed(gate):
             for name in late:
                 submit(name, str(gate))
             for _ in range(len(early) + 2):
@@ -74,7 +74,7 @@ def test_a_node_that_is_killed_costs_only_what_it_was_running(cluster: Cluster, 
             cluster.remove_node(node, allow_graceful=False)
         outcomes |= {task.name: outcome for task, outcome in (workers.next() for _ in late)}
     assert all(outcome.reason is None for outcome in outcomes.values())
-    began = Counter(sweep_works.begun(marks))
+    began = Counter(gated_work.begun(marks))
     assert began.keys() == {*early, *late}
     assert all(began[name] == 1 for name in early), "what was finished is not done again"
     assert sum(began[name] for name in late) == len(late) + 1, "one task was running on the killed node, and began again"
@@ -136,10 +136,10 @@ def test_failures_on_a_cluster_are_recorded(cluster: Cluster, tmp_path: Path) ->
     config = SweepConfig(ray=cluster.address, retries=1)
     with RayWorkers(config) as workers:
         tasks = [
-            Task("bad", sweep_works.bad_input, {}, tmp_path / "bad"),
-            Task("fault", sweep_works.fault, {}, tmp_path / "fault"),
-            Task("doomed", sweep_works.die, {}, tmp_path / "doomed", (str(marks), "doomed", 99)),
-            Task("hardy", sweep_works.die, {}, tmp_path / "hardy", (str(marks), "hardy", 1)),
+            Task("bad", gated_work.bad_input, {}, tmp_path / "bad"),
+            Task("fault", gated_work.fault, {}, tmp_path / "fault"),
+            Task("doomed", gated_work.die, {}, tmp_path / "doomed", (str(marks), "doomed", 99)),
+            Task("hardy", gated_work.die, {}, tmp_path / "hardy", (str(marks), "hardy", 1)),
         ]
         for task in tasks:
             workers.submit(task)
@@ -148,15 +148,15 @@ def test_failures_on_a_cluster_are_recorded(cluster: Cluster, tmp_path: Path) ->
     assert outcomes["fault"].reason == "ZeroDivisionError: a fault of ours"
     assert outcomes["doomed"].facts is None and "WorkerCrashedError" in str(outcomes["doomed"].reason)
     assert outcomes["hardy"].facts == {"name": "hardy"}
-    assert sweep_works.begun(marks) == ["doomed", "doomed", "hardy", "hardy"]
+    assert gated_work.begun(marks) == ["doomed", "doomed", "hardy", "hardy"]
 
 
 def test_tasks_ask_for_what_was_declared(cluster: Cluster, tmp_path: Path) -> None:
     """What no node has is waited for; a task that wants a machine to itself asks for all cores of the smallest."""
     cluster.add_node(num_cpus=3)
     with RayWorkers(SweepConfig(ray=cluster.address, cpus=2, memory="50M")) as workers:
-        task = Task("nap", sweep_works.copy, {}, tmp_path, (str(tmp_path), "nap", str(tmp_path / "gate")))
-        with sweep_works.watched(tmp_path) as starts, sweep_works.closed(tmp_path / "gate"):
+        task = Task("nap", gated_work.copy, {}, tmp_path, (str(tmp_path), "nap", str(tmp_path / "gate")))
+        with gated_work.watched(tmp_path) as starts, gated_work.closed(tmp_path / "gate"):
             workers.submit(task)
             next(starts)
             while ray.available_resources().get("CPU") != 2:  # which nodes report at intervals

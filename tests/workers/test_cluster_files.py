@@ -1,4 +1,4 @@
-"""What a sweep on a cluster does without one: files on their way, and an address where nobody listens."""
+"""What work on a cluster does without one: files on their way, and an address where nobody listens."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from bbfit.checks import InputError
-from bbfit.sweep.cluster import RayWorkers, _same_handlers, read_files, write_files
-from bbfit.sweep.config import SweepConfig
+from bbfit.workers.cluster import RayWorkers, _same_handlers, read_files, write_files
+from bbfit.workers.config import WorkersConfig
 
 
 def test_an_address_without_a_cluster_is_refused() -> None:
     with (
         pytest.raises(InputError, match=r"ray: no cluster answers at 127.0.0.1:1 .*; start one with ray start"),
-        RayWorkers(SweepConfig(ray="127.0.0.1:1")),
+        RayWorkers(WorkersConfig(ray="127.0.0.1:1")),
     ):
         pass
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from bbfit.outputs import wait_until_free
 from bbfit.scratch import ScratchFolder, remove_own
-from bbfit.sweep.tasks import Outcome, Task, attempt
+from bbfit.workers.tasks import Outcome, Task, attempt
 
 # A fork of a process that has used torch can hang. Workers are forks of a server that only imports, or new processes on Windows.
 _CONTEXT: Any = multiprocessing.get_context("forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn")

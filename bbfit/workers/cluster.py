@@ -1,7 +1,7 @@
 """Run tasks on a Ray cluster, whose machines need not share a disk.
 
 Each input is put into Ray's object store once, and each machine fetches it once. The output files return through the object store to the
-machine that started the sweep, which writes them. bbfit must be installed on all machines.
+machine that submitted the tasks, which writes them. bbfit must be installed on all machines.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from bbfit.checks import fail, in_words
 from bbfit.files import write_bytes
 from bbfit.outputs import output_folder
 from bbfit.scratch import ScratchFolder
-from bbfit.sweep.config import SweepConfig
-from bbfit.sweep.tasks import Outcome, Task, attempt
+from bbfit.workers.config import WorkersConfig
+from bbfit.workers.tasks import Outcome, Task, attempt
 
 Files = dict[str, bytes]
 """The contents of files by their paths relative to a folder."""
@@ -39,7 +39,7 @@ class RayWorkers:
     If the process or the machine of a task dies, Ray repeats the task up to ``config.retries`` times.
     """
 
-    def __init__(self, config: SweepConfig) -> None:
+    def __init__(self, config: WorkersConfig) -> None:
         try:
             import ray
         except ImportError:

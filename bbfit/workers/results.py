@@ -1,4 +1,4 @@
-"""The results of a sweep: one small JSON file for each, named by its cache key."""
+"""The results of tasks: one small JSON file for each, named by its cache key."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bbfit.checks import InputError, check_record
 from bbfit.files import read_json, remove_parts, write_json
 from bbfit.inputs import reading
 from bbfit.outputs import output_folder
-from bbfit.sweep.tasks import Outcome
+from bbfit.workers.tasks import Outcome
 
 
 class Results:

@@ -10,11 +10,11 @@ import sys
 import time
 from pathlib import Path
 
-import sweep_works
+import gated_work
 
 from bbfit.outputs import claimed_folder
-from bbfit.sweep.local import LocalWorkers
-from bbfit.sweep.tasks import Outcome, Task, Work
+from bbfit.workers.local import LocalWorkers
+from bbfit.workers.tasks import Outcome, Task, Work
 
 
 def carried_out(workers: LocalWorkers, tasks: list[Task]) -> dict[str, Outcome]:
@@ -34,7 +34,7 @@ def test_tasks_read_and_write_where_they_are_told_to(tmp_path: Path) -> None:
     (tmp_path / "tree.txt").write_text("3")
     inputs = {"views": (tmp_path / "views",), "tree": (tmp_path / "tree.txt",)}
     with LocalWorkers(2) as workers:
-        tasks = [Task(name, sweep_works.copy, inputs, tmp_path / name, (str(tmp_path), name)) for name in ("x", "y", "z")]
+        tasks = [Task(name, gated_work.copy, inputs, tmp_path / name, (str(tmp_path), name)) for name in ("x", "y", "z")]
         outcomes = carried_out(workers, tasks)
     for name in ("x", "y", "z"):
         assert outcomes[name].facts == {"name": name, "files": 3} and outcomes[name].reason is None
@@ -44,13 +44,13 @@ def test_tasks_read_and_write_where_they_are_told_to(tmp_path: Path) -> None:
 def test_a_failure_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
     with LocalWorkers(1) as workers:
         tasks = [
-            task("fault", sweep_works.fault, tmp_path),
-            task("bad", sweep_works.bad_input, tmp_path),
-            task("good", sweep_works.copy, tmp_path / "good", str(tmp_path), "good"),
+            task("fault", gated_work.fault, tmp_path),
+            task("bad", gated_work.bad_input, tmp_path),
+            task("good", gated_work.copy, tmp_path / "good", str(tmp_path), "good"),
         ]
         outcomes = carried_out(workers, tasks)
     assert outcomes["good"].facts == {"name": "good", "files": 0}
-    assert outcomes["fault"].reason == "ZeroDivisionError: a fault of ours" and "sweep_works.py" in (outcomes["fault"].trace or "")
+    assert outcomes["fault"].reason == "ZeroDivisionError: a fault of ours" and "gated_work.py" in (outcomes["fault"].trace or "")
     assert outcomes["bad"].reason == "leaf.png cannot be used (No such file)" and outcomes["bad"].trace is None
 
 
@@ -59,45 +59,45 @@ def test_a_process_that_dies_costs_its_own_task_only(tmp_path: Path) -> None:
     marks = str(tmp_path)
     with LocalWorkers(2, retries=2) as workers:
         tasks = [
-            task("hardy", sweep_works.die, tmp_path, marks, "hardy", 2),
-            task("doomed", sweep_works.die, tmp_path, marks, "doomed", 99),
-            *(task(name, sweep_works.copy, tmp_path / name, marks, name) for name in ("a", "b", "c")),
+            task("hardy", gated_work.die, tmp_path, marks, "hardy", 2),
+            task("doomed", gated_work.die, tmp_path, marks, "doomed", 99),
+            *(task(name, gated_work.copy, tmp_path / name, marks, name) for name in ("a", "b", "c")),
         ]
         outcomes = carried_out(workers, tasks)
     assert outcomes["hardy"].facts == {"name": "hardy"}
     assert outcomes["doomed"].reason == "its process died 3 times, last by SIGKILL"
     assert all(outcomes[name].reason is None for name in ("a", "b", "c"))
-    assert sweep_works.begun(tmp_path) == ["a", "b", "c", *["doomed"] * 3, *["hardy"] * 3]
+    assert gated_work.begun(tmp_path) == ["a", "b", "c", *["doomed"] * 3, *["hardy"] * 3]
 
 
 def test_tasks_that_want_a_machine_to_themselves_run_alone(tmp_path: Path) -> None:
     """The one behind it begins when it has ended."""
     marks, gate = str(tmp_path), tmp_path / "gate"
-    with LocalWorkers(2) as workers, sweep_works.watched(tmp_path) as began:
-        with sweep_works.closed(gate):
-            workers.submit(task("first", sweep_works.copy, tmp_path / "first", marks, "first", str(gate), alone=True))
-            workers.submit(task("second", sweep_works.copy, tmp_path / "second", marks, "second"))
-            assert next(began)[0] == "first" and sweep_works.begun(tmp_path) == ["first"]
+    with LocalWorkers(2) as workers, gated_work.watched(tmp_path) as began:
+        with gated_work.closed(gate):
+            workers.submit(task("first", gated_work.copy, tmp_path / "first", marks, "first", str(gate), alone=True))
+            workers.submit(task("second", gated_work.copy, tmp_path / "second", marks, "second"))
+            assert next(began)[0] == "first" and gated_work.begun(tmp_path) == ["first"]
         ended, _ = workers.next()
-        assert ended.name == "first" and sweep_works.begun(tmp_path) == ["first"]
+        assert ended.name == "first" and gated_work.begun(tmp_path) == ["first"]
         assert workers.next()[0].name == "second"
 
 
 def test_processes_end_with_their_parent(tmp_path: Path) -> None:
     """Even when it is killed, in the middle of a task."""
     script = f"""
-import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
+import sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r})
 from pathlib import Path
-import sweep_works
-from bbfit.sweep.local import LocalWorkers
-from bbfit.sweep.tasks import Task
+import gated_work
+from bbfit.workers.local import LocalWorkers
+from bbfit.workers.tasks import Task
 if __name__ == "__main__":
     with LocalWorkers(1) as workers:
-        workers.submit(Task("nap", sweep_works.copy, {{}}, Path({str(tmp_path)!r}), ({str(tmp_path)!r}, "nap", {str(tmp_path / "gate")!r})))
+        workers.submit(Task("nap", gated_work.copy, {{}}, Path({str(tmp_path)!r}), ({str(tmp_path)!r}, "nap", {str(tmp_path / "gate")!r})))
         workers.next()
 """
     (tmp_path / "parent.py").write_text(script)
-    with sweep_works.watched(tmp_path) as began, sweep_works.closed(tmp_path / "gate"):
+    with gated_work.watched(tmp_path) as began, gated_work.closed(tmp_path / "gate"):
         with subprocess.Popen([sys.executable, str(tmp_path / "parent.py")]) as parent:
             _, child = next(began)
             process = os.pidfd_open(child)
@@ -108,18 +108,18 @@ if __name__ == "__main__":
 
 def test_a_task_waits_until_a_killed_sweep_has_left_its_folder(tmp_path: Path) -> None:
     with LocalWorkers(1) as workers:
-        assert carried_out(workers, [task("warm", sweep_works.claim, tmp_path / "warm")])["warm"].reason is None
+        assert carried_out(workers, [task("warm", gated_work.claim, tmp_path / "warm")])["warm"].reason is None
         with claimed_folder("out", tmp_path / "run"):
-            workers.submit(task("again", sweep_works.claim, tmp_path / "run"))
+            workers.submit(task("again", gated_work.claim, tmp_path / "run"))
             time.sleep(0.5)  # in which the task would be refused
         _, outcome = workers.next()
     assert outcome.reason is None and outcome.facts == {"name": "run"}
 
 
 def test_leaving_ends_what_still_runs(tmp_path: Path) -> None:
-    with sweep_works.watched(tmp_path) as began, sweep_works.closed(tmp_path / "gate"):
+    with gated_work.watched(tmp_path) as began, gated_work.closed(tmp_path / "gate"):
         with LocalWorkers(1) as workers:
-            workers.submit(task("nap", sweep_works.copy, tmp_path / "nap", str(tmp_path), "nap", str(tmp_path / "gate")))
+            workers.submit(task("nap", gated_work.copy, tmp_path / "nap", str(tmp_path), "nap", str(tmp_path / "gate")))
             _, child = next(began)
             assert Path(f"/proc/{child}").exists()
         assert not Path(f"/proc/{child}").exists()

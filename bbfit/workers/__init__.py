@@ -1,0 +1,1 @@
+"""Work on many trees, in processes on this machine or on a Ray cluster."""
