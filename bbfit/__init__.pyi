@@ -5,7 +5,9 @@ from .blender.views_folder import render_views as render_views
 from .budget.choice import choose as choose
 from .budget.config import BudgetConfig as BudgetConfig
 from .checks import InputError as InputError
-from .comparison import compare as compare
+from .comparison.config import CompareConfig as CompareConfig
+from .comparison.many_trees import compare_trees as compare_trees
+from .comparison.one_tree import compare as compare
 from .evaluation.report import Report as Report
 from .evaluation.scoring import evaluate as evaluate
 from .exporting.config import ExportConfig as ExportConfig
@@ -22,7 +24,6 @@ from .lod import build_lod as build_lod
 from .pipeline import RunConfig as RunConfig
 from .pipeline import run as run
 from .rendering.dispatch import render as render
-from .rivals.config import CompareConfig as CompareConfig
 from .sweep.config import SweepConfig as SweepConfig
 from .sweep.scheduling import run_sweep as run_sweep
 from .tree_files.tree_file import TreeFile as TreeFile

@@ -91,7 +91,7 @@ def pages() -> None:
     """Draw report.png and view.png: screenshots of the report and the page of an acer."""
     with tempfile.TemporaryDirectory() as folder:
         views = bbfit.ViewsConfig(count=60, size=512)
-        config = bbfit.RunConfig(species="acer", grow=bbfit.GrowConfig(seed=2, detail=0.5), views=views, fit=bbfit.FitConfig(billboards=16))
+        config = bbfit.RunConfig(species="acer", grow=bbfit.GrowConfig(seed=2, detail=0.5), views=views)
         draw_pages(bbfit.run(None, Path(folder) / "acer", config).folder)
 
 

@@ -17,19 +17,24 @@ from PIL import Image
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import InputError
-from bbfit.comparison import CompareResult, compare
+from bbfit.comparison.config import LIT, SYSTEMS, CompareConfig
+from bbfit.comparison.many_trees import compare_trees
+from bbfit.comparison.one_tree import CompareResult, compare
 from bbfit.evaluation.scoring import evaluate
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.pipeline import RunConfig
-from bbfit.rivals.config import LIT, SYSTEMS, CompareConfig
+from bbfit.reporting.comparison_summary import COSTS, front, summaries
+from bbfit.trees.config import GrowConfig
 from bbfit.views.dataset import ViewDataset
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
 STAGES = RunConfig(views=ViewsConfig(count=8, size=64, samples=2, denoise=False), fit=FitConfig(steps=40, placement="even"))
-SMALL = CompareConfig(billboards=3, many=5, crossed=2, directions=2, slices=2, mesh_vertices=80, mesh_vertices_many=120, mesh_steps=6)
+SMALL = CompareConfig(
+    billboards=3, many=5, most=7, crossed=2, directions=2, slices=2, mesh_vertices=80, mesh_vertices_many=120, mesh_steps=6
+)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +46,7 @@ def test_every_system_is_scored_on_the_same_views(done: CompareResult) -> None:
     assert tuple(row.system for row in done.rows) == SYSTEMS
     names = ViewDataset.load(done.folder / "views").test.names
     for row in done.rows:
-        assert row.vertices and row.bytes and row.seconds is not None
+        assert row.costs.vertices and row.costs.bytes and row.costs.seconds is not None
         if row.system == "draco":
             assert row.measures is None
             continue
@@ -50,23 +55,28 @@ def test_every_system_is_scored_on_the_same_views(done: CompareResult) -> None:
 
 
 def test_costs_are_those_of_the_models(done: CompareResult) -> None:
-    rows = {row.system: row for row in done.rows}
-    for row in done.rows:
-        if row.system != "draco":
-            model = (done.folder / row.system / "model.glb").read_bytes()
-            assert row.bytes == len(model) and row.vertices == glb_counts(model)[0], row.system
-    assert rows["bbfit"].vertices == 12 and rows["thesis"].vertices == 32 and rows["crossed"].vertices == 8
-    assert rows["slicing"].planes is not None and rows["slicing"].planes <= 4 and rows["slicing"].vertices == 4 * rows["slicing"].planes
-    assert rows["cloud-many"].planes == rows["bbfit-many"].planes == 5
-    assert rows["decimated-vertices"].vertices is not None and rows["decimated-vertices"].vertices <= 12
-    assert rows["decimated-bytes"].bytes is not None and rows["decimated-bytes"].bytes <= (rows["bbfit"].bytes or 0)
-    assert rows["learned"].vertices is not None and rows["learned"].vertices <= 80
+    costs = {row.system: row.costs for row in done.rows}
+    for system, cost in costs.items():
+        if system != "draco":
+            model = (done.folder / system / "model.glb").read_bytes()
+            assert cost.bytes == len(model) and cost.vertices == glb_counts(model)[0], system
+            assert cost.shaded is not None and 0.1 < cost.shaded < 60, system  # ten vertices cover a part of the tree
+    assert {system for system, cost in costs.items() if cost.shader} == {"slicing"}
+    assert costs["bbfit"].vertices == 12 and costs["thesis"].vertices == 32 and costs["crossed"].vertices == 8
+    assert costs["slicing"].planes is not None and costs["slicing"].planes <= 4
+    assert costs["slicing"].vertices == 4 * costs["slicing"].planes
+    assert costs["cloud-many"].planes == costs["bbfit-many"].planes == 5 and costs["bbfit-most"].planes == 7
+    assert (costs["bbfit-default"].planes or 0) > 7
+    assert costs["decimated-vertices"].vertices is not None and costs["decimated-vertices"].vertices <= 12
+    assert costs["decimated-bytes"].bytes is not None and costs["decimated-bytes"].bytes <= (costs["bbfit"].bytes or 0)
+    assert costs["learned"].vertices is not None and costs["learned"].vertices <= 80
 
 
 def test_bbfits_row_is_its_run(done: CompareResult) -> None:
     cloud = BillboardCloud.load(done.folder / "bbfit" / "run" / "cloud.safetensors")
     report = evaluate(cloud, ViewDataset.load(done.folder / "views").test, export=ExportConfig(outline="rectangle"))
-    assert done.rows[0].measures == report.mean and cloud.alpha.kind == "mask"
+    row = next(row for row in done.rows if row.system == "bbfit")
+    assert row.measures == report.antialiased and cloud.alpha.kind == "mask" and row.costs.shaded == report.shaded
     assert BillboardCloud.load(done.folder / "bbfit-blend" / "run" / "cloud.safetensors").alpha.kind == "blend"
 
 
@@ -83,7 +93,7 @@ def test_maps_take_the_light_of_other_suns(done: CompareResult) -> None:
     for name in ("bbfit-maps", "baked-maps"):
         torch.testing.assert_close(clouds[name].centers, clouds["bbfit"].centers)
         assert rows[name].light != rows["bbfit"].light
-    assert rows["fluffed"].vertices == rows["baked-maps"].vertices and rows["fluffed"].light != rows["baked-maps"].light
+    assert rows["fluffed"].costs.vertices == rows["baked-maps"].costs.vertices and rows["fluffed"].light != rows["baked-maps"].light
     assert "## Under other suns" in (done.folder / "compare.md").read_text()
 
 
@@ -99,7 +109,7 @@ def test_tables_and_pictures(done: CompareResult) -> None:
     assert [line["system"] for line in table] == list(SYSTEMS)
     assert [float(line["psnr"]) for line in table if line["psnr"]] == [row.measures.over.mean.psnr for row in done.rows if row.measures]
     text = (done.folder / "compare.md").read_text()
-    assert all(f"| {row.title} |" in text for row in done.rows) and "| the tree |" in text
+    assert all(f"| {row.title}{'*' * row.costs.shader} |" in text for row in done.rows) and "| the tree |" in text
     assert len(json.loads((done.folder / "compare.json").read_text())) == len(SYSTEMS)
     for name in ("systems.png", "quality.png"):
         with Image.open(done.folder / name) as picture:
@@ -115,16 +125,67 @@ def test_nothing_is_done_twice_and_a_missing_package_leaves_one_out(done: Compar
     (done.folder / "draco" / "result.json").unlink()
     monkeypatch.setitem(sys.modules, "DracoPy", None)
     (row,) = compare(TREE, done.folder, CompareConfig(**{**vars(SMALL), "systems": ("draco",)}), STAGES).rows
-    assert row.vertices is None and "DracoPy is not installed" in row.note
+    assert row.costs.vertices is None and "DracoPy is not installed" in row.note
+
+
+def test_a_result_with_a_damaged_cost_is_refused(done: CompareResult) -> None:
+    path = done.folder / "crossed" / "result.json"
+    before = path.read_text()
+    path.write_text(before.replace('"vertices": 8', '"vertices": "8"'))
+    record = json.loads((done.folder / "run.json").read_text())
+    assert record["stages"]["crossed"]["outputs"]["crossed/result.json"]
+    compare(TREE, done.folder, CompareConfig(**{**vars(SMALL), "systems": ("crossed",)}), STAGES)
+    assert path.read_text() == before  # it had changed, so the system was run again
+
+
+def test_trees_are_compared_by_means_and_spreads(tmp_path: Path) -> None:
+    """Two seeds of a species, a file, and a file without triangles: means of three, and the reason for the fourth."""
+    config = replace(SMALL, systems=("bbfit", "crossed", "slicing", "draco"), workers=1)
+    trimesh.PointCloud([[0, 0, 0], [0, 1, 0], [1, 0, 0]]).export(tmp_path / "points.ply")
+    trees = (TREE, tmp_path / "points.ply")
+    stages = replace(STAGES, grow=GrowConfig(detail=0.1))
+    done = compare_trees(tmp_path / "out", config, stages, species=("apple",), seeds=(0, 1), trees=trees)
+    assert list(done.rows) == ["apple_0", "apple_1", "tree"]
+    assert list(done.failures) == ["points"] and "points.ply" in done.failures["points"]
+    every = [{row.system: row for row in rows} for rows in done.rows.values()]
+    assert every[0]["crossed"].measures != every[1]["crossed"].measures
+    systems = {each.system: each for each in summaries(done.rows)}
+    assert list(systems) == ["bbfit", "crossed", "slicing"]
+    found = [rows["crossed"].measures.over.mean.psnr for rows in every if rows["crossed"].measures]
+    assert systems["crossed"].psnr.mean == pytest.approx(np.mean(found))
+    assert systems["crossed"].psnr.deviation == pytest.approx(np.std(found, ddof=1))
+    sizes = [rows["crossed"].costs.bytes or 0 for rows in every]
+    size = systems["crossed"].costs["bytes"]
+    assert size is not None and size.mean == pytest.approx(np.exp(np.mean(np.log(sizes))))
+    for cost in COSTS:
+        assert {each.system for each in front(list(systems.values()), cost, "psnr")} <= {"bbfit", "crossed"}
+    with (done.folder / "summary.csv").open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [(line["tree"], line["system"]) for line in lines] == [(name, row.system) for name, rows in done.rows.items() for row in rows]
+    text = (done.folder / "summary.md").read_text()
+    assert "Means over 3 trees" in text and "| slicing and blending, 2 x 2 slices* |" in text
+    with Image.open(done.folder / "pareto.png") as picture:
+        assert min(picture.size) > 400
+    times = {path: path.stat().st_mtime_ns for path in done.folder.glob("trees/*/*/result.json")}
+    again = compare_trees(tmp_path / "out", config, stages, species=("apple",), seeds=(0, 1), trees=trees)
+    assert again.rows == done.rows and times == {path: path.stat().st_mtime_ns for path in times}
+    assert again.failures == done.failures
 
 
 def test_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="systems: expected one of bbfit, bbfit-blend"):
+    with pytest.raises(InputError, match="systems: expected one of bbfit-default, bbfit-default-blend, bbfit-small"):
         CompareConfig(systems=("octree",))
     with pytest.raises(InputError, match="slices: expected at least 1"):
         CompareConfig(slices=0)
     with pytest.raises(InputError, match="billboards: the comparison sets their numbers"):
         compare(TREE, tmp_path, SMALL, RunConfig(fit=FitConfig(billboards=3)))
+    (tmp_path / "bad.glb").write_bytes(TREE.read_bytes()[:3000])
+    with pytest.raises(InputError, match=r"bad\.glb"):
+        compare_trees(tmp_path / "out", SMALL, STAGES, trees=(tmp_path / "bad.glb",))
+    with pytest.raises(InputError, match="seeds: expected different ones"):
+        compare_trees(tmp_path / "out", SMALL, STAGES, species=("apple",), seeds=(1, 1))
+    with pytest.raises(InputError, match="there are no trees"):
+        compare_trees(tmp_path / "out", SMALL, STAGES)
 
 
 def test_trees_that_only_blender_reads_as_they_stand_are_converted(tmp_path: Path) -> None:
@@ -134,7 +195,7 @@ def test_trees_that_only_blender_reads_as_they_stand_are_converted(tmp_path: Pat
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / "tree.ply")
     config = replace(SMALL, systems=("decimated-vertices", "draco"))
     decimated, draco = compare(tmp_path / "tree.ply", tmp_path / "out", config, STAGES).rows
-    assert decimated.vertices is not None and decimated.vertices <= 12 and draco.vertices
+    assert decimated.costs.vertices is not None and decimated.costs.vertices <= 12 and draco.costs.vertices
     low, high = trimesh.load(tmp_path / "out" / "decimated-vertices" / "model.glb").bounds
     original = trimesh.load(TREE).bounds
     assert (low >= original[0] - 1e-3).all() and (high <= original[1] + 1e-3).all()

@@ -1,4 +1,4 @@
-"""The commands that compare: many configurations on many trees, and many systems on one."""
+"""The commands that compare: many configurations on many trees, and many systems."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Annotated
 import tyro
 
 from bbfit.blender.config import ViewsConfig
+from bbfit.checks import fail
 from bbfit.cli.console import out_console, progress
+from bbfit.comparison.config import CompareConfig
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.inputs import InputLimits
-from bbfit.rivals.config import CompareConfig
 from bbfit.sweep.config import SweepConfig
 from bbfit.trees.config import GrowConfig
 
@@ -67,18 +68,23 @@ def sweep_command(
 
 
 def compare_command(
-    tree: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TREE")],
+    tree: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[TREE]")] = None,
     /,
     out: Path = Path("runs/compare"),
+    species: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (0,),
+    trees: tuple[Path, ...] = (),
     seed: int = 0,
     compare: CompareConfig = CompareConfig(),  # noqa: B008
+    grow: GrowConfig = GrowConfig(detail=0.5),  # noqa: B008
     views: ViewsConfig = ViewsConfig(),  # noqa: B008
     fit: FitConfig = FitConfig(),  # noqa: B008
     export: ExportConfig = ExportConfig(),  # noqa: B008
     limits: InputLimits = InputLimits(),  # noqa: B008
 ) -> None:
-    """Compare bbfit with other methods on one tree: scores on the same held-out views, bytes, vertices and seconds.
+    """Compare bbfit with other methods: scores on the same held-out views, bytes, vertices, shaded pixels and seconds.
 
+    With one TREE it compares their pictures. With --trees or --species it compares means over trees, on this machine or on a Ray cluster.
     Interrupted and started again, it resumes where it stopped.
 
     For example: bbfit compare tree.glb --out runs/compare
@@ -86,21 +92,36 @@ def compare_command(
     Args:
         tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
         out: Folder for the results.
-        seed: Seed of all stages; --views.seed and --fit.seed override it for one of them.
-        compare: Which systems are compared, and how large each is.
-        views: How the tree is rendered.
+        species: Species to grow and compare on; `bbfit grow --list` lists them.
+        seeds: Seeds of the trees of each species.
+        trees: Tree files to compare on.
+        seed: Seed of all other stages; --views.seed and --fit.seed override it for one of them.
+        compare: Which systems are compared, how large each is, and where trees are compared.
+        grow: How trees are grown.
+        views: How trees are rendered.
         fit: How bbfit's billboards are fitted.
         export: How they are written.
         limits: What the tree and the views may refer to, and how large they may be.
     """
-    from bbfit import comparison
+    from bbfit.comparison.many_trees import compare_trees
+    from bbfit.comparison.one_tree import compare as compare_one
     from bbfit.pipeline import RunConfig
-    from bbfit.reporting.tables import compare_table
+    from bbfit.reporting.tables import compare_table, summary_table
 
-    stages = RunConfig(views=views, fit=fit, export=export, limits=limits)
+    many = bool(species or trees)
+    if (tree is not None) == many:
+        fail("compare", "expected a tree, or trees and species", "for example bbfit compare tree.glb, or bbfit compare --trees a.glb b.glb")
+    stages = RunConfig(grow=grow, views=views, fit=fit, export=export, limits=limits)
+    if tree is not None:
+        with progress() as on_progress:
+            result = compare_one(tree, out, compare, stages, on_progress=on_progress)
+        out_console.print(compare_table(result.rows))
+        tables = "tables in {}: compare.md, compare.csv, compare.json; pictures: systems.png, quality.png"
+        out_console.print(tables.format(result.folder), soft_wrap=True)
+        return
     with progress() as on_progress:
-        result = comparison.compare(tree, out, compare, stages, on_progress=on_progress)
-    out_console.print(compare_table(result.rows))
-    out_console.print(
-        f"tables in {result.folder}: compare.md, compare.csv, compare.json; pictures: systems.png, quality.png", soft_wrap=True
-    )
+        compared = compare_trees(out, compare, stages, species=species, seeds=seeds, trees=trees, on_progress=on_progress)
+    out_console.print(summary_table(compared.rows))
+    for name, reason in compared.failures.items():
+        out_console.print(f"{name} failed: {reason}", style="yellow", soft_wrap=True)
+    out_console.print(f"in {compared.folder}: summary.md, summary.csv, pareto.png, and a comparison for each tree in trees", soft_wrap=True)

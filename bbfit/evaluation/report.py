@@ -161,7 +161,7 @@ class Report:
     sizes: tuple[SizeScore, ...] = ()
     """The exported model in smaller and smaller pictures, the largest first."""
     shaded: float | None = None
-    """Fragments that a graphics card shades over the pixels that the targets cover (:func:`bbfit.evaluation.scoring.score_shading`)."""
+    """Fragments that a graphics card shades over the pixels that the targets cover (:func:`bbfit.evaluation.shading.score_shading`)."""
     shimmer: tuple[ShimmerScore, ...] = ()
     """The change between neighboring views in smaller and smaller pictures, the largest first; empty if the views have no neighbors."""
     trunk: TrunkScore | None = None

@@ -17,6 +17,7 @@ from bbfit.evaluation.distances import Distances, viewing_distances
 from bbfit.evaluation.light import LightScore, score_light
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeScore, ViewScore
+from bbfit.evaluation.shading import score_shading
 from bbfit.evaluation.shimmer import score_shimmer
 from bbfit.evaluation.sizes import HALVINGS, score_sizes
 from bbfit.evaluation.trunk import TrunkView, measure_trunk, trunk_score
@@ -24,7 +25,6 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.camera import Camera
-from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.light import Light
 from bbfit.rendering.cards import CardRenderer
@@ -136,7 +136,7 @@ def evaluate_model(
         alpha=model.cloud.alpha,
         overdraw=model.overdraw,
         sizes=sizes,
-        shaded=score_shading(model.cards, views),
+        shaded=score_shading(CardRenderer(model.cards).fragments, views),
         shimmer=shimmer,
         trunk=trunk_score(trunks),
         light=light,
@@ -161,17 +161,6 @@ def score_model_light(
     shown, has_maps = model.antialiased() if model.cloud.alpha.kind == "mask" else model, model.cloud.surface is not None
     draw = shown.draw if has_maps else lambda camera, light: shown.draw(camera)
     return score_light(draw, lit, baked, model.surfaces if has_maps else None, on_view)
-
-
-def score_shading(cards: Cards, views: ViewSet) -> float | None:
-    """Fragments that a graphics card shades in all views over the pixels that the targets cover, by the sum of their alpha.
-
-    1 is a model without layers or empty fragments. ``None`` if the targets are empty.
-    """
-    renderer = CardRenderer(cards)
-    shaded = sum(renderer.fragments(views.cameras[index]) for index in range(len(views)))
-    covered = sum(float(views.targets([index], torch.float64)[0][..., 3].sum()) for index in range(len(views)))
-    return shaded / covered if covered else None
 
 
 def score_views(

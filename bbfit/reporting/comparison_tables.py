@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bbfit.checks import check_record
 from bbfit.evaluation.measures import Measures
 from bbfit.evaluation.scoring import OriginalTree, view_angles
 from bbfit.files import write_bytes
 from bbfit.images import encode_png, over_color, premultiply, read_rgba, to_bytes
-from bbfit.reporting.plots import FAINT, INK, PAPER, picture_font, spread_views, write_figure
+from bbfit.reporting.plots import FAINT, INK, PAPER, picture_font, spread_views
 from bbfit.reporting.sweep_tables import markdown
 from bbfit.views.view_set import ViewSet
 
@@ -29,8 +30,29 @@ _MEASURES = (
     *("color_delta_e", "color_chroma", "color_brightness", "thesis_psnr"),
 )
 _LIGHT = ("psnr", "flip", "low", "r2")
+_INTRO = """Means over the held-out views, which are the same for all systems. PSNR, SSIM and FLIP are also means over four backgrounds.
+*Shaded* is the number of pixels that a graphics card shades for each pixel that the tree covers. Systems with a star need a shader of their
+own in every program."""
 # Headings of the measures in compare.md.
 _SHOWN = ("PSNR, dB", "SSIM", "FLIP", "PSNR over white", "silhouette IoU", "sharpness", "color ΔE", "chroma", "brightness")
+
+
+@dataclass(frozen=True)
+class CompareCosts:
+    """What the result of a system costs; ``None`` where that is unknown or does not exist."""
+
+    planes: int | None = None
+    """Number of planes; ``None`` for a mesh."""
+    vertices: int | None = None
+    """Vertices of its model."""
+    bytes: int | None = None
+    """Size of its model as GLB, or of its own file."""
+    seconds: float | None = None
+    """Time of making the model, without rendering the views."""
+    shaded: float | None = None
+    """Fragments that a graphics card shades over the pixels that the tree covers (:func:`bbfit.evaluation.shading.score_shading`)."""
+    shader: bool = False
+    """Whether a program needs a shader of its own to show it."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +63,8 @@ class CompareRow:
     """Its short name."""
     title: str
     """What the system does, for the reader."""
-    planes: int | None
-    """Number of planes; ``None`` for a mesh."""
-    vertices: int | None
-    """Vertices of its model."""
-    bytes: int | None
-    """Size of its model as GLB."""
-    seconds: float | None
-    """Time of making the model, without rendering the views."""
+    costs: CompareCosts
+    """What the result costs."""
     measures: Measures | None
     """Means over the held-out views; ``None`` where nothing was drawn."""
     note: str
@@ -58,27 +74,26 @@ class CompareRow:
 
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON holds them."""
-        fields = {name: value for name, value in vars(self).items() if name != "measures"}
-        return fields | {"measures": None if self.measures is None else self.measures.to_json()}
+        measures = None if self.measures is None else self.measures.to_json()
+        return vars(self) | {"costs": asdict(self.costs), "measures": measures}
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> CompareRow:
         """The row that :meth:`to_json` returned."""
-        measures = content["measures"]
-        return CompareRow(**{**content, "measures": None if measures is None else Measures.from_json(measures)})
+        measures, costs = content["measures"], CompareCosts(**content["costs"])
+        check_record("costs", costs, CompareCosts)
+        return CompareRow(**{**content, "costs": costs, "measures": None if measures is None else Measures.from_json(measures)})
 
 
 def compare_csv(rows: Sequence[CompareRow]) -> bytes:
     """CSV with one line per system: all measures and costs."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        ["system", "title", "planes", "vertices", "bytes", "seconds", *_MEASURES, *(f"light_{name}" for name in _LIGHT), "note"]
-    )
+    costs = [entry.name for entry in fields(CompareCosts)]
+    writer.writerow(["system", "title", *costs, *_MEASURES, *(f"light_{name}" for name in _LIGHT), "note"])
     for row in rows:
-        costs = [row.planes, row.vertices, row.bytes, row.seconds]
         light = [None if row.light is None else row.light[name] for name in _LIGHT]
-        writer.writerow([row.system, row.title, *costs, *_measures(row.measures), *light, row.note])
+        writer.writerow([row.system, row.title, *vars(row.costs).values(), *_measures(row.measures), *light, row.note])
     return text.getvalue().encode(errors="backslashreplace")
 
 
@@ -93,15 +108,15 @@ def _measures(measures: Measures | None) -> list[float | None]:
 
 def compare_markdown(rows: Sequence[CompareRow], original: OriginalTree) -> str:
     """A Markdown document with a table of all systems, the tree itself first."""
-    table = [["the tree", "", _count(original.vertices), _count(original.bytes), "", *[""] * len(_SHOWN)]]
+    table = [["the tree", "", _count(original.vertices), _count(original.bytes), "", "", *[""] * len(_SHOWN)]]
     for row in rows:
-        seconds = "" if row.seconds is None else f"{row.seconds:,.1f}"
-        planes = "" if row.planes is None else str(row.planes)
-        table.append([row.title, planes, _count(row.vertices), _count(row.bytes), seconds, *_shown(row.measures)])
-    head = ["system", "planes", "vertices", "bytes", "seconds", *_SHOWN]
+        costs = row.costs
+        seconds, shaded = ("" if value is None else f"{value:,.1f}" for value in (costs.seconds, costs.shaded))
+        counts = [_count(costs.planes), _count(costs.vertices), _count(costs.bytes)]
+        table.append([row.title + ("*" if costs.shader else ""), *counts, shaded, seconds, *_shown(row.measures)])
+    head = ["system", "planes", "vertices", "bytes", "shaded", "seconds", *_SHOWN]
     notes = "".join(f"- {row.title}: {row.note}\n" for row in rows if row.note)
-    means = "Means over the held-out views, which are the same for all systems. PSNR, SSIM and FLIP are also means over four backgrounds."
-    return f"# Comparison\n\n{means}\n\n{markdown(head, table)}\n{_light_markdown(rows)}{notes}"
+    return f"# Comparison\n\n{_INTRO}\n\n{markdown(head, table)}\n{_light_markdown(rows)}{notes}"
 
 
 def _light_markdown(rows: Sequence[CompareRow]) -> str:
@@ -131,34 +146,6 @@ def _count(value: int | None) -> str:
     return "" if value is None else f"{value:,}"
 
 
-def compare_plot(rows: Sequence[CompareRow], path: Path) -> None:
-    """Write a PNG with PSNR and FLIP, means over the backgrounds, against bytes and vertices, one point for each system that was drawn."""
-    from matplotlib.figure import Figure
-
-    drawn = [row for row in rows if row.measures is not None]
-    if not drawn:
-        return
-    figure = Figure(figsize=(13, 8.5), dpi=110, layout="constrained")
-    axes = figure.subplots(2, 2, sharex="col", sharey="row")
-    for line, name in enumerate(("PSNR, dB, mean over backgrounds", "FLIP, mean over backgrounds, lower is better")):
-        for column, cost in enumerate(("bytes", "vertices")):
-            axis = axes[line][column]
-            for number, row in enumerate(drawn):
-                assert row.measures is not None
-                over, own = row.measures.over.mean, row.system.startswith("bbfit")
-                x, y = getattr(row, cost), over.psnr if line == 0 else over.flip
-                axis.scatter(x, y, s=90 if own else 45, marker="*" if own else "o", color=f"C{number % 10}", zorder=3, label=row.title)
-                axis.annotate(row.system, (x, y), (4, 4), textcoords="offset points", fontsize=7, color="#70767e")
-            axis.set_xscale("log")
-            axis.margins(x=0.15)  # for the names
-            axis.grid(alpha=0.3)
-            if line == 1:
-                axis.set_xlabel(cost)
-        axes[line][0].set_ylabel(name)
-    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    write_figure(figure, path)
-
-
 def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) -> None:
     """Write ``systems.png``: one held-out view over white, and the picture of each system that was drawn, with its mean scores.
 
@@ -170,10 +157,10 @@ def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) ->
     drawn = [row for row in rows if row.measures is not None]
     pictures = [("the tree", f"held-out view {views.names[index]}", views.targets([index])[0])]
     for row in drawn:
-        assert row.measures is not None and row.vertices is not None and row.bytes is not None
+        assert row.measures is not None and row.costs.bytes is not None
         straight = torch.from_numpy(read_rgba(folder / row.system / "held_out" / f"{views.names[index]}.png")).float() / 255
         over = row.measures.over.mean
-        caption = f"{over.psnr:.2f} dB  ·  FLIP {over.flip:.3f}  ·  {row.vertices:,} vertices  ·  {row.bytes / 1e6:.2g} MB"
+        caption = f"{over.psnr:.2f} dB  ·  FLIP {over.flip:.3f}  ·  {_vertices(row.costs)}{row.costs.bytes / 1e6:.2g} MB"
         pictures.append((row.title, caption, premultiply(straight)))
     part = _around(views.targets([index])[0][..., 3])
     gap, line = 14, 3 * _TEXT + 8
@@ -190,6 +177,10 @@ def compare_picture(rows: Sequence[CompareRow], views: ViewSet, folder: Path) ->
         draw.text((left, top + _TILE + 4), title, INK, bold)
         draw.text((left, top + _TILE + 8 + _TEXT), caption, FAINT, font)
     write_bytes(folder / "systems.png", encode_png(np.asarray(sheet)))
+
+
+def _vertices(costs: CompareCosts) -> str:
+    return "" if costs.vertices is None else f"{costs.vertices:,} vertices  ·  "
 
 
 def _around(alpha: Tensor) -> tuple[int, int, int, int]:

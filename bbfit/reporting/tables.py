@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from bbfit.evaluation.report import Cost, Report
 from bbfit.exporting.lod import LodLevel
+from bbfit.reporting.comparison_summary import summaries
 from bbfit.reporting.comparison_tables import CompareRow
 from bbfit.reporting.sweep_tables import MEASURES, SweepRow, label_names
 from bbfit.trees.species import Species
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 # Reports with more rings than this are shown without rings.
 _MOST_RINGS = 8
 _MEANS = "PSNR, SSIM and FLIP: means over four backgrounds"
+# Costs of a comparison over trees, with their digits.
+_COSTS = (("vertices", 0), ("bytes", 0), ("shaded", 1), ("seconds", 1))
 _UP, _DOWN, _ONE = "↑", "↓", "→ 1"
 
 
@@ -168,9 +171,21 @@ def compare_table(rows: Sequence[CompareRow]) -> Table:
     for row in rows:
         over = None if row.measures is None else row.measures.over.mean
         scores = ["-"] * 3 if over is None else [f"{over.psnr:.2f}", f"{over.ssim:.3f}", f"{over.flip:.3f}"]
-        seconds = "-" if row.seconds is None else f"{row.seconds:,.1f}"
+        costs = row.costs
+        seconds = "-" if costs.seconds is None else f"{costs.seconds:,.1f}"
         lit = "-" if row.light is None else f"{row.light['psnr']:.2f}"
-        table.add_row(row.title, *scores, lit, _count(row.planes), _count(row.vertices), _count(row.bytes), seconds)
+        table.add_row(row.title, *scores, lit, _count(costs.planes), _count(costs.vertices), _count(costs.bytes), seconds)
+    return table
+
+
+def summary_table(rows: Mapping[str, Sequence[CompareRow]]) -> Table:
+    """A ``rich`` table with one line per system: means of its costs and measures over trees, whose rows are given by their names."""
+    head = ["PSNR, dB", "±", "FLIP", "vertices", "bytes", "shaded", "seconds"]
+    table = _table(["system"], head, no_wrap=True)
+    table.caption, table.caption_justify = f"{_MEANS} and {len(rows)} trees; ±: standard deviation over the trees", "left"
+    for each in summaries(rows):
+        costs = ("-" if (spread := each.costs[name]) is None else f"{spread.mean:,.{digits}f}" for name, digits in _COSTS)
+        table.add_row(each.title, f"{each.psnr.mean:.2f}", f"{each.psnr.deviation:.2f}", f"{each.flip.mean:.3f}", *costs)
     return table
 
 

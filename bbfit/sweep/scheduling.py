@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections import defaultdict
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from typing import Any
 
 from bbfit.blender.config import RING
 from bbfit.blender.requirements import check_blender
-from bbfit.checks import InputError, check_file, check_folder, fail
+from bbfit.checks import InputError, fail
 from bbfit.exporting.config import ExportConfig
 from bbfit.files import write_bytes
 from bbfit.fitting.loop import fit_inputs
@@ -32,6 +31,7 @@ from bbfit.trees.species import load_species
 from bbfit.views.dataset import ViewDataset
 from bbfit.workers.choice import workers_of
 from bbfit.workers.results import Results
+from bbfit.workers.sources import Source, sources
 from bbfit.workers.tasks import Outcome, Task, Workers
 
 TABLES = ("table.csv", "table.md", "table.png")
@@ -40,20 +40,6 @@ TABLES = ("table.csv", "table.md", "table.png")
 _DIGITS = 20
 # Seconds between two writes of the table during a sweep.
 _TABLE_INTERVAL = 10.0
-
-
-@dataclass(frozen=True)
-class Source:
-    """A tree of a sweep."""
-
-    name: str
-    """The name of its folder and of its rows."""
-    species: str | None = None
-    """The species to grow."""
-    tree: Path | None = None
-    """The file of a tree to render."""
-    views: Path | None = None
-    """The folder of existing views."""
 
 
 @dataclass(frozen=True)
@@ -137,38 +123,6 @@ def _check(folder: Path, sources: list[Source], cells: list[Cell], config: Sweep
 
 def _tree_folder(folder: Path, source: Source) -> Path:
     return folder / "trees" / source.name
-
-
-def sources(
-    species: Sequence[str], trees: Sequence[str | Path], views: Sequence[str | Path], species_file: Path | None = None
-) -> list[Source]:
-    """The trees of a sweep with unique names: that of the species, the file or the folder, with the parent folder's if they coincide.
-
-    ``trees`` are files, ``views`` are folders, and ``species_file`` contains more species. Raises ``MissingFileError`` or ``InputError`` if
-    there are no trees, one does not exist, or two have the same name.
-    """
-    result = [Source(load_species(name, species_file).name, species=name) for name in species]
-    on_disk = [(path, Source(_plain(path.stem), tree=check_file("tree", path))) for path in map(Path, trees)]
-    for folder in views:
-        path = check_folder("views", folder).resolve()
-        path = path.parent if path.name == "views" else path  # a run calls its folder of views so
-        on_disk.append((path, Source(_plain(path.name), views=Path(folder))))
-    names = [source.name for source in result] + [source.name for _, source in on_disk]
-    for path, source in on_disk:  # tree libraries often have a folder for each tree, with the same file name in all folders
-        result.append(
-            source if names.count(source.name) == 1 else replace(source, name=f"{_plain(path.resolve().parent.name)}_{source.name}")
-        )
-    if not result:
-        fail("sweep", "there are no trees", "give species, trees or views")
-    for source in result:
-        if sum(other.name == source.name for other in result) > 1:
-            fail("sweep", f"two trees are called {source.name}", "rename one, or omit one")
-    return result
-
-
-def _plain(name: str) -> str:
-    """A name in which bytes that are not UTF-8 are written as numbers."""
-    return os.fsencode(name).decode(errors="backslashreplace")
 
 
 class _Sweep:

@@ -9,7 +9,7 @@ from bbfit.budget.config import amount
 from bbfit.checks import Count, Range, check_count, check_fields, fail
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class WorkersConfig:
     """The processes or machines that run tasks."""
 

@@ -14,12 +14,12 @@ from bbfit.blender.config import ViewsConfig
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError
 from bbfit.cli import main
-from bbfit.comparison import compare
+from bbfit.comparison.config import CompareConfig
+from bbfit.comparison.one_tree import compare
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.lod import build_lod
 from bbfit.pipeline import RunConfig, run
-from bbfit.rivals.config import CompareConfig
 from bbfit.sweep.config import SweepConfig
 from bbfit.sweep.scheduling import run_sweep
 from bbfit.trees.config import GrowConfig

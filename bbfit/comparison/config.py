@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
-from bbfit.checks import Count, check_choice, check_fields
+from bbfit.checks import Count, check_choice
+from bbfit.workers.config import WorkersConfig
 
 SYSTEMS = (
+    "bbfit-default",
+    "bbfit-default-blend",
+    "bbfit-small",
+    "bbfit-fine",
     "bbfit",
     "bbfit-blend",
     "bbfit-many",
+    "bbfit-most",
     "bbfit-bytes",
     "thesis",
     "crossed",
@@ -32,8 +39,8 @@ LIT = ("bbfit-maps", "baked-maps", "fluffed")
 
 
 @dataclass(frozen=True)
-class CompareConfig:
-    """Which systems are compared, and how large each is."""
+class CompareConfig(WorkersConfig):
+    """Which systems are compared, how large each is, and where a comparison on many trees runs."""
 
     systems: tuple[str, ...] = ()
     """Names of the systems. Default: all of them. The table names those that are skipped because a package is not installed."""
@@ -41,6 +48,8 @@ class CompareConfig:
     """Billboards of bbfit's smaller fits, and planes of the smaller billboard cloud."""
     many: Count = 32
     """Billboards of bbfit's larger fit, and planes of the larger billboard cloud."""
+    most: Count = 500
+    """Billboards of bbfit's largest fit."""
     crossed: Count = 4
     """Number of crossed planes."""
     directions: Count = 6
@@ -57,4 +66,9 @@ class CompareConfig:
     def __post_init__(self) -> None:
         for system in self.systems:
             check_choice("systems", system, SYSTEMS)
-        check_fields(self)
+        super().__post_init__()
+
+    @property
+    def compared(self) -> dict[str, Any]:
+        """The options that affect results: all but where tasks run."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name not in WorkersConfig.__dataclass_fields__}

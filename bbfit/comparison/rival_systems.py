@@ -1,0 +1,175 @@
+"""The systems that are not bbfit's own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from bbfit.blender.conversion import tree_as_glb
+from bbfit.blender.pictures import render_pictures
+from bbfit.comparison.config import CompareConfig
+from bbfit.comparison.own_systems import fits
+from bbfit.comparison.subject import Subject, System, SystemResult, billboards
+from bbfit.evaluation.shading import triangle_fragments
+from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.lod import glb_counts
+from bbfit.exporting.model import shipped_model
+from bbfit.files import write_bytes
+from bbfit.fitting.config import FitConfig
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import premultiply, read_rgba
+from bbfit.outputs import output_folder
+from bbfit.rendering.cards import CardRenderer
+from bbfit.rivals.baking import tree_triangles
+from bbfit.rivals.billboard_clouds import billboard_cloud
+from bbfit.rivals.crossed import crossed_planes
+from bbfit.rivals.decimation import decimate
+from bbfit.rivals.draco import draco_size
+from bbfit.rivals.learned_mesh import learn_mesh, mesh_glb
+from bbfit.rivals.slicing import slicing
+
+_RECTANGLE = ExportConfig(outline="rectangle")
+# Blender decimates a tree to a number of triangles. It takes a few attempts to find the number that fits a size in bytes.
+_DECIMATION_ATTEMPTS = 5
+
+
+def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]:
+    """The systems that are not bbfit's own, by their names. Some depend on the size of bbfit's fit."""
+    size, count, crossed = fits(config, shared)["bbfit"], config.billboards, config.crossed
+    few, more, steps = config.mesh_vertices, config.mesh_vertices_many, config.mesh_steps
+    return {
+        "crossed": System(f"{crossed} crossed planes, baked", partial(_baked, partial(crossed_planes, count=crossed)), (crossed,)),
+        "slicing": System(
+            f"slicing and blending, {config.directions} x {config.slices} slices", _sliced, (config.directions, config.slices)
+        ),
+        "cloud": _cloud(count),
+        "cloud-many": _cloud(config.many),
+        "decimated-vertices": System(f"decimated to {4 * count} vertices", partial(_decimated, vertices=4 * count), (count,)),
+        "decimated-bytes": System("decimated to bbfit's bytes", _decimated_to_size, size),
+        "thinned": System("thinned out to bbfit's bytes", _thinned, size),
+        "draco": System("the tree, with Draco", _draco),
+        "learned": System(f"learned mesh, {few} vertices", partial(_learned, few), (few, steps)),
+        "learned-many": System(f"learned mesh, {more} vertices", partial(_learned, more), (more, steps)),
+    }
+
+
+def _cloud(count: int) -> System:
+    return System(f"billboard cloud, {count} planes, baked", partial(_baked, partial(billboard_cloud, count=count)), (count,))
+
+
+def _baked(bake: Callable[..., BillboardCloud], subject: Subject, folder: Path) -> SystemResult:
+    started = time.perf_counter()
+    cloud = bake(subject.tree, config=subject.bake, folder=folder / "baked", on_progress=subject.on(folder, "bake"))
+    result = billboards(subject, cloud, _RECTANGLE, 0.0)
+    return replace(result, seconds=time.perf_counter() - started)
+
+
+def _sliced(subject: Subject, folder: Path) -> SystemResult:
+    started = time.perf_counter()
+    slices = slicing(
+        subject.tree,
+        subject.bake,
+        directions=subject.config.directions,
+        slices=subject.config.slices,
+        folder=folder / "baked",
+        on_progress=subject.on(folder, "bake"),
+    )
+    model = shipped_model(BillboardCloud.joined(slices.clouds), _RECTANGLE)
+    renderers = [CardRenderer(shipped_model(cloud, _RECTANGLE).cards) for cloud in slices.clouds]
+
+    def fragments(camera: Camera) -> float:
+        return sum(renderers[index].fragments(camera) for index, weight in slices.weights(camera) if weight > 0)
+
+    cameras, planes = subject.views.test.cameras, sum(map(len, slices.clouds))
+    note = "two of the slicings are drawn at a time, and their pictures are mixed, which requires a shader"
+    seconds = time.perf_counter() - started
+    return SystemResult(
+        model.glb,
+        model.cards.vertex_count,
+        seconds,
+        lambda index: slices.draw(cameras[index]),
+        planes,
+        note,
+        fragments=fragments,
+        shader=True,
+    )
+
+
+def _decimated(subject: Subject, folder: Path, *, vertices: int | None = None, size: int | None = None) -> SystemResult:
+    started = time.perf_counter()
+    mesh = decimate(subject.tree, vertices=vertices, size=size)
+    note = "edge collapses, then vertex clustering" if mesh.clustered else "edge collapses"
+    return _rendered(mesh.glb, subject, folder, time.perf_counter() - started, note)
+
+
+def _decimated_to_size(subject: Subject, folder: Path) -> SystemResult:
+    return _decimated(subject, folder, size=subject.most_bytes)
+
+
+def _thinned(subject: Subject, folder: Path) -> SystemResult:
+    """Decimate the tree with enlarged leaves (Cook et al. 2007) to at most the size of the ``bbfit`` system's model."""
+    started, path, limit = time.perf_counter(), folder / "thinned.glb", subject.most_bytes
+    request = subject.views.request
+    assert request and request.tree.faces
+    triangles = max(1, request.tree.faces * limit // subject.tree.bytes)
+    for _ in range(_DECIMATION_ATTEMPTS):
+        tree_as_glb(subject.tree, path, triangles=triangles)
+        if path.stat().st_size <= limit:
+            break
+        triangles = max(1, int(0.97 * triangles * limit / path.stat().st_size))
+    model = path.read_bytes()
+    path.unlink()
+    note = "Blender; enlarged leaves" if len(model) <= limit else "Blender; enlarged leaves; no smaller size is possible"
+    return _rendered(model, subject, folder, time.perf_counter() - started, note)
+
+
+def _draco(subject: Subject, folder: Path) -> SystemResult:
+    started = time.perf_counter()
+    compressed = draco_size(subject.tree)
+    note = "the tree itself, with 14 bits for each coordinate; not drawn"
+    return SystemResult(None, compressed.vertices, time.perf_counter() - started, None, note=note, size=compressed.bytes)
+
+
+def _learned(vertices: int, subject: Subject, folder: Path) -> SystemResult:
+    started, on_progress, steps = time.perf_counter(), subject.on(folder, "learn"), subject.config.mesh_steps
+    mesh = learn_mesh(
+        subject.views.train,
+        vertices=vertices,
+        steps=steps,
+        seed=subject.stages.fit.seed,
+        on_step=lambda step, loss: on_progress(step, steps),
+    )
+    model, cameras = mesh_glb(mesh), subject.views.test.cameras
+    return SystemResult(
+        model,
+        len(mesh.vertices),
+        time.perf_counter() - started,
+        lambda index: mesh.draw(cameras[index]),
+        note="blended, so its triangles must be sorted",
+        fragments=partial(triangle_fragments, mesh.vertices[mesh.faces].double()),
+    )
+
+
+def _rendered(model: bytes, subject: Subject, folder: Path, seconds: float, note: str) -> SystemResult:
+    """A model as Blender renders it in the light of the views."""
+    path = folder / "model.glb"
+    write_bytes(path, model)
+    pictures = output_folder("out", folder / "blender")
+    for earlier in [*pictures.glob("*.png"), *pictures.glob("*.json")]:
+        earlier.unlink()  # pictures of another model
+    cameras, on_progress = subject.views.test.cameras, subject.on(folder, "render")
+    paths = render_pictures(path, cameras, pictures, subject.stages.views, on_progress=on_progress)
+    return SystemResult(
+        model,
+        glb_counts(model)[0],
+        seconds,
+        lambda index: premultiply(torch.from_numpy(read_rgba(paths[index])).double() / 255),
+        note=note,
+        fragments=partial(triangle_fragments, torch.tensor(tree_triangles(path))),
+    )

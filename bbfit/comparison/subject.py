@@ -1,0 +1,122 @@
+"""What the systems of a comparison work on, and what they return."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from bbfit.comparison.config import CompareConfig
+from bbfit.evaluation.light import LightScore
+from bbfit.evaluation.scoring import held_out, score_model_light
+from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.model import ShippedModel, shipped_model
+from bbfit.fitting.initialize import pixels_per_meter
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.pipeline import RunConfig
+from bbfit.rendering.cards import CardRenderer
+from bbfit.reporting.comparison_tables import CompareRow
+from bbfit.rivals.baking import BakeConfig
+from bbfit.stages.stage import OnProgress
+from bbfit.tree_files.tree_file import TreeFile
+from bbfit.views.dataset import ViewDataset
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A tree with its views, and the options of the comparison."""
+
+    tree: TreeFile
+    """The tree, in a format that all systems read."""
+    views: ViewDataset
+    """Its views; a system sees the training split only."""
+    folder: Path
+    """The folder of the comparison, which contains ``views``."""
+    config: CompareConfig
+    """The sizes of the systems."""
+    stages: RunConfig
+    """The options of views, and those that all fits and exports share."""
+    on_progress: OnProgress
+    """Called with the progress of each system."""
+    row: Callable[[str], CompareRow]
+    """The row of another system, by its name."""
+
+    @property
+    def bake(self) -> BakeConfig:
+        """How rivals bake: with the resolution and the light of the views."""
+        return BakeConfig(float(pixels_per_meter(self.views.train.cameras)), views=self.stages.views)
+
+    @property
+    def most_bytes(self) -> int:
+        """The size of the ``bbfit`` system's model, which others may not exceed."""
+        size = self.row("bbfit").costs.bytes
+        assert size is not None
+        return size
+
+    def on(self, folder: Path, activity: str) -> Callable[[int, int], None]:
+        """Reports the progress of a system with the given folder."""
+        return partial(self.on_progress, f"{folder.name} {activity}")
+
+
+@dataclass(frozen=True)
+class SystemResult:
+    """The simplified tree of a system."""
+
+    model: bytes | None
+    """The GLB file. ``None`` if there is none."""
+    vertices: int | None
+    """Vertices of the model."""
+    seconds: float
+    """Time of making it."""
+    draw: Callable[[int], Tensor] | None
+    """Draws a held-out view as premultiplied RGBA. ``None`` if the result looks like the tree itself."""
+    planes: int | None = None
+    """Number of planes; ``None`` for a mesh."""
+    note: str = ""
+    """A remark for the reader."""
+    size: int | None = None
+    """Size in bytes if there is no GLB file."""
+    fragments: Callable[[Camera], float] | None = None
+    """Fragments that a graphics card shades for one camera. ``None`` if that is not known."""
+    shader: bool = False
+    """Whether a program needs a shader of its own to show it."""
+    lit: Callable[[Callable[[int, int], None]], LightScore | None] | None = None
+    """Scores it under the suns of held-out views, and reports finished views and their total. ``None`` if that is not done."""
+
+
+@dataclass(frozen=True)
+class System:
+    """A way to simplify a tree."""
+
+    title: str
+    """What it does, for the reader."""
+    simplify: Callable[[Subject, Path], SystemResult]
+    """Simplifies the tree, with a folder for its files."""
+    inputs: tuple[Any, ...] = ()
+    """What the result depends on besides the tree, its views, and the options that all fits and exports share."""
+
+
+def billboards(subject: Subject, cloud: BillboardCloud, export: ExportConfig, seconds: float) -> SystemResult:
+    """The result of a system that makes billboards. Masks are drawn with alpha to coverage."""
+    model = shipped_model(cloud, export)
+    drawn = model.antialiased() if cloud.alpha.kind == "mask" else model
+    return SystemResult(
+        model.glb,
+        model.cards.vertex_count,
+        seconds,
+        lambda index: held_out(drawn.draw, subject.views.test, index)[1],
+        len(cloud),
+        "drawn with alpha to coverage" if cloud.alpha.kind == "mask" else "",
+        fragments=CardRenderer(model.cards).fragments,
+        lit=partial(_lit, subject, model),
+    )
+
+
+def _lit(subject: Subject, model: ShippedModel, on_view: Callable[[int, int], None]) -> LightScore | None:
+    views, baked = subject.views.lit_test, subject.views.test.light
+    return None if views is None or baked is None else score_model_light(model, views, baked[[0]], on_view)

@@ -1,0 +1,89 @@
+"""The score and the costs of each system of a comparison on one tree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from torch import Tensor
+
+from bbfit.checks import InputError, check_record
+from bbfit.comparison.config import CompareConfig
+from bbfit.comparison.own_systems import own_systems
+from bbfit.comparison.rival_systems import rival_systems
+from bbfit.comparison.subject import Subject
+from bbfit.evaluation.measures import Measures, mean_measures
+from bbfit.evaluation.scoring import score_views
+from bbfit.evaluation.shading import score_shading
+from bbfit.files import read_json, remove_parts, write_bytes, write_json
+from bbfit.images import to_bytes, unpremultiply, write_png
+from bbfit.inputs import reading
+from bbfit.outputs import output_folder, used_folder
+from bbfit.pipeline import RunConfig
+from bbfit.provenance import VERSIONS
+from bbfit.reporting.comparison_tables import CompareCosts, CompareRow
+from bbfit.stages.stage import OnProgress, Record, Stage
+from bbfit.tree_files.tree_file import TreeFile
+from bbfit.views.dataset import ViewDataset
+
+# The results of every system also depend on the versions of these algorithms.
+_VERSIONS = {name: VERSIONS[name] for name in ("fit", "export", "evaluate")}
+
+
+class Systems:
+    """A tree with its views, and the systems that simplify it."""
+
+    def __init__(
+        self, tree: TreeFile, views: ViewDataset, record: Record, config: CompareConfig, stages: RunConfig, on_progress: OnProgress
+    ) -> None:
+        self._subject = Subject(tree, views, record.folder, config, stages, on_progress, self.row)
+        self._record = record
+        self._systems = own_systems(config, stages.fit) | rival_systems(config, stages.fit)
+
+    def row(self, system: str) -> CompareRow:
+        """The score and the costs of a system."""
+        subject, chosen = self._subject, self._systems[system]
+        folder = subject.folder / system
+
+        def work(on_progress: OnProgress) -> None:
+            result = chosen.simplify(subject, folder)
+            if result.model is not None:
+                write_bytes(folder / "model.glb", result.model)
+            measures = None if result.draw is None else self._score(system, result.draw, output_folder("out", folder / "held_out"))
+            score = None if result.lit is None else result.lit(partial(subject.on_progress, f"{system} light"))
+            light = None if score is None else score.figures
+            size = result.size if result.model is None else len(result.model)
+            shaded = None if result.fragments is None else score_shading(result.fragments, subject.views.test)
+            costs = CompareCosts(result.planes, result.vertices, size, round(result.seconds, 1), shaded, result.shader)
+            write_json(folder / "result.json", CompareRow(system, chosen.title, costs, measures, result.note, light).to_json())
+
+        shared = (subject.stages.fit, subject.stages.export, _VERSIONS)
+        inputs = (system, subject.tree.digest, subject.views.fingerprint, chosen.inputs, *shared)
+        outputs = (f"{system}/result.json", f"{system}/model*.glb", f"{system}/held_out/*.png")
+        try:
+            with used_folder("out", folder):
+                remove_parts(folder)
+                self._record.run(Stage(system, inputs, outputs, work, algorithm="compare"))
+        except InputError as error:
+            if "is not installed" not in str(error) and "LLVM" not in str(error):
+                raise
+            return CompareRow(system, chosen.title, CompareCosts(), None, str(error), None)
+        content = read_json("result", folder / "result.json")
+        with reading("result", folder / "result.json", "remove it, then start bbfit compare again"):
+            row = replace(CompareRow.from_json(content), title=chosen.title)
+            check_record("row", row, CompareRow)
+            return row
+
+    def _score(self, system: str, draw: Callable[[int], Tensor], folder: Path) -> Measures:
+        """Compute the mean measures over the held-out views, and save the pictures."""
+        views = self._subject.views.test
+
+        def draw_and_save(index: int) -> Tensor:
+            image = draw(index).double().cpu().clamp(0, 1)
+            write_png(folder / f"{views.names[index]}.png", to_bytes(unpremultiply(image)))
+            return image
+
+        on_view = partial(self._subject.on_progress, f"{system} score")
+        return mean_measures([view.measures for view in score_views(draw_and_save, views, on_view=on_view)])

@@ -1,0 +1,184 @@
+"""Tables and pictures of a comparison over trees: means, spreads, and who is best at which cost."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean, geometric_mean, stdev
+
+from bbfit.budget.choice import pareto_front
+from bbfit.reporting.comparison_tables import CompareCosts, CompareRow
+from bbfit.reporting.plots import write_figure
+from bbfit.reporting.sweep_tables import markdown
+
+COSTS = {
+    "bytes": "bytes",
+    "vertices": "vertices",
+    "shaded": "shaded pixels for each covered pixel",
+    "seconds": "seconds to make",
+}
+"""The costs that fronts are drawn against, with their names in pictures."""
+_QUALITIES = {"psnr": "PSNR, dB, mean over backgrounds", "flip": "FLIP, mean over backgrounds, lower is better"}
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The mean of a figure over trees, and how far the trees are from it."""
+
+    mean: float
+    """The mean; for costs the geometric mean."""
+    deviation: float
+    """The standard deviation over the trees, 0 for one tree."""
+
+
+@dataclass(frozen=True)
+class SystemSummary:
+    """The results of one system over trees."""
+
+    system: str
+    """Its short name."""
+    title: str
+    """What the system does, for the reader."""
+    trees: int
+    """Number of trees that it was scored on."""
+    shader: bool
+    """Whether a program needs a shader of its own to show it."""
+    psnr: Spread
+    """PSNR in dB, a mean over backgrounds and views."""
+    flip: Spread
+    """FLIP in [0, 1], a mean over backgrounds and views."""
+    costs: Mapping[str, Spread | None]
+    """By the names of :data:`COSTS`; ``None`` where one is not known for all trees."""
+
+
+def summaries(rows: Mapping[str, Sequence[CompareRow]]) -> list[SystemSummary]:
+    """The summary of each system that was drawn on every tree, in the order of the first tree's rows. ``rows`` are by the trees' names."""
+    by_tree = [{row.system: row for row in of_tree if row.measures is not None} for of_tree in rows.values()]
+    names = by_tree[0] if by_tree else {}
+    return [_summary([of_tree[name] for of_tree in by_tree]) for name in names if all(name in each for each in by_tree)]
+
+
+def _summary(rows: Sequence[CompareRow]) -> SystemSummary:
+    over = [row.measures.over.mean for row in rows if row.measures is not None]
+    costs = {name: [getattr(row.costs, name) for row in rows] for name in COSTS}
+    return SystemSummary(
+        rows[0].system,
+        rows[0].title,
+        len(rows),
+        rows[0].costs.shader,
+        _spread([each.psnr for each in over]),
+        _spread([each.flip for each in over]),
+        {name: None if any(not value for value in values) else _spread(values, costs=True) for name, values in costs.items()},
+    )
+
+
+def _spread(values: Sequence[float], *, costs: bool = False) -> Spread:
+    return Spread((geometric_mean if costs else fmean)(values), stdev(values) if len(values) > 1 else 0.0)
+
+
+def front(systems: Sequence[SystemSummary], cost: str, quality: str) -> list[SystemSummary]:
+    """The systems on the Pareto front of a cost (:data:`COSTS`) and ``psnr`` or ``flip``, by increasing cost.
+
+    Those that need a shader of their own and those without this cost are left out.
+    """
+    able = [(system, spread) for system in systems if not system.shader and (spread := system.costs[cost]) is not None]
+    sign = 1 if quality == "psnr" else -1
+    return [able[index][0] for index in pareto_front([(spread.mean, sign * getattr(each, quality).mean) for each, spread in able])]
+
+
+def summary_csv(rows: Mapping[str, Sequence[CompareRow]]) -> bytes:
+    """CSV with one line for each system of each tree: its costs, PSNR and FLIP over the backgrounds and over white, and its note."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    names = list(CompareCosts.__dataclass_fields__)
+    writer.writerow(["tree", "system", *names, "psnr", "flip", "white_psnr", "white_flip", "note"])
+    for tree, row in ((tree, row) for tree, of_tree in rows.items() for row in of_tree):
+        over = None if row.measures is None else row.measures.over
+        figures = [None] * 4 if over is None else [over.mean.psnr, over.mean.flip, over.white.psnr, over.white.flip]
+        writer.writerow([tree, row.system, *vars(row.costs).values(), *figures, row.note])
+    return text.getvalue().encode(errors="backslashreplace")
+
+
+def summary_markdown(rows: Mapping[str, Sequence[CompareRow]], failures: Mapping[str, str]) -> str:
+    """A Markdown document: means and spreads of each system, the fronts, PSNR on each tree, and the trees that failed with the reasons."""
+    systems = summaries(rows)
+    head = ["system", "vertices", "bytes", "shaded", "seconds", "PSNR, dB", "±", "FLIP", "±"]
+    table = []
+    for each in systems:
+        costs = [_number(each.costs[name]) for name in ("vertices", "bytes", "shaded", "seconds")]
+        scores = [f"{each.psnr.mean:.2f}", f"{each.psnr.deviation:.2f}", f"{each.flip.mean:.4f}", f"{each.flip.deviation:.4f}"]
+        table.append([each.title + ("*" if each.shader else ""), *costs, *scores])
+    parts = [
+        "# Comparison over trees",
+        f"Means over {len(rows)} trees; costs are geometric means, and ± is the standard deviation over the trees. PSNR and FLIP are means "
+        "over four backgrounds. Systems with a star need a shader of their own in every program.",
+        markdown(head, table),
+        "## Fronts",
+        "Which systems does no other match that costs no more? Systems with a star are left out. From cheap to dear:",
+        "\n".join(
+            f"- {quality.upper()} and {cost}: {', '.join(each.system for each in front(systems, cost, quality)) or 'none'}"
+            for cost in COSTS
+            for quality in _QUALITIES
+        ),
+        "## PSNR on each tree",
+        markdown(["system", *rows], [[each.title, *_psnrs(rows, each.system)] for each in systems]),
+    ]
+    if failures:
+        parts += ["## Trees that failed", "\n".join(f"- {name}: {reason}" for name, reason in failures.items())]
+    return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
+
+
+def _psnrs(rows: Mapping[str, Sequence[CompareRow]], system: str) -> list[str]:
+    found = [next(row for row in of_tree if row.system == system) for of_tree in rows.values()]
+    return ["" if row.measures is None else f"{row.measures.over.mean.psnr:.2f}" for row in found]
+
+
+def _number(spread: Spread | None) -> str:
+    if spread is None:
+        return ""
+    return f"{spread.mean:,.0f}" if spread.mean >= 100 else f"{spread.mean:.1f}"
+
+
+def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
+    """Write a PNG with PSNR and FLIP against each cost, and their fronts: one point for each system, with its spread over trees.
+
+    Systems that need a shader of their own are hollow, and not part of the fronts. Without systems no file is written.
+    """
+    if not systems:
+        return
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(22, 10), dpi=100, layout="constrained")
+    axes = figure.subplots(len(_QUALITIES), len(COSTS), sharex="col", sharey="row")
+    for line, quality in enumerate(_QUALITIES):
+        for column, cost in enumerate(COSTS):
+            axis = axes[line][column]
+            best = front(systems, cost, quality)
+            axis.set_xscale("log")
+            if len(best) > 1:
+                axis.step(*_corners(best, cost, quality), where="post", color="#9aa3ad", linewidth=1, zorder=1)
+            for number, each in enumerate(systems):
+                spread, value, own = each.costs[cost], getattr(each, quality), each.system.startswith("bbfit")
+                if spread is None:
+                    continue
+                color, at = f"C{number % 10}", (spread.mean, value.mean)
+                axis.errorbar(*at, value.deviation, color=color, elinewidth=0.6, alpha=0.5, zorder=2)
+                face = "none" if each.shader else color
+                axis.scatter(*at, s=90 if own else 45, marker="*" if own else "o", edgecolor=color, facecolor=face, zorder=3)
+                axis.annotate(each.system, at, (4, 4), textcoords="offset points", fontsize=7, color="#70767e")
+            axis.margins(x=0.15)  # for the names
+            axis.grid(alpha=0.3)
+            if line == len(_QUALITIES) - 1:
+                axis.set_xlabel(COSTS[cost])
+        axes[line][0].set_ylabel(_QUALITIES[quality])
+    write_figure(figure, path)
+
+
+def _corners(systems: Sequence[SystemSummary], cost: str, quality: str) -> tuple[list[float], list[float]]:
+    return [spread.mean if (spread := each.costs[cost]) else math.nan for each in systems], [
+        getattr(each, quality).mean for each in systems
+    ]
