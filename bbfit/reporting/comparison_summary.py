@@ -159,6 +159,9 @@ def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
             axis = axes[line][column]
             best = front(systems, cost, quality)
             axis.set_xscale("log")
+            known = [spread.mean for each in systems if (spread := each.costs[cost]) is not None]
+            if known:
+                axis.set_xlim(min(known) / 2, max(known) * 4)  # to the right there are names
             if len(best) > 1:
                 axis.step(*_corners(best, cost, quality), where="post", color="#9aa3ad", linewidth=1, zorder=1)
             for number, each in enumerate(systems):
@@ -170,7 +173,6 @@ def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
                 face = "none" if each.shader else color
                 axis.scatter(*at, s=90 if own else 45, marker="*" if own else "o", edgecolor=color, facecolor=face, zorder=3)
                 axis.annotate(each.system, at, (4, 4), textcoords="offset points", fontsize=7, color="#70767e")
-            axis.margins(x=0.15)  # for the names
             axis.grid(alpha=0.3)
             if line == len(_QUALITIES) - 1:
                 axis.set_xlabel(COSTS[cost])
