@@ -26,6 +26,7 @@ SYSTEMS = (
     "decimated-vertices",
     "decimated-bytes",
     "thinned",
+    "height-fields",
     "draco",
     "learned",
     "learned-many",

@@ -31,6 +31,7 @@ from bbfit.rivals.billboard_clouds import billboard_cloud
 from bbfit.rivals.crossed import crossed_planes
 from bbfit.rivals.decimation import decimate
 from bbfit.rivals.draco import draco_size
+from bbfit.rivals.height_fields import height_fields
 from bbfit.rivals.learned_mesh import learn_mesh, mesh_glb
 from bbfit.rivals.slicing import slicing
 
@@ -53,6 +54,7 @@ def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]
         "decimated-vertices": System(f"decimated to {4 * count} vertices", partial(_decimated, vertices=4 * count), (count,)),
         "decimated-bytes": System("decimated to bbfit's bytes", _decimated_to_size, size),
         "thinned": System("thinned out to bbfit's bytes", _thinned, size),
+        "height-fields": System("the tree as coded height fields", _height_fields),
         "draco": System("the tree, with Draco", _draco),
         "learned": System(f"learned mesh, {few} vertices", partial(_learned, few), (few, steps)),
         "learned-many": System(f"learned mesh, {more} vertices", partial(_learned, more), (more, steps)),
@@ -134,6 +136,17 @@ def _draco(subject: Subject, folder: Path) -> SystemResult:
     compressed = draco_size(subject.tree)
     note = "the tree itself, with 14 bits for each coordinate; not drawn"
     return SystemResult(None, compressed.vertices, time.perf_counter() - started, None, note=note, size=compressed.bytes)
+
+
+def _height_fields(subject: Subject, folder: Path) -> SystemResult:
+    """Code the tree as height fields at the resolution of the views. Blender renders the decoded tree, which is the file of the model."""
+    started = time.perf_counter()
+    coded = height_fields(subject.tree, 1 / subject.bake.texels_per_meter)
+    seconds = time.perf_counter() - started
+    compressed = draco_size(subject.tree, error=coded.error)
+    note = f"{coded.patches:,} patches; wrong by {1000 * coded.error:.1f} mm (RMS), at which Draco takes {compressed.bytes:,} bytes"
+    result = _rendered(coded.glb, subject, folder, seconds, note)
+    return replace(result, model=None, vertices=None, size=len(coded.data), fragments=None, shader=True)
 
 
 def _learned(vertices: int, subject: Subject, folder: Path) -> SystemResult:

@@ -12,12 +12,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.checks import check_count, fail
+from bbfit.rivals.mesh_parts import Part, parts_glb, tree_parts, used_vertices
 from bbfit.tree_files.tree_file import TreeFile
 
 # Rounds of edge collapse, each with the excess of the previous one as its target; steps of the search for a grid.
@@ -38,16 +38,6 @@ class DecimatedTree:
     """Whether edge collapse was not enough and vertices were clustered."""
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Triangles of one material."""
-
-    points: NDArray[np.float64]  # [P, 3] meters, the file's axes
-    faces: NDArray[np.int64]  # [F, 3]
-    uv: NDArray[np.float64] | None  # [P, 2]
-    material: Any
-
-
 def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: int | None = None) -> DecimatedTree:
     """Reduce a .glb, .gltf or .obj to at least 4 ``vertices``, or to a GLB of ``size`` bytes, textures and materials included.
 
@@ -61,10 +51,10 @@ def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: 
     assert limit is not None
     check_count("vertices" if size is None else "size", limit, 4)
     collapse = _collapser()
-    parts = _parts(TreeFile.open(tree))
+    parts = tree_parts(TreeFile.open(tree))
 
-    def cost(parts: list[_Part]) -> int:
-        return sum(len(part.points) for part in parts) if size is None else len(_glb(parts))
+    def cost(parts: list[Part]) -> int:
+        return sum(len(part.points) for part in parts) if size is None else len(parts_glb(parts))
 
     whole, now, clustered = parts, cost(parts), False
     for _ in range(_ROUNDS):
@@ -78,17 +68,17 @@ def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: 
     if now > limit:
         # Start again from the whole tree: edge collapse has removed the trunk in favor of leaves that cannot collapse.
         parts, clustered = _clustered(whole, lambda parts: cost(parts) <= limit), True
-    return DecimatedTree(_glb(parts), sum(len(part.points) for part in parts), sum(len(part.faces) for part in parts), clustered)
+    return DecimatedTree(parts_glb(parts), sum(len(part.points) for part in parts), sum(len(part.faces) for part in parts), clustered)
 
 
-def _collapser() -> Callable[[_Part, int], _Part]:
+def _collapser() -> Callable[[Part, int], Part]:
     """A function that collapses edges of a part to about a number of triangles, or until no edge can collapse."""
     try:
         import fast_simplification
     except ImportError:
         fail("decimate", "the package fast-simplification is not installed", 'pip install "bbfit[rivals]"')
 
-    def collapse(part: _Part, faces: int) -> _Part:
+    def collapse(part: Part, faces: int) -> Part:
         if faces >= len(part.faces):
             return part
         points = np.ascontiguousarray(part.points, np.float32)
@@ -100,27 +90,12 @@ def _collapser() -> Callable[[_Part, int], _Part]:
         source = np.zeros(len(moved), np.int64)
         far_first = kept[np.argsort(-away, kind="stable")]
         source[became[far_first]] = far_first  # the last one written is the nearest of those that became a vertex
-        return _used(replace(part, points=moved.astype(np.float64), faces=left.astype(np.int64), uv=_taken(part.uv, source)))
+        return used_vertices(replace(part, points=moved.astype(np.float64), faces=left.astype(np.int64), uv=_taken(part.uv, source)))
 
     return collapse
 
 
-def _parts(tree: TreeFile) -> list[_Part]:
-    """The file's triangles by material, placed and welded."""
-    import trimesh
-
-    parts = []
-    for mesh in tree.scene().dump():
-        assert isinstance(mesh, trimesh.Trimesh)
-        mesh.merge_vertices(merge_norm=True)
-        uv = getattr(mesh.visual, "uv", None)
-        material = getattr(mesh.visual, "material", None)
-        part = _Part(np.asarray(mesh.vertices), np.asarray(mesh.faces), None if uv is None else np.asarray(uv), material)
-        parts.append(_used(part))
-    return parts
-
-
-def _clustered(parts: list[_Part], fits: Callable[[list[_Part]], bool]) -> list[_Part]:
+def _clustered(parts: list[Part], fits: Callable[[list[Part]], bool]) -> list[Part]:
     """Merge vertices on the finest grid whose result fits."""
     points = np.concatenate([part.points for part in parts])
     low, extent = points.min(0), float(np.ptp(points, axis=0).max())
@@ -140,7 +115,7 @@ def _clustered(parts: list[_Part], fits: Callable[[list[_Part]], bool]) -> list[
     return best
 
 
-def _merged(part: _Part, low: NDArray[np.float64], cell: float) -> _Part:
+def _merged(part: Part, low: NDArray[np.float64], cell: float) -> Part:
     """Merge the vertices in each cell of a grid at their mean position; drop degenerate and duplicate triangles."""
     cells = np.floor((part.points - low) / cell).astype(np.int64)
     _, first, became = np.unique(cells, axis=0, return_index=True, return_inverse=True)
@@ -150,32 +125,14 @@ def _merged(part: _Part, low: NDArray[np.float64], cell: float) -> _Part:
     faces = became[part.faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
     _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return _used(replace(part, points=means, faces=faces[np.sort(kept)], uv=_taken(part.uv, first)))
+    return used_vertices(replace(part, points=means, faces=faces[np.sort(kept)], uv=_taken(part.uv, first)))
 
 
 def _taken(uv: NDArray[np.float64] | None, source: NDArray[np.int64]) -> NDArray[np.float64] | None:
     return None if uv is None else uv[source]
 
 
-def _used(part: _Part) -> _Part:
-    """A part without unused vertices."""
-    used, faces = np.unique(part.faces, return_inverse=True)
-    return replace(part, points=part.points[used], faces=faces.reshape(-1, 3), uv=_taken(part.uv, used))
-
-
-def _glb(parts: list[_Part]) -> bytes:
-    import trimesh
-
-    meshes = []
-    for part in parts:
-        visual = trimesh.visual.TextureVisuals(uv=part.uv, material=part.material) if part.material is not None else None
-        meshes.append(trimesh.Trimesh(part.points, part.faces, visual=visual, process=False, validate=False))
-    data = trimesh.Scene(meshes).export(file_type="glb")
-    assert isinstance(data, bytes)
-    return data
-
-
-def _overhead(parts: list[_Part]) -> int:
+def _overhead(parts: list[Part]) -> int:
     """Bytes of the file without its triangles: materials, textures and the frame."""
     numbers = sum(part.points.size * 4 + part.faces.size * 4 + (0 if part.uv is None else part.uv.size * 4) for part in parts)
-    return len(_glb(parts)) - numbers
+    return len(parts_glb(parts)) - numbers

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,12 +26,13 @@ class DracoSize:
     """Vertices after decompression; quantization may merge some."""
 
 
-def draco_size(tree: str | Path | TreeFile, *, position_bits: int = 14) -> DracoSize:
+def draco_size(tree: str | Path | TreeFile, *, position_bits: int = 14, error: float | None = None) -> DracoSize:
     """Compress every mesh of a .glb, .gltf or .obj as glTF's KHR_draco_mesh_compression would, with texture coordinates and normals.
 
     A coordinate of a position takes ``position_bits`` bits, 1 to 30. As in Draco's own encoder, whose highest level of compression is used,
-    texture coordinates take 12 and normals 10. Raises ``MissingFileError`` or ``InputError`` if the file cannot be used or the package
-    DracoPy is missing.
+    texture coordinates take 12 and normals 10. With ``error``, positions take as many bits as this root mean square in meters needs:
+    three coordinates that are rounded to multiples of q are wrong by q / 2. Raises ``MissingFileError`` or ``InputError`` if the file
+    cannot be used or the package DracoPy is missing.
     """
     check_range("position_bits", position_bits, 1, 30)
     try:
@@ -39,7 +41,10 @@ def draco_size(tree: str | Path | TreeFile, *, position_bits: int = 14) -> Draco
         fail("draco", "the package DracoPy is not installed", 'pip install "bbfit[rivals]"')
     total, vertices = _FRAME, 0
     textures: dict[int, int] = {}
-    for mesh in TreeFile.open(tree).scene().geometry.values():
+    scene = TreeFile.open(tree).scene()
+    if error is not None:
+        position_bits = min(max(1, math.ceil(math.log2(scene.extents.max() / (2 * error)))), 30)
+    for mesh in scene.geometry.values():
         uv = getattr(mesh.visual, "uv", None)
         # A PLY of the mesh has normals only if the mesh was loaded with normals.
         header = mesh.export(file_type="ply", include_attributes=False)[:1000]
