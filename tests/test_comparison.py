@@ -33,7 +33,7 @@ from bbfit.views.dataset import ViewDataset
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
 STAGES = RunConfig(views=ViewsConfig(count=8, size=64, samples=2, denoise=False), fit=FitConfig(steps=40, placement="even"))
 SMALL = CompareConfig(
-    billboards=3, many=5, most=7, crossed=2, directions=2, slices=2, mesh_vertices=80, mesh_vertices_many=120, mesh_steps=6
+    billboards=3, few=2, many=5, medium=6, most=7, crossed=2, directions=2, slices=2, mesh_vertices=80, mesh_vertices_many=120, mesh_steps=6
 )
 
 

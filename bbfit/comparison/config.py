@@ -11,11 +11,14 @@ from bbfit.workers.config import WorkersConfig
 SYSTEMS = (
     "bbfit-default",
     "bbfit-default-blend",
+    "bbfit-rectangles",
     "bbfit-small",
     "bbfit-fine",
     "bbfit",
+    "bbfit-few",
     "bbfit-blend",
     "bbfit-many",
+    "bbfit-medium",
     "bbfit-most",
     "bbfit-bytes",
     "thesis",
@@ -46,9 +49,13 @@ class CompareConfig(WorkersConfig):
     systems: tuple[str, ...] = ()
     """Names of the systems. Default: all of them. The table names those that are skipped because a package is not installed."""
     billboards: Count = 8
-    """Billboards of bbfit's smaller fits, and planes of the smaller billboard cloud."""
+    """Billboards of the fits that others are compared with, and planes of the smaller billboard cloud."""
     many: Count = 32
-    """Billboards of bbfit's larger fit, and planes of the larger billboard cloud."""
+    """Billboards of a larger fit, and planes of the larger billboard cloud."""
+    few: Count = 2
+    """Billboards of bbfit's smallest fit."""
+    medium: Count = 125
+    """Billboards of a fit with about the vertices of the smaller learned mesh."""
     most: Count = 500
     """Billboards of bbfit's largest fit."""
     crossed: Count = 4
