@@ -40,6 +40,7 @@ MARKED = {
         "blender",
         "rivals/test_baking.py",
         "rivals/test_crossed_and_sliced.py",
+        "rivals/test_octahedral.py",
         "sweep/test_scheduling.py",
         "test_comparison.py",
         "test_notebooks.py",

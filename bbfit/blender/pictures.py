@@ -41,6 +41,7 @@ def render_pictures(
     config: ViewsConfig,
     *,
     clips: Sequence[tuple[float, float]] | None = None,
+    depth: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
     """Render a tree with given cameras with Blender's Cycles, in the light of its views.
@@ -62,6 +63,9 @@ def render_pictures(
     clips
         The nearest and the farthest visible distance from each camera along its axis, in meters: V pairs with 0 < nearest < farthest. By
         default everything is visible.
+    depth
+        Also write ``0000_depth.png`` and so on (:func:`depth_path`), which needs ``clips``. Its red channel is 0 at the nearest and 255 at
+        the farthest distance, and where a camera sees nothing.
     on_progress
         Called with the number of finished pictures and the total number, at the start and after each picture.
 
@@ -79,6 +83,8 @@ def render_pictures(
     """
     cameras, out = cameras.batch().to(torch.float64), Path(out)
     _check(cameras, clips)
+    if depth and clips is None:
+        fail("depth", "its range is that of the clip distances", "give clips")
     tree = TreeFile.open(tree)
     request = ViewsRequest.of(tree, config)
     request = replace(
@@ -91,7 +97,8 @@ def render_pictures(
         fail("out", f"{out} contains pictures from elsewhere", f"choose another output folder, or remove {out} to render again")
     count, size = len(cameras), cameras.width
     paths = [out / f"{index:04}.png" for index in range(count)]
-    missing = [index for index, path in enumerate(paths) if not is_intact(path, size)]
+    wanted = [[path, depth_path(path)] if depth else [path] for path in paths]
+    missing = [index for index, files in enumerate(wanted) if not all(is_intact(file, size) for file in files)]
     on_progress = on_progress or (lambda done, total: None)
     on_progress(count - len(missing), count)
     if not missing:
@@ -102,10 +109,16 @@ def render_pictures(
         request.save(out / PICTURES_FILE)
         visible = clips or [clip_distances(points, position) for position in cameras.position]
         report, finished = on_progress, count - len(missing)
-        pool.render(
-            frames(cameras, paths, missing, visible, config.seed), config.render_workers, finished, lambda done: report(done, count)
-        )
+        requests = frames(cameras, paths, missing, visible, config.seed)
+        if depth:
+            requests = [request | {"depth": str(depth_path(paths[request["frame"]]).resolve())} for request in requests]
+        pool.render(requests, config.render_workers, finished, lambda done: report(done, count))
     return paths
+
+
+def depth_path(picture: Path) -> Path:
+    """The file of the depth of a picture."""
+    return picture.with_stem(f"{picture.stem}_depth")
 
 
 def is_intact(path: Path, size: int) -> bool:

@@ -41,7 +41,7 @@ def import_beside(name: str) -> ModuleType:
     return module
 
 
-SCENE, LIGHTS, THIN = (import_beside(f"worker_{name}") for name in ("scene", "lights", "thin"))
+SCENE, LIGHTS, THIN, DEPTH = (import_beside(f"worker_{name}") for name in ("scene", "lights", "thin", "depth"))
 
 
 def main() -> NoReturn:
@@ -216,7 +216,7 @@ def use_device(name: str) -> None:
 
 
 def render(frame: dict[str, Any], settings: dict[str, Any]) -> None:
-    """Render one picture, and those under single lights that belong to it, under temporary names, then rename them."""
+    """Render one picture, and those under single lights or its depth that belong to it, under temporary names, then rename them."""
     import bpy
     from mathutils import Matrix
 
@@ -233,6 +233,8 @@ def render(frame: dict[str, Any], settings: dict[str, Any]) -> None:
     part = path.with_name(f".bbfit-{path.stem}.part")
     scene.render.filepath = str(part).replace("{", "{{").replace("}", "}}")  # Blender would replace {names}
     parts = LIGHTS.aim(frame["lights"], path, settings) if "lights" in frame else {}
+    if "depth" in frame:
+        parts = DEPTH.aim(Path(frame["depth"]), frame["clip"])
     try:
         bpy.ops.render.render(write_still=True)
     except RuntimeError as error:

@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.pictures import PICTURES_FILE, render_pictures, vertical_axis
+from bbfit.blender.pictures import PICTURES_FILE, depth_path, render_pictures, vertical_axis
 from bbfit.checks import InputError
 from bbfit.files import read_json, write_json
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinhole_intrinsics
@@ -69,6 +69,24 @@ def test_clip_distances_show_a_slab(thing_glb: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(bounds(foot), [-0.1, 0.1, 0.0, 0.3], atol=3 / 32)
     np.testing.assert_allclose(bounds(arm), [0.2, 1.3, 1.5, 1.8], atol=3 / 32)
     assert nothing.shape == (32, 32, 4) and not nothing[..., 3].any()
+
+
+def test_depth_lies_beside_pictures_and_leaves_them_as_they_are(thing_glb: Path, tmp_path: Path) -> None:
+    """The fronts of the post, the arm and the foot, z = 0.2, 0.1 and 0.8, from z = 5; a folder without depth is completed."""
+    clips, folder = [(4.0, 6.0)], tmp_path / "out"
+    (path,) = render_pictures(thing_glb, front(), folder, CONFIG, clips=clips)
+    before = path.read_bytes()
+    assert render_pictures(thing_glb, front(), folder, CONFIG, clips=clips, depth=True) == [path]
+    assert path.read_bytes() == before
+    depth = 4 + 2 * (read_rgba(depth_path(path))[..., 0] / 255)
+    places = front()[0].project(torch.tensor([[0.0, 1.0, 0.2], [1.0, 1.65, 0.1], [0.0, 0.15, 0.8], [1.0, 0.5, 0.0]], dtype=torch.float64))
+    found = [depth[row, column] for column, row in places.round().int().tolist()]
+    np.testing.assert_allclose(found, [4.8, 4.9, 4.2, 6.0], atol=2 / 255)
+    told: list[tuple[int, int]] = []
+    render_pictures(thing_glb, front(), folder, CONFIG, clips=clips, depth=True, on_progress=lambda *at: told.append(at))
+    assert told == [(1, 1)]
+    with pytest.raises(InputError, match="give clips"):
+        render_pictures(thing_glb, front(), folder, CONFIG, depth=True)
 
 
 def test_what_is_clipped_still_casts_its_shadow(tmp_path: Path) -> None:

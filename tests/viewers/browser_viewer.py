@@ -26,6 +26,7 @@ from bbfit.glb import gltf_parts
 
 HERE = Path(__file__).parent
 NODE = HERE.parent / "node"
+PROGRAMS = HERE.parents[1] / "bbfit" / "rivals" / "programs"
 # No such host: every request is answered from the disk.
 ORIGIN = "https://viewer.invalid"
 SCRIPT = "text/javascript"
@@ -254,10 +255,9 @@ def _material(found: dict[str, Any]) -> BrowserMaterial:
 def _answer(route: Route, glb: Path) -> None:
     """Serve the page, the program and the model under the page's own origin; refuse everything else."""
     name = route.request.url.removeprefix(f"{ORIGIN}/").partition("?")[0]
-    file = glb if name == "model.glb" else HERE / name
-    if not file.is_file():
-        file = NODE / "node_modules" / name
-    if not file.is_file():
+    places = [glb] if name == "model.glb" else [HERE / name, PROGRAMS / name, NODE / "node_modules" / name]
+    file = next(filter(Path.is_file, places), None)
+    if file is None:
         route.abort()
         return
     route.fulfill(path=file, content_type=TYPES.get(file.suffix))

@@ -27,6 +27,9 @@ if (smooth === "centered") {
     "clamp( ( diffuseColor.a - alphaTest ) / max( fwidth( diffuseColor.a ), 0.0001 ) + 0.5, 0.0, 1.0 )",
   );
 }
+// With ?impostor=plain, models are octahedral impostors, drawn by the program that bbfit writes for them. With ?impostor=turned, they are
+// instances that are turned by 90 degrees.
+const { loadImpostor } = query.has("impostor") ? await import("/impostor_three.js") : {};
 // Without alpha of its own: three.js always asks for one, and what alpha to coverage writes there lets the page through.
 const context = canvas.getContext("webgl2", { alpha: false, antialias: smooth !== null });
 const renderer = new THREE.WebGLRenderer({ canvas, context });
@@ -46,6 +49,11 @@ export async function load(node) {
     material?.dispose();
   });
   scene.clear();
+  if (loadImpostor) {
+    const impostor = await loadImpostor("/model.glb", { loader });
+    scene.add(query.get("impostor") === "turned" ? turned(impostor) : impostor);
+    return [];
+  }
   const gltf = await loader.loadAsync("/model.glb");
   scene.add(gltf.scene);
   if (node !== null) await showOnly(gltf, node);
@@ -58,6 +66,13 @@ export async function load(node) {
     object.material.alphaToCoverage = smooth !== null && object.material.alphaTest > 0;
   });
   return [...materials].map(describe);
+}
+
+function turned({ geometry, material }) {
+  const forest = new THREE.InstancedMesh(geometry, material, 1);
+  forest.setMatrixAt(0, new THREE.Matrix4().makeRotationY(Math.PI / 2).scale(new THREE.Vector3(0.5, 0.5, 0.5)));
+  forest.scale.setScalar(2);
+  return forest;
 }
 
 // Levels of detail are nodes beside the scene (MSFT_lod), which three.js does not load by itself.
