@@ -33,8 +33,20 @@ from bbfit.views.dataset import ViewDataset
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
 STAGES = RunConfig(views=ViewsConfig(count=8, size=64, samples=2, denoise=False), fit=FitConfig(steps=40, placement="even"))
 SMALL = CompareConfig(
-    billboards=3, few=2, many=5, medium=6, most=7, crossed=2, directions=2, slices=2, mesh_vertices=80, mesh_vertices_many=120, mesh_steps=6
+    billboards=3,
+    few=2,
+    many=5,
+    medium=6,
+    most=7,
+    crossed=2,
+    directions=2,
+    slices=2,
+    frames=3,
+    mesh_vertices=80,
+    mesh_vertices_many=120,
+    mesh_steps=6,
 )
+OCTAHEDRAL = [system for system in SYSTEMS if system.startswith("octahedral")]
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +73,12 @@ def test_costs_are_those_of_the_models(done: CompareResult) -> None:
             model = (done.folder / system / "model.glb").read_bytes()
             assert cost.bytes == len(model) and cost.vertices == glb_counts(model)[0], system
             assert cost.shaded is not None and 0.1 < cost.shaded < 60, system  # ten vertices cover a part of the tree
-    assert {system for system, cost in costs.items() if cost.shader} == {"slicing"}
+    assert {system for system, cost in costs.items() if cost.shader} == {"slicing", *OCTAHEDRAL}
+    assert {costs[system].planes for system in OCTAHEDRAL} == {1} and {costs[system].vertices for system in OCTAHEDRAL} == {4}
+    assert (costs["octahedral-flat"].bytes or 0) < (costs["octahedral"].bytes or 0)
+    assert (costs["octahedral-mask"].seconds or 0) >= (costs["octahedral"].seconds or 0)  # which contains their bake
+    assert all((done.folder / system / "impostor_three.js").is_file() for system in OCTAHEDRAL)
+    assert [system for system in OCTAHEDRAL if (done.folder / system / "baked").exists()] == ["octahedral"]
     assert costs["bbfit"].vertices == 12 and costs["thesis"].vertices == 32 and costs["crossed"].vertices == 8
     assert costs["slicing"].planes is not None and costs["slicing"].planes <= 4
     assert costs["slicing"].vertices == 4 * costs["slicing"].planes
@@ -84,7 +101,9 @@ def test_maps_take_the_light_of_other_suns(done: CompareResult) -> None:
     """Each on the planes of bbfit. Baked colors reproduce nothing of the change; decimated meshes are not scored."""
     rows = {row.system: row for row in done.rows}
     lit = {name: row.light["r2"] for name, row in rows.items() if row.light is not None}
-    assert set(lit) == {name for name in SYSTEMS if not name.startswith(("decimated", "thinned", "draco", "learned", "slicing"))}
+    assert set(lit) == {
+        name for name in SYSTEMS if not name.startswith(("decimated", "thinned", "draco", "learned", "slicing", "octahedral"))
+    }
     assert all(lit[name] == pytest.approx(0, abs=1e-9) for name in lit if name not in LIT)
     assert all(abs(lit[name] or 0) > 1e-3 for name in LIT)
     maps, baked = rows["bbfit-maps"].light, rows["bbfit"].light

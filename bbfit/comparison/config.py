@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Annotated, Any
 
-from bbfit.checks import Count, check_choice
+from bbfit.checks import Count, Range, check_choice
 from bbfit.workers.config import WorkersConfig
 
 SYSTEMS = (
@@ -26,6 +26,9 @@ SYSTEMS = (
     "slicing",
     "cloud",
     "cloud-many",
+    "octahedral",
+    "octahedral-flat",
+    "octahedral-mask",
     "decimated-vertices",
     "decimated-bytes",
     "thinned",
@@ -64,6 +67,8 @@ class CompareConfig(WorkersConfig):
     """Number of slicing directions."""
     slices: Count = 5
     """Slices per direction."""
+    frames: Annotated[int, Range(2, 256)] = 12
+    """Directions along each side of the grid of an octahedral impostor."""
     mesh_vertices: Count = 500
     """Vertices of the smaller learned mesh."""
     mesh_vertices_many: Count = 2000

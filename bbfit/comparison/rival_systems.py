@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -33,9 +34,13 @@ from bbfit.rivals.decimation import decimate
 from bbfit.rivals.draco import draco_size
 from bbfit.rivals.height_fields import height_fields
 from bbfit.rivals.learned_mesh import learn_mesh, mesh_glb
+from bbfit.rivals.octahedral import octahedral_impostor
+from bbfit.rivals.octahedral_files import THREE_PROGRAM, impostor_glb, three_program
 from bbfit.rivals.slicing import slicing
 
 _RECTANGLE = ExportConfig(outline="rectangle")
+# The triangles of a quad.
+_QUAD = torch.tensor([[0, 1, 2], [0, 2, 3]])
 # Blender decimates a tree to a number of triangles. It takes a few attempts to find the number that fits a size in bytes.
 _DECIMATION_ATTEMPTS = 5
 
@@ -51,6 +56,9 @@ def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]
         ),
         "cloud": _cloud(count),
         "cloud-many": _cloud(config.many),
+        "octahedral": _impostor(config.frames, "blend"),
+        "octahedral-flat": _impostor(config.frames, "blend, without depth", parallax=0),
+        "octahedral-mask": _impostor(config.frames, "mask", alpha="mask"),
         "decimated-vertices": System(f"decimated to {4 * count} vertices", partial(_decimated, vertices=4 * count), (count,)),
         "decimated-bytes": System("decimated to bbfit's bytes", _decimated_to_size, size),
         "thinned": System("thinned out to bbfit's bytes", _thinned, size),
@@ -99,6 +107,36 @@ def _sliced(subject: Subject, folder: Path) -> SystemResult:
         planes,
         note,
         fragments=fragments,
+        shader=True,
+    )
+
+
+def _impostor(frames: int, kind: str, **options: Any) -> System:
+    return System(f"octahedral impostor, {frames} x {frames} frames, {kind}", partial(_octahedral, options), (frames, options))
+
+
+def _octahedral(options: dict[str, Any], subject: Subject, folder: Path) -> SystemResult:
+    """An octahedral impostor. Variants with ``options`` share the frames of the system ``octahedral``, and the time of rendering them."""
+    shared = subject.row("octahedral").costs.seconds or 0.0 if options else 0.0
+    started = time.perf_counter()
+    impostor = octahedral_impostor(
+        subject.tree,
+        subject.config.frames,
+        subject.bake,
+        folder=folder.parent / "octahedral" / "baked",
+        on_progress=subject.on(folder, "bake"),
+    )
+    impostor = replace(impostor, **options)
+    model, cameras = impostor_glb(impostor), subject.views.test.cameras
+    write_bytes(folder / THREE_PROGRAM, three_program())
+    return SystemResult(
+        model,
+        glb_counts(model)[0],
+        shared + time.perf_counter() - started,
+        lambda index: impostor.draw(cameras[index]),
+        planes=1,
+        note="a shader blends three frames; one quad",
+        fragments=lambda camera: triangle_fragments(impostor.quad(camera)[_QUAD], camera),
         shader=True,
     )
 

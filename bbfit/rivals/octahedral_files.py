@@ -29,8 +29,8 @@ def impostor_glb(impostor: OctahedralImpostor) -> bytes:
     """An impostor as binary glTF 2.0: one quad of 4 vertices, the atlas of colors, and, with parallax, that of heights, both as PNG.
 
     The mesh's ``extras`` describe the grid for a shader: ``frames``, ``hemisphere``, ``center`` and ``radius`` in meters, ``parallax``,
-    ``levels`` (:attr:`~bbfit.rivals.octahedral.OctahedralImpostor.levels`) and ``heights``, the index of that texture or null. A program
-    without the shader shows the frame that is nearest to the front, which is +Z, on the quad, unlit.
+    ``per_pixel`` and ``levels`` as in :class:`~bbfit.rivals.octahedral.OctahedralImpostor`, and ``heights``, the index of that texture or
+    null. A program without the shader shows the frame that is nearest to the front, which is +Z, on the quad, unlit.
     """
     side, frames, heights = impostor.radius, impostor.grid.frames, impostor.parallax > 0
     square = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
@@ -46,6 +46,7 @@ def impostor_glb(impostor: OctahedralImpostor) -> bytes:
         "center": impostor.center.tolist(),
         "radius": side,
         "parallax": impostor.parallax,
+        "per_pixel": impostor.per_pixel,
         "levels": impostor.levels,
         "heights": 1 if heights else None,
     }
