@@ -84,7 +84,7 @@ class SystemResult:
     fragments: Callable[[Camera], float] | None = None
     """Fragments that a graphics card shades for one camera. ``None`` if that is not known."""
     shader: bool = False
-    """Whether a program needs a shader of its own to show it."""
+    """Whether a program needs a shader or a decoder of its own to show it."""
     lit: Callable[[Callable[[int, int], None]], LightScore | None] | None = None
     """Scores it under the suns of held-out views, and reports finished views and their total. ``None`` if that is not done."""
 

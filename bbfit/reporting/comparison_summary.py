@@ -46,7 +46,7 @@ class SystemSummary:
     trees: int
     """Number of trees that it was scored on."""
     shader: bool
-    """Whether a program needs a shader of its own to show it."""
+    """Whether a program needs a shader or a decoder of its own to show it."""
     psnr: Spread
     """PSNR in dB, a mean over backgrounds and views."""
     flip: Spread
@@ -83,7 +83,7 @@ def _spread(values: Sequence[float], *, costs: bool = False) -> Spread:
 def front(systems: Sequence[SystemSummary], cost: str, quality: str) -> list[SystemSummary]:
     """The systems on the Pareto front of a cost (:data:`COSTS`) and ``psnr`` or ``flip``, by increasing cost.
 
-    Those that need a shader of their own and those without this cost are left out.
+    Those that need a shader or a decoder of their own and those without this cost are left out.
     """
     able = [(system, spread) for system in systems if not system.shader and (spread := system.costs[cost]) is not None]
     sign = 1 if quality == "psnr" else -1
@@ -115,7 +115,7 @@ def summary_markdown(rows: Mapping[str, Sequence[CompareRow]], failures: Mapping
     parts = [
         "# Comparison over trees",
         f"Means over {len(rows)} trees; costs are geometric means, and ± is the standard deviation over the trees. PSNR and FLIP are means "
-        "over four backgrounds. Systems with a star need a shader of their own in every program.",
+        "over four backgrounds. Systems with a star need a shader or a decoder of their own in every program.",
         markdown(head, table),
         "## Fronts",
         "Which systems does no other match that costs no more? Systems with a star are left out. From cheap to dear:",
@@ -146,7 +146,7 @@ def _number(spread: Spread | None) -> str:
 def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
     """Write a PNG with PSNR and FLIP against each cost, and their fronts: one point for each system, with its spread over trees.
 
-    Systems that need a shader of their own are hollow, and not part of the fronts. Without systems no file is written.
+    Systems that need a shader or a decoder of their own are hollow, and not part of the fronts. Without systems no file is written.
     """
     if not systems:
         return

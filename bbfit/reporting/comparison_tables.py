@@ -31,8 +31,8 @@ _MEASURES = (
 )
 _LIGHT = ("psnr", "flip", "low", "r2")
 _INTRO = """Means over the held-out views, which are the same for all systems. PSNR, SSIM and FLIP are also means over four backgrounds.
-*Shaded* is the number of pixels that a graphics card shades for each pixel that the tree covers. Systems with a star need a shader of their
-own in every program."""
+*Shaded* is the number of pixels that a graphics card shades for each pixel that the tree covers. Systems with a star need a
+shader or a decoder of their own in every program."""
 # Headings of the measures in compare.md.
 _SHOWN = ("PSNR, dB", "SSIM", "FLIP", "PSNR over white", "silhouette IoU", "sharpness", "color ΔE", "chroma", "brightness")
 
@@ -52,7 +52,7 @@ class CompareCosts:
     shaded: float | None = None
     """Fragments that a graphics card shades over the pixels that the tree covers (:func:`bbfit.evaluation.shading.score_shading`)."""
     shader: bool = False
-    """Whether a program needs a shader of its own to show it."""
+    """Whether a program needs a shader or a decoder of its own to show it."""
 
 
 @dataclass(frozen=True)
