@@ -34,6 +34,7 @@ from bbfit.rivals.octahedral_grid import OctahedralGrid
 from bbfit.scratch import ScratchFolder
 from bbfit.tree_files.tree_file import TreeFile
 
+ImpostorAlpha = Literal["blend", "mask"]
 LARGEST_ATLAS = 2048
 """Most texels along a side of an atlas whose frames' size is not given."""
 CUTOFF = 0.5
@@ -57,7 +58,7 @@ class OctahedralImpostor:
     """Center of the tree in meters, [3] float64."""
     radius: float
     """Half the side of a frame in meters; the sphere of this radius contains the tree."""
-    alpha: Literal["blend", "mask"] = "blend"
+    alpha: ImpostorAlpha = "blend"
     """Whether the mixed alpha is blended, or cut off at :data:`CUTOFF`."""
     parallax: int = 2
     """How often a ray moves to the depth that a frame shows. With 0, frames are flat."""
@@ -71,7 +72,7 @@ class OctahedralImpostor:
         check_shape("heights", tuple(self.heights.shape), (side, side))
         check_shape("center", tuple(self.center.shape), (3,))
         check_range("radius", self.radius, 0, math.inf, open_low=True)
-        check_choice("alpha", self.alpha, get_args(Literal["blend", "mask"]))
+        check_choice("alpha", self.alpha, get_args(ImpostorAlpha))
         check_range("parallax", self.parallax, 0, 64)
 
     @property

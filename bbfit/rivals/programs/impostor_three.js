@@ -103,7 +103,7 @@ vec4 seen(vec2 cell, float level) {
   vec3 from = start * frame, along = ray * frame;
   along /= max(along.z, 1e-3 * length(along)); // edge-on and from behind, a frame shows nothing
   vec2 point = from.xy - from.z * along.xy;
-  for (int step = 0; step < PARALLAX; step++) {
+  for (int i = 0; i < PARALLAX; i++) {
     float height = radius * (2.0 * textureLod(heights, inAtlas(cell, point, level), level).r - 1.0);
     point = from.xy - (from.z + height) * along.xy;
   }
