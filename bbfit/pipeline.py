@@ -188,14 +188,34 @@ def run(
     """
     config, on_progress = config or RunConfig(), on_progress or silent
     with prepare(source, out, config, on_progress=on_progress) as prepared:
-        return _fitted(prepared, config, on_progress, on_step)
+        return _finished(prepared, config, on_progress, on_step)
 
 
-def _fitted(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on_step: Callable[[Step], None] | None) -> RunResult:
+def _finished(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on_step: Callable[[Step], None] | None) -> RunResult:
     """The stages of a run after its views."""
-    record, tree, views = prepared.record, prepared.tree, prepared.views
-    folder = record.folder
-    fit_config, missed, export = config.fit, None, export_config(views, config.exported)
+    record, views = prepared.record, prepared.views
+    cloud, export, missed = fitted(prepared, config, on_progress=on_progress, on_step=on_step)
+    max_bytes = config.budget.most_bytes
+    model = shipped_model(cloud, export, on_progress=on_progress)
+    seconds = {name: spent for name, spent in record.seconds.items() if name not in ("export", "evaluate", "report")}
+    grown = record.head["config"]["species"]
+    subject, original = subject_of(views, record.folder / "cloud.safetensors", grown and grown["name"]), original_tree(views, prepared.tree)
+    record.run(evaluate_stage(record.folder, model, views, original, subject, seconds, max_bytes), on_progress)
+    report = Report.load(record.folder / "metrics.json")
+    record.run(export_stage(record.folder, model, report, max_bytes), on_progress)
+    record.run(report_stage(record.folder, report, model, views, _facts(record)), on_progress)
+    return RunResult(record.folder, cloud, report, tuple(record.skipped), missed)
+
+
+def fitted(
+    prepared: Prepared, config: RunConfig, *, on_progress: OnProgress | None = None, on_step: Callable[[Step], None] | None = None
+) -> tuple[BillboardCloud, ExportConfig, float | None]:
+    """Run the stages of :func:`run` that make billboards of prepared views.
+
+    Returns the billboards, the options of their export, and the target PSNR in dB if the trials of the budget did not reach it.
+    """
+    record, tree, views, on_progress = prepared.record, prepared.tree, prepared.views, on_progress or silent
+    folder, fit_config, missed, export = record.folder, config.fit, None, export_config(views, config.exported)
     if config.budget.given:
         record.run(budget_stage(folder, views, tree, fit_config, config.budget, export), on_progress)
         fit_config, met = read_choice(folder)
@@ -204,16 +224,7 @@ def _fitted(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on_s
     max_bytes = config.budget.most_bytes
     limit = None if max_bytes is None else (max_bytes, export)
     record.run(fit_stage(folder, views, tree, fit_config, limit, on_step), on_progress)
-    cloud = BillboardCloud.load(folder / "cloud.safetensors")
-    model = shipped_model(cloud, export, on_progress=on_progress)
-    seconds = {name: spent for name, spent in record.seconds.items() if name not in ("export", "evaluate", "report")}
-    grown = record.head["config"]["species"]
-    subject = subject_of(views, folder / "cloud.safetensors", grown and grown["name"])
-    record.run(evaluate_stage(folder, model, views, original_tree(views, tree), subject, seconds, max_bytes), on_progress)
-    report = Report.load(folder / "metrics.json")
-    record.run(export_stage(folder, model, report, max_bytes), on_progress)
-    record.run(report_stage(folder, report, model, views, _facts(record)), on_progress)
-    return RunResult(folder, cloud, report, tuple(record.skipped), missed)
+    return BillboardCloud.load(folder / "cloud.safetensors"), export, missed
 
 
 @contextlib.contextmanager

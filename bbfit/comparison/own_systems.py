@@ -13,7 +13,7 @@ from bbfit.comparison.config import CompareConfig
 from bbfit.comparison.subject import Subject, System, SystemResult, billboards
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.pipeline import RunConfig, run
+from bbfit.pipeline import RunConfig, fitted, prepare
 from bbfit.rivals.fluffed import fluffed
 
 
@@ -90,9 +90,11 @@ def _run(stages: RunConfig, subject: Subject, folder: Path) -> SystemResult:
     def report(stage: str, done: int, total: int, note: str = "") -> None:
         subject.on_progress(f"{folder.name} {stage}", done, total, note)
 
-    result = run(subject.folder / "views", folder / "run", replace(stages, tree=subject.tree.path), on_progress=report)
-    seconds = sum(result.report.seconds.get(stage, 0.0) for stage in ("budget", "fit", "export"))
-    return replace(billboards(subject, result.cloud, stages.export, seconds), lit=lambda _: result.report.light)
+    config = replace(stages, tree=subject.tree.path)
+    with prepare(subject.folder / "views", folder / "run", config, on_progress=report) as prepared:
+        cloud, export, _ = fitted(prepared, config, on_progress=report)
+        seconds = sum(prepared.record.seconds.get(stage, 0.0) for stage in ("budget", "fit"))
+    return billboards(subject, cloud, export, seconds)
 
 
 def _fluffed(subject: Subject, folder: Path) -> SystemResult:
