@@ -69,6 +69,8 @@ class CompareConfig(WorkersConfig):
     """Slices per direction."""
     frames: Annotated[int, Range(2, 256)] = 12
     """Directions along each side of the grid of an octahedral impostor."""
+    hemisphere: bool = True
+    """Whether all of these directions are above the horizon. Otherwise half of them are below."""
     mesh_vertices: Count = 500
     """Vertices of the smaller learned mesh."""
     mesh_vertices_many: Count = 2000

@@ -56,9 +56,9 @@ def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]
         ),
         "cloud": _cloud(count),
         "cloud-many": _cloud(config.many),
-        "octahedral": _impostor(config.frames, "blend"),
-        "octahedral-flat": _impostor(config.frames, "blend, without depth", parallax=0),
-        "octahedral-mask": _impostor(config.frames, "mask", alpha="mask"),
+        "octahedral": _impostor(config, "blend"),
+        "octahedral-flat": _impostor(config, "blend, without depth", parallax=0),
+        "octahedral-mask": _impostor(config, "mask", alpha="mask"),
         "decimated-vertices": System(f"decimated to {4 * count} vertices", partial(_decimated, vertices=4 * count), (count,)),
         "decimated-bytes": System("decimated to bbfit's bytes", _decimated_to_size, size),
         "thinned": System("thinned out to bbfit's bytes", _thinned, size),
@@ -111,8 +111,9 @@ def _sliced(subject: Subject, folder: Path) -> SystemResult:
     )
 
 
-def _impostor(frames: int, kind: str, **options: Any) -> System:
-    return System(f"octahedral impostor, {frames} x {frames} frames, {kind}", partial(_octahedral, options), (frames, options))
+def _impostor(config: CompareConfig, kind: str, **options: Any) -> System:
+    title = f"octahedral impostor, {config.frames} x {config.frames} frames{'' if config.hemisphere else ' all around'}, {kind}"
+    return System(title, partial(_octahedral, options), (config.frames, config.hemisphere, options))
 
 
 def _octahedral(options: dict[str, Any], subject: Subject, folder: Path) -> SystemResult:
@@ -123,7 +124,8 @@ def _octahedral(options: dict[str, Any], subject: Subject, folder: Path) -> Syst
         subject.tree,
         subject.config.frames,
         subject.bake,
-        folder=folder.parent / "octahedral" / "baked",
+        hemisphere=subject.config.hemisphere,
+        folder=folder.parent / "octahedral" / ("baked" if subject.config.hemisphere else "baked_all_around"),
         on_progress=subject.on(folder, "bake"),
     )
     impostor = replace(impostor, **options)

@@ -5,8 +5,8 @@ foliage) and "Extracting Triangular 3D Models, Materials, and Lighting From Imag
 normal maps, materials and lights: the texture is shown as it is. The start is the visual hull (``mesh_hull``), not a
 tetrahedral grid, and the renderer a ray caster on the CPU (``mesh_rays``), not a rasterizer on a GPU.
 
-Another start was measured and left out: the trunk, decimated, and cards through clusters of leaves, with 2,000 vertices in all. On validation
-views of an acer it is at 26.9 dB and FLIP 0.048, a mean over backgrounds, and the hull at 27.4 dB and 0.050.
+Another start was measured and left out: the trunk, decimated, and cards through clusters of leaves, with 2,000 vertices in all. On
+validation views of an acer it is at 26.9 dB and FLIP 0.048, a mean over backgrounds, and the hull at 27.4 dB and 0.050.
 """
 
 from __future__ import annotations
