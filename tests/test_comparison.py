@@ -42,6 +42,7 @@ SMALL = CompareConfig(
     directions=2,
     slices=2,
     frames=3,
+    large_bytes=100_000,
     mesh_vertices=80,
     mesh_vertices_many=120,
     mesh_steps=6,
@@ -87,6 +88,7 @@ def test_costs_are_those_of_the_models(done: CompareResult) -> None:
     assert (costs["bbfit-default"].planes or 0) > 7
     assert costs["decimated-vertices"].vertices is not None and costs["decimated-vertices"].vertices <= 12
     assert costs["decimated-bytes"].bytes is not None and costs["decimated-bytes"].bytes <= (costs["bbfit"].bytes or 0)
+    assert (costs["thinned"].bytes or 0) <= (costs["bbfit"].bytes or 0) < 60_000 < (costs["thinned-large"].bytes or 0) <= 100_000
     assert costs["learned"].vertices is not None and costs["learned"].vertices <= 80
 
 

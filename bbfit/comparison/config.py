@@ -32,6 +32,7 @@ SYSTEMS = (
     "decimated-vertices",
     "decimated-bytes",
     "thinned",
+    "thinned-large",
     "height-fields",
     "draco",
     "learned",
@@ -71,6 +72,8 @@ class CompareConfig(WorkersConfig):
     """Directions along each side of the grid of an octahedral impostor."""
     hemisphere: bool = True
     """Whether all of these directions are above the horizon. Otherwise half of them are below."""
+    large_bytes: Count = 1_000_000
+    """Most bytes of the larger tree that is thinned out."""
     mesh_vertices: Count = 500
     """Vertices of the smaller learned mesh."""
     mesh_vertices_many: Count = 2000

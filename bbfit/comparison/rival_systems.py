@@ -62,6 +62,9 @@ def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]
         "decimated-vertices": System(f"decimated to {4 * count} vertices", partial(_decimated, vertices=4 * count), (count,)),
         "decimated-bytes": System("decimated to bbfit's bytes", _decimated_to_size, size),
         "thinned": System("thinned out to bbfit's bytes", _thinned, size),
+        "thinned-large": System(
+            f"thinned out to {config.large_bytes:,} bytes", partial(_thinned, limit=config.large_bytes), (config.large_bytes,)
+        ),
         "height-fields": System("the tree as coded height fields", _height_fields),
         "draco": System("the tree, with Draco", _draco),
         "learned": System(f"learned mesh, {few} vertices", partial(_learned, few), (few, steps)),
@@ -154,12 +157,13 @@ def _decimated_to_size(subject: Subject, folder: Path) -> SystemResult:
     return _decimated(subject, folder, size=subject.most_bytes)
 
 
-def _thinned(subject: Subject, folder: Path) -> SystemResult:
-    """Decimate the tree with enlarged leaves (Cook et al. 2007) to at most the size of the ``bbfit`` system's model."""
-    started, path, limit = time.perf_counter(), folder / "thinned.glb", subject.most_bytes
+def _thinned(subject: Subject, folder: Path, limit: int | None = None) -> SystemResult:
+    """Decimate the tree with enlarged leaves (Cook et al. 2007) to at most ``limit`` bytes, or to the size of ``bbfit``'s model."""
+    started, path = time.perf_counter(), folder / "thinned.glb"
+    limit = limit or subject.most_bytes
     request = subject.views.request
     assert request and request.tree.faces
-    triangles = max(1, request.tree.faces * limit // subject.tree.bytes)
+    triangles = max(1, min(request.tree.faces, request.tree.faces * limit // subject.tree.bytes))
     for _ in range(_DECIMATION_ATTEMPTS):
         tree_as_glb(subject.tree, path, triangles=triangles)
         if path.stat().st_size <= limit:
