@@ -24,22 +24,12 @@ SMALLEST_PART = 0.01
 
 
 def hull_surface(views: ViewSet) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Carve the hull from two grids, the second around the cells that the first one keeps.
+    """The surface of the hull.
 
-    The result is a closed surface (Lorensen and Cline 1987): vertices in meters, [P, 3], and triangles counter-clockwise from outside,
-    [F, 3]. Raises ``InputError`` if no point lies inside the silhouettes of all views.
+    The result is closed (Lorensen and Cline 1987): vertices in meters, [P, 3], and triangles counter-clockwise from outside, [F, 3]. Raises
+    ``InputError`` if no point lies inside the silhouettes of all views.
     """
-    center, half = _reach(views.cameras)
-    low, high = center - half, center + half
-    for cells in (COARSE, FINE):
-        side = float((high - low).max()) / cells
-        counts = np.maximum(np.ceil((high - low) / side), 1).astype(int) + 2
-        start = (low + high - side * (counts - 1)) / 2
-        kept = _carve(views, start, side, counts)
-        filled = np.argwhere(kept >= OPAQUE)
-        if len(filled) == 0:
-            fail("views", "no point lies inside the silhouettes of all views", "check the cameras, and that the pictures show one tree")
-        low, high = start + (filled.min(0) - 1) * side, start + (filled.max(0) + 1) * side
+    kept, start, side = hull_grid(views, FINE, OPAQUE)
     smooth = ndimage.gaussian_filter(np.pad(kept, 2), 0.7)
     points, triangles, _, _ = marching_cubes(smooth, min(OPAQUE, 0.5 * float(smooth.max())), gradient_direction="ascent")
     links = coo_matrix((np.ones(len(triangles)), (triangles[:, 0], triangles[:, 1])), shape=(len(points),) * 2)
@@ -47,6 +37,26 @@ def hull_surface(views: ViewSet) -> tuple[NDArray[np.float64], NDArray[np.int64]
     large = np.bincount(part)[part] >= SMALLEST_PART * len(triangles)
     used, corners = np.unique(triangles[large], return_inverse=True)
     return start + (points[used] - 2) * side, corners.reshape(-1, 3).astype(np.int64)
+
+
+def hull_grid(views: ViewSet, cells: int, least: float) -> tuple[NDArray[np.float32], NDArray[np.float64], float]:
+    """Carve the hull from two grids, the second around the cells of the first one whose opacity is at least ``least``.
+
+    The result is the least opacity over all views of each cell's picture, [X, Y, Z], with about ``cells`` cells along the longest side; the
+    center of the first cell, [3]; and the side of a cell, in meters. Raises ``InputError`` if no cell has that opacity.
+    """
+    center, half = _reach(views.cameras)
+    low, high = center - half, center + half
+    for count in (COARSE, cells):
+        side = float((high - low).max()) / count
+        counts = np.maximum(np.ceil((high - low) / side), 1).astype(int) + 2
+        start = (low + high - side * (counts - 1)) / 2
+        kept = _carve(views, start, side, counts)
+        filled = np.argwhere(kept >= least)
+        if len(filled) == 0:
+            fail("views", "no point lies inside the silhouettes of all views", "check the cameras, and that the pictures show one tree")
+        low, high = start + (filled.min(0) - 1) * side, start + (filled.max(0) + 1) * side
+    return kept, start, side
 
 
 def _reach(cameras: Camera) -> tuple[NDArray[np.float64], float]:
