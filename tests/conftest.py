@@ -66,6 +66,7 @@ MARKED = {
         "operators/test_kernels.py",
         "reporting/test_plots.py",
         "rivals/test_learned_mesh.py",
+        "rivals/test_radiance_field.py",
         "workers/test_local.py",
         "test_budget_runs.py",
         "test_cli.py",

@@ -46,8 +46,9 @@ SMALL = CompareConfig(
     mesh_vertices=80,
     mesh_vertices_many=120,
     mesh_steps=6,
+    field_steps=6,
 )
-CODED = ("height-fields", "draco")  # they ship no model that programs draw
+CODED = ("height-fields", "draco", "radiance-field")  # they ship no model that programs draw
 OCTAHEDRAL = [system for system in SYSTEMS if system.startswith("octahedral")]
 
 
@@ -60,7 +61,8 @@ def test_every_system_is_scored_on_the_same_views(done: CompareResult) -> None:
     assert tuple(row.system for row in done.rows) == SYSTEMS
     names = ViewDataset.load(done.folder / "views").test.names
     for row in done.rows:
-        assert row.costs.bytes and row.costs.seconds is not None and (row.costs.vertices or row.system == "height-fields")
+        assert row.costs.bytes and row.costs.seconds is not None
+        assert (row.costs.vertices is None) == (row.system in ("height-fields", "radiance-field"))
         if row.system == "draco":
             assert row.measures is None
             continue
@@ -75,7 +77,7 @@ def test_costs_are_those_of_the_models(done: CompareResult) -> None:
             model = (done.folder / system / "model.glb").read_bytes()
             assert cost.bytes == len(model) and cost.vertices == glb_counts(model)[0], system
             assert cost.shaded is not None and 0.1 < cost.shaded < 60, system  # ten vertices cover a part of the tree
-    assert {system for system, cost in costs.items() if cost.shader} == {"slicing", "height-fields", *OCTAHEDRAL}
+    assert {system for system, cost in costs.items() if cost.shader} == {"slicing", "height-fields", "radiance-field", *OCTAHEDRAL}
     assert {costs[system].planes for system in OCTAHEDRAL} == {1} and {costs[system].vertices for system in OCTAHEDRAL} == {4}
     assert (costs["octahedral-flat"].bytes or 0) < (costs["octahedral"].bytes or 0)
     assert (costs["octahedral-mask"].seconds or 0) >= (costs["octahedral"].seconds or 0)  # which contains their bake
@@ -90,6 +92,7 @@ def test_costs_are_those_of_the_models(done: CompareResult) -> None:
     assert costs["decimated-bytes"].bytes is not None and costs["decimated-bytes"].bytes <= (costs["bbfit"].bytes or 0)
     assert (costs["thinned"].bytes or 0) <= (costs["bbfit"].bytes or 0) < 60_000 < (costs["thinned-large"].bytes or 0) <= 100_000
     assert costs["learned"].vertices is not None and costs["learned"].vertices <= 80
+    assert costs["radiance-field"].bytes == (done.folder / "radiance-field" / "field.bin").stat().st_size
 
 
 def test_bbfits_row_is_its_run(done: CompareResult) -> None:

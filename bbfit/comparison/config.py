@@ -37,6 +37,7 @@ SYSTEMS = (
     "draco",
     "learned",
     "learned-many",
+    "radiance-field",
     "bbfit-maps",
     "baked-maps",
     "fluffed",
@@ -80,6 +81,8 @@ class CompareConfig(WorkersConfig):
     """Vertices of the larger learned mesh."""
     mesh_steps: Count = 600
     """Optimizer steps of a learned mesh."""
+    field_steps: Count = 3000
+    """Optimizer steps of a radiance field."""
 
     def __post_init__(self) -> None:
         for system in self.systems:

@@ -36,6 +36,7 @@ from bbfit.rivals.height_fields import height_fields
 from bbfit.rivals.learned_mesh import learn_mesh, mesh_glb
 from bbfit.rivals.octahedral import octahedral_impostor
 from bbfit.rivals.octahedral_files import THREE_PROGRAM, impostor_glb, three_program
+from bbfit.rivals.radiance_field import learn_radiance_field
 from bbfit.rivals.slicing import slicing
 
 _RECTANGLE = ExportConfig(outline="rectangle")
@@ -69,6 +70,7 @@ def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]
         "draco": System("the tree, with Draco", _draco),
         "learned": System(f"learned mesh, {few} vertices", partial(_learned, few), (few, steps)),
         "learned-many": System(f"learned mesh, {more} vertices", partial(_learned, more), (more, steps)),
+        "radiance-field": System("radiance field", _radiance_field, (config.field_steps,)),
     }
 
 
@@ -211,6 +213,20 @@ def _learned(vertices: int, subject: Subject, folder: Path) -> SystemResult:
         note="blended, so its triangles must be sorted",
         fragments=partial(triangle_fragments, mesh.vertices[mesh.faces].double()),
     )
+
+
+def _radiance_field(subject: Subject, folder: Path) -> SystemResult:
+    started, on_progress, steps = time.perf_counter(), subject.on(folder, "learn"), subject.config.field_steps
+    field = learn_radiance_field(
+        subject.views.train, steps=steps, seed=subject.stages.fit.seed, on_step=lambda step, loss: on_progress(step, steps)
+    )
+    write_bytes(folder / "field.bin", field.to_bytes())
+    seconds, cameras = time.perf_counter() - started, subject.views.test.cameras
+    drawn, camera = time.perf_counter(), subject.views.train.cameras[0]
+    field.draw(camera)
+    drawn = time.perf_counter() - drawn
+    note = f"{drawn:.2f} s a frame of {camera.width} x {camera.height} pixels on this CPU; {field.samples(camera):.0f} samples a ray"
+    return SystemResult(None, None, seconds, lambda index: field.draw(cameras[index]), note=note, size=field.bytes, shader=True)
 
 
 def _rendered(model: bytes, subject: Subject, folder: Path, seconds: float, note: str) -> SystemResult:

@@ -61,7 +61,13 @@ class Systems:
 
         shared = (subject.stages.fit, subject.stages.export, _VERSIONS)
         inputs = (system, subject.tree.digest, subject.views.fingerprint, chosen.inputs, *shared)
-        outputs = (f"{system}/result.json", f"{system}/model*.glb", f"{system}/impostor*.js", f"{system}/held_out/*.png")
+        outputs = (
+            f"{system}/result.json",
+            f"{system}/model*.glb",
+            f"{system}/impostor*.js",
+            f"{system}/field*.bin",
+            f"{system}/held_out/*.png",
+        )
         try:
             with used_folder("out", folder):
                 remove_parts(folder)

@@ -34,7 +34,7 @@ from bbfit.rivals.voxel_grid import Samples, VoxelGrid
 from bbfit.views.view_set import ViewSet
 
 CELLS = 256
-"""Cells along the longest side of a tree, about."""
+"""Most cells along the longest side of a tree whose number is not given."""
 LEVELS = 3
 """Grids that are learned, each with cells of half the side of those before."""
 STEP = 1.0
@@ -52,7 +52,8 @@ FAINT = 0.02
 START = -3.0
 """Density of the first grid."""
 # Colors are values from -2 to 2, for 0 to 1, and densities from -8 to 8, which softplus makes positive: all change at about one rate.
-_COLORS, _DENSITIES = 2.0, 8.0
+_COLORS = 2.0
+_LIMITS = torch.tensor([_COLORS, _COLORS, _COLORS, 8.0])
 # Share of the cells whose variation a step takes, and what rounds the tip of the absolute value.
 _VARIED, _ROUND = 1 / 16, 1e-4
 # Rays that are drawn at a time.
@@ -101,8 +102,7 @@ class RadianceField:
         Raises ``InputError`` for a batch of cameras.
         """
         starts, rays = _centers(camera)
-        values = self.values.float() / 255 * 2 - 1
-        values = torch.cat([values[:, :3] * _COLORS, values[:, 3:] * _DENSITIES], -1).numpy()
+        values = ((self.values.float() / 255 * 2 - 1) * _LIMITS).numpy()
         parts = []
         for first in range(0, len(rays), _TOGETHER):
             some = slice(first, first + _TOGETHER)
@@ -121,7 +121,7 @@ def learn_radiance_field(
     views: ViewSet,
     *,
     steps: int = 3000,
-    cells: int = CELLS,
+    cells: int | None = None,
     seed: int = 0,
     on_step: Callable[[int, float], None] | None = None,
 ) -> RadianceField:
@@ -136,7 +136,8 @@ def learn_radiance_field(
     steps
         Optimizer steps; half of them for the last grid.
     cells
-        Cells of the last grid along the longest side of the tree, about.
+        Cells of the last grid along the longest side of the tree, about. Default: one for each pixel along the longer side of a picture, at
+        least 32 and at most :data:`CELLS`.
     seed
         Seed of the order of the rays and the places of the points on them.
     on_step
@@ -148,6 +149,8 @@ def learn_radiance_field(
         If an argument is out of range, or the views share no common silhouette.
     """
     check_count("steps", steps, LEVELS)
+    if cells is None:
+        cells = min(max(views.cameras.width, views.cameras.height, 4 << LEVELS), CELLS)
     check_count("cells", cells, 4 << LEVELS)
     check_count("seed", seed, 0)
     random = torch.Generator().manual_seed(seed)
@@ -169,8 +172,7 @@ def learn_radiance_field(
         smaller = VoxelGrid(grid.cells & (seen if last else _grown(seen)), grid.start, grid.side)
         finer = smaller if last else smaller.halved()
         grid, values = finer, grid.carried(values, finer)
-    scaled = torch.cat([values[:, :3] / _COLORS, values[:, 3:] / _DENSITIES], -1)
-    return RadianceField(grid, ((scaled + 1) / 2 * 255).round().clamp(0, 255).byte())
+    return RadianceField(grid, ((values / _LIMITS + 1) / 2 * 255).round().byte())
 
 
 class _Lesson:
@@ -181,14 +183,11 @@ class _Lesson:
         self._grid, self._colors, self._length = grid, colors, length
         self._parts = [(first, samples.of_rays(first, first + BATCH)) for first in range(0, len(colors), BATCH)]
 
-    def learn(
-        self, values: Tensor, steps: range, random: torch.Generator, fall: float, on_step: Callable[[int, float], None]
-    ) -> Tensor:
+    def learn(self, values: Tensor, steps: range, random: torch.Generator, fall: float, on_step: Callable[[int, float], None]) -> Tensor:
         """Values after some steps, at the end of which the step size is ``fall`` times that of the beginning."""
         values = values.clone().requires_grad_()
         optimizer = torch.optim.Adam([values], RATE, betas=(0.9, 0.99), eps=1e-12)
         schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, fall ** (1 / max(1, len(steps))))
-        limits = torch.tensor([_COLORS] * 3 + [_DENSITIES])
         order: list[int] = []
         for step in steps:
             order = order or torch.randperm(len(self._parts), generator=random).tolist()
@@ -201,7 +200,7 @@ class _Lesson:
             optimizer.step()
             schedule.step()
             with torch.no_grad():
-                values.clamp_(-limits, limits)
+                values.clamp_(-_LIMITS, _LIMITS)
             on_step(step + 1, float(loss.detach()))
         return values.detach()
 

@@ -1,7 +1,7 @@
 """A sparse grid of voxels: values at the corners of cells, and rays that visit only the cells that are there.
 
-The cells' mask is the occupancy grid of Müller et al. 2022 ("Instant Neural Graphics Primitives", appendix E.2), and values are interpolated
-linearly between the corners, as in Fridovich-Keil et al. 2022 ("Plenoxels", section 3.1).
+The mask of the cells is the occupancy grid of Müller et al. 2022 ("Instant Neural Graphics Primitives", appendix E.2). Values are
+interpolated linearly between the corners, as in Fridovich-Keil et al. 2022 ("Plenoxels", section 3.1).
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class VoxelGrid:
     def samples(self, starts: Tensor, rays: Tensor, step: float, offsets: Tensor) -> Samples:
         """Points on rays, one every ``step`` cells, that lie in cells that are there.
 
-        Rays are given by a point in meters and a unit direction, float32 [R, 3] each. The points of a ray are shifted by ``offsets``, [R], in
-        [0, 1] steps.
+        Rays are given by a point in meters and a unit direction, float32 [R, 3] each. ``offsets``, [R] in [0, 1], shift the points of a ray
+        by a part of a step.
         """
         starts = (starts - torch.from_numpy(self.start).float()) / self.side
         parts = [self._visited(starts[k : k + _TOGETHER], rays[k : k + _TOGETHER], step, offsets[k : k + _TOGETHER]) for k in _chunks(rays)]
@@ -98,7 +98,7 @@ class VoxelGrid:
     def carried(self, values: Tensor, part: VoxelGrid) -> Tensor:
         """Values at the corners, [P, C], as values at the corners of a part of the grid, or of its halved grid, [Q, C]."""
         factor = part.cells.shape[0] // self.cells.shape[0]
-        slots = self._slots[np.ravel_multi_index((part.indices // factor).T, self.cells.shape)]
+        slots = self._slots[np.ravel_multi_index(tuple((part.indices // factor).T), self.cells.shape)]
         places = torch.from_numpy((part.indices % factor)[:, None] + _CORNERS).float() / factor
         samples = Samples(torch.arange(8 * len(slots)), slots.repeat_interleave(8), places.reshape(-1, 3))
         result = torch.zeros(len(part.vertices), values.shape[1])
@@ -113,7 +113,7 @@ class VoxelGrid:
     def _joined(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """The corners of cells in the box, and for the eight of each cell which of them it is."""
         places = (self.indices[:, None] + _CORNERS).reshape(-1, 3)
-        return np.unique(np.ravel_multi_index(places.T, self._corner_counts), return_inverse=True)
+        return np.unique(np.ravel_multi_index(tuple(places.T), self._corner_counts), return_inverse=True)
 
     @cached_property
     def _slots(self) -> Tensor:
