@@ -100,7 +100,9 @@ def small(words: list[str]) -> list[str]:
     """The options that make a ``bbfit`` command small."""
     command, given = words[0], set(words)
     with_tree = len(words) > 1 and not words[1].startswith("-")
-    stages = options(SMALL_VIEWS | SMALL_FIT)
+    stages, several = options(SMALL_VIEWS | SMALL_FIT), bool(given & {"--trees", "--species"})
+    grown = [] if "--trees" in given else options(SMALL_TREE)
+    machine = ["--ray", "local"] if "--ray" in given else ["--workers", "1"]
     if command == "grow":
         return [] if "--list" in given else options(SMALL_TREE)
     if command == "views":
@@ -115,12 +117,11 @@ def small(words: list[str]) -> list[str]:
         return [*stages, "--planes", "2", "1"]
     if command == "sweep":
         one = ["--billboards", "2"] + ([] if "--grid" in given else ["--species", "acer", "--loss", "l2", "--variants", "base"])
-        grown = [] if "--trees" in given else options(SMALL_TREE)
-        machine = ["--ray", "local"] if "--ray" in given else ["--workers", "1"]
         return [*stages, *one, *grown, *machine]
     if command == "compare":  # tests/test_comparison.py has the others
         some = [] if "--systems" in given else ["--systems", "bbfit", "crossed", "draco"]
-        return [*stages, *some, "--billboards", "2", "--many", "3"]
+        grown = [*grown, "--species", "acer", "--seeds", "0"] if "--species" in given else []
+        return [*stages, *some, *grown, *(machine if several else []), "--billboards", "2", "--many", "3", "--mesh-steps", "2"]
     assert command in ("evaluate", "export"), f"how is bbfit {command} made small?"
     return []
 
