@@ -10,14 +10,21 @@ import pytest
 
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.scoring import OriginalTree
-from bbfit.reporting.comparison_tables import CompareRow, compare_csv, compare_markdown
+from bbfit.reporting.comparison_tables import CompareCosts, CompareRow, compare_csv, compare_markdown
 
 OVER = Over(*(OverBackground(20.0 + step, 0.7 + step / 100, 0.1 + step / 100) for step in range(4)))
 COLOUR = Colour((40, 50, 20, 100), (20, 25, 10, 50), (40, 50, 20, 100), (16, 20, 8, 50))
 MEASURES = Measures(OVER, Rgba(0.07, 23.5, 0.75), ThesisScale(2e-5, 0.99, 92.6, 17.3), COLOUR, 0.9, 0.4)
 ROWS = [
-    CompareRow("bbfit", "bbfit, 8 billboards", 8, 32, 1000, 2.5, MEASURES, "", {"psnr": 19.5, "flip": 0.2, "low": 25.25, "r2": None}),
-    CompareRow("draco", "the tree, with Draco", None, 9000, 500, 0.1, None, "not drawn", None),
+    CompareRow(
+        "bbfit",
+        "bbfit, 8 billboards",
+        CompareCosts(8, 32, 1000, 2.5, 4.25),
+        MEASURES,
+        "",
+        {"psnr": 19.5, "flip": 0.2, "low": 25.25, "r2": None},
+    ),
+    CompareRow("draco", "the tree, with Draco", CompareCosts(None, 9000, 500, 0.1, shader=True), None, "not drawn", None),
 ]
 
 
@@ -49,7 +56,8 @@ def test_markdown_shows_them_too() -> None:
     shown = dict(zip(head, drawn, strict=True))
     assert (shown["PSNR, dB"], shown["FLIP"], shown["PSNR over white"]) == ("21.50", "0.1150", "20.00")
     assert (shown["color ΔE"], shown["chroma"], shown["brightness"]) == ("0.00", "1.00", "0.80")
-    assert set(line) == {"---"} and tree[:2] == ["the tree", ""] and other[0] == "the tree, with Draco"
+    assert set(line) == {"---"} and tree[:2] == ["the tree", ""] and other[0] == "the tree, with Draco*"  # it needs a decoder
+    assert shown["shaded"] == "4.2"
 
 
 def test_markdown_lists_what_was_scored_under_other_suns() -> None:
