@@ -201,7 +201,7 @@ def test_trees_are_compared_by_means_and_spreads(tmp_path: Path) -> None:
 
 
 def test_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="systems: expected one of bbfit-default, bbfit-default-blend, bbfit-rectangles"):
+    with pytest.raises(InputError, match="systems: expected one of bbfit-default, bbfit-default-blend, bbfit-default-coverage"):
         CompareConfig(systems=("octree",))
     with pytest.raises(InputError, match="slices: expected at least 1"):
         CompareConfig(slices=0)

@@ -11,6 +11,7 @@ from bbfit.workers.config import WorkersConfig
 SYSTEMS = (
     "bbfit-default",
     "bbfit-default-blend",
+    "bbfit-default-coverage",
     "bbfit-rectangles",
     "bbfit-small",
     "bbfit-fine",
@@ -20,6 +21,7 @@ SYSTEMS = (
     "bbfit-many",
     "bbfit-medium",
     "bbfit-most",
+    "bbfit-most-coverage",
     "bbfit-bytes",
     "thesis",
     "crossed",

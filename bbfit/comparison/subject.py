@@ -108,7 +108,7 @@ def billboards(subject: Subject, cloud: BillboardCloud, export: ExportConfig, se
     """
     started = time.perf_counter()
     model = shipped_model(cloud, export)
-    drawn = model.antialiased() if cloud.alpha.kind == "mask" else model
+    drawn = model.antialiased() if cloud.alpha.tested else model
     glb = model.glb
     return SystemResult(
         glb,
@@ -116,7 +116,7 @@ def billboards(subject: Subject, cloud: BillboardCloud, export: ExportConfig, se
         seconds + time.perf_counter() - started,
         lambda index: held_out(drawn.draw, subject.views.test, index)[1],
         len(cloud),
-        "drawn with alpha to coverage" if cloud.alpha.kind == "mask" else "",
+        "drawn with alpha to coverage" if cloud.alpha.tested else "",
         fragments=CardRenderer(model.cards).fragments,
         lit=partial(_lit, subject, model),
     )

@@ -58,7 +58,7 @@ def described_glb(glb: bytes, description: Description) -> bytes:
         item["name"] = f"{description.name}_{item['name']}"
     tree["scenes"][tree["scene"]]["name"] = description.name
     alpha: dict[str, Any] = {"mode": description.alpha.kind}
-    alpha |= {"cutoff": description.alpha.cutoff} if description.alpha.kind == "mask" else {}
+    alpha |= {"cutoff": description.alpha.cutoff} if description.alpha.tested else {}
     light = {"sun_direction": description.sun_direction, "sun_strength": description.sun_strength, "ambient": description.ambient}
     places = {"bounds": _bounds(tree), "tree_bounds": description.tree_bounds, "distances": description.distances}
     facts = {

@@ -59,8 +59,8 @@ def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int
         material = trimesh.visual.material.PBRMaterial(
             name="billboards_two_sided" if one_sided else "billboards",
             baseColorTexture=placeholder,
-            alphaMode="MASK" if cards.alpha.kind == "mask" else "BLEND",
-            alphaCutoff=float(cards.alpha.cutoff) if cards.alpha.kind == "mask" else None,
+            alphaMode="MASK" if cards.alpha.tested else "BLEND",
+            alphaCutoff=float(cards.alpha.cutoff) if cards.alpha.tested else None,
             doubleSided=not one_sided,
             metallicFactor=0.0,
             roughnessFactor=1.0,
@@ -155,8 +155,8 @@ def _complete(tree: dict[str, Any], cards: Cards, pictures: list[str], config: R
             material["pbrMetallicRoughness"] |= {"baseColorFactor": [0.0, 0.0, 0.0, 1.0], "metallicFactor": 1.0}
             material |= {"emissiveTexture": {"index": 0}, "emissiveFactor": [1.0, 1.0, 1.0]}
         used |= set(material.get("extensions", ()))
-        if cards.alpha.kind == "hash":
-            material["extras"] = {"alphaMode": "HASH"}
+        if cards.alpha.kind in ("hash", "coverage"):  # which glTF lacks
+            material["extras"] = {"alphaMode": cards.alpha.kind.upper()}
     for mesh in tree["meshes"]:
         for attributes in (primitive["attributes"] for primitive in mesh["primitives"]):
             if _TANGENT in attributes:

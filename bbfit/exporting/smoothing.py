@@ -14,14 +14,16 @@ from bbfit.operators.drawing.compositing import coverage
 
 
 def smoothed(cloud: BillboardCloud) -> BillboardCloud:
-    """A cloud with the alpha mode ``mask`` as one with ``blend`` that looks like it; of another mode it is the cloud itself.
+    """A cloud with the alpha mode ``mask`` or ``coverage`` as one with ``blend`` that looks like it; of other modes it is the cloud itself.
 
     The alpha of a texel becomes the share of it that the mask covers: from 0 to 1 over one texel across the cutoff's contour
     (:func:`~bbfit.operators.drawing.compositing.coverage`; central differences are the change of alpha from texel to texel). So edges are
     one texel wide, the interior is opaque, and what was under the cutoff is gone.
     """
-    if cloud.alpha.kind != "mask":
+    if not cloud.alpha.tested:
         return cloud
+    if cloud.alpha.kind == "coverage":
+        return replace(cloud, alpha=AlphaMode())
     texels = [_smoothed(side, cloud.alpha).reshape(-1, 4) for texture in cloud.textures() for side in texture]
     return replace(cloud, texels=torch.cat(texels), alpha=AlphaMode())
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, TypeVar
 
 from bbfit.checks import Count, Range, Seed, check_fields, fail
-from bbfit.geometry.alpha import AlphaKind, Cutoff
+from bbfit.geometry.alpha import AlphaKind, AlphaMode, Cutoff
 from bbfit.operators.config import Backend, Loss
 from bbfit.provenance import EXECUTION
 
@@ -120,6 +120,16 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
         "sharpness_weight": 1.0,
         "binarization_weight": 0.03,
     },
+    "coverage": {
+        "most_layers": 2.6,
+        "margin": 0.03,
+        "alpha_cutoff": 0.4,
+        "least_alpha": 0.12,
+        "colors": "views",
+        "antialiased": True,
+        "sharpness_weight": 0.2,
+        "binarization_weight": 0.0,
+    },
 }
 
 
@@ -130,7 +140,8 @@ class FitConfig:
     preset: Preset = "default"
     """default is the best that bbfit can do; thesis follows the thesis: 10,000 steps of one random view, no bounds, L2."""
     alpha: AlphaKind | None = None
-    """Alpha mode to fit for: cut off below the cutoff (mask), blended (blend), or drawn at random with alpha as the probability (hash).
+    """Alpha mode to fit for: cut off below the cutoff (mask), blended (blend), drawn at random with alpha as the probability (hash), or
+    alpha to coverage by the samples of a pixel (coverage).
     Preset: mask; thesis: blend."""
     alpha_cutoff: Cutoff | None = None
     """Least alpha that shows with mask, in (0, 1). The lower, the more leaves remain where mip levels average alpha.
@@ -313,6 +324,13 @@ class ResolvedFit(FitConfig):
     beta1: _Decay
     beta2: _Decay
     schedule: Schedule
+
+    @property
+    def drawn_alpha(self) -> AlphaMode:
+        """The alpha mode in which finished textures are drawn to fit their colors; on average, ``hash`` looks like ``blend``."""
+        if self.alpha in ("mask", "coverage"):
+            return AlphaMode(self.alpha, self.alpha_cutoff, antialiased=self.antialiased or self.alpha == "coverage")
+        return AlphaMode()
 
     def counted(self, count: int) -> ResolvedFit:
         """The same with a number of billboards, if it is not chosen yet, and with a search of the length that suits it."""

@@ -197,11 +197,11 @@ def fit(
             bounds = opaque_bounds(fitted, grow=not config.locality)
             start = bounded(fitted, bounds, density, config.max_texels).to(torch.float32)
     assert fitted is not None
-    fitted = replace(fitted, alpha=AlphaMode(config.alpha, config.alpha_cutoff))
+    shipped = AlphaMode(config.alpha, config.alpha_cutoff)
     fitted.texels[:, 3] *= fitted.texels[:, 3] >= config.least_alpha
     if config.alpha == "mask":
-        drawn = matched_coverage(replace(fitted, alpha=replace(fitted.alpha, antialiased=config.antialiased)), views.train, config.backend)
-        fitted = replace(drawn, alpha=fitted.alpha)
+        fitted = matched_coverage(replace(fitted, alpha=config.drawn_alpha), views.train, config.backend)
+    fitted = replace(fitted, alpha=config.drawn_alpha if config.alpha == "coverage" else shipped)
     # No view determines the colors of transparent texels, but filtering shows them.
     bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
@@ -210,7 +210,7 @@ def fit(
         fitted = fit_maps(fitted, views, config, None if on_step is None else partial(_report_map_step, on_step, fitted, config))
     if config.colors != "joint":
         fitted = matched_colors(smoothed_colors(fitted), views.train, config.backend)
-    fitted = palettized(fitted, config.palette)
+    fitted = replace(palettized(fitted, config.palette), alpha=shipped)
     if config.placement != "even" or config.placement_learning_rate:
         fitted = trimmed(fitted)
     try:
@@ -292,12 +292,12 @@ def resolution_levels(config: ResolvedFit, cameras: Camera) -> list[ResolutionLe
 def step_alpha(config: ResolvedFit, level: ResolutionLevel, index: int) -> AlphaMode:
     """Return the alpha mode that step ``index``, from 0, of a resolved configuration renders with.
 
-    It is ``blend``, except for a ``mask`` at full resolution. There the ramp around the cutoff hardens over the first 30 % of the level's
-    steps and is a step function after that. At lower resolutions, a mask at full resolution looks like ``blend``. On average, so does
-    ``hash``.
+    It is ``blend``, except for ``mask`` and ``coverage`` at full resolution. There the ramp of a mask around the cutoff hardens over the
+    first 30 % of the level's steps and is a step function after that. At lower resolutions, a mask at full resolution looks like ``blend``.
+    On average, so does ``hash``.
     """
     if config.alpha != "mask" or level.halvings:
-        return BLEND
+        return BLEND if level.halvings else config.drawn_alpha
     progress = (index - level.begin) / (_HARDENING * (level.end - level.begin))
     first = max(2.0, 0.5 / min(config.alpha_cutoff, 1 - config.alpha_cutoff))
     hardness = first * (max(first, HARDEST) / first) ** progress if progress < 1 else math.inf

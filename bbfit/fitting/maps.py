@@ -14,8 +14,7 @@ from torch.nn.functional import normalize, pad
 
 from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.levels import Targets
-from bbfit.fitting.steps import BLEND, pass_of
-from bbfit.geometry.alpha import AlphaMode
+from bbfit.fitting.steps import pass_of
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.light import SUNNY
@@ -72,7 +71,7 @@ def fit_maps(
     assert exposures.light is not None
     texels, surface = baked_maps(cloud, views.lit_train, config.backend)
     shade, pull_back = _shading(config.backend)
-    alpha = BLEND if config.alpha != "mask" else AlphaMode("mask", config.alpha_cutoff, math.inf, config.antialiased)
+    alpha = config.drawn_alpha
     passes: Any = pass_of(config)(cloud.without_textures(), Targets.at(exposures, 0), config, None, 1)
     base, maps = (passes.adam.start(passes.adam.padded(values)) for values in (texels, surface))
     lights = texture_lights(cloud, exposures.cameras, exposures.light)

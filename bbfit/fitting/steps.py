@@ -27,7 +27,7 @@ BLEND = AlphaMode()
 
 def alpha_rate(alpha: AlphaMode) -> float:
     """Factor of alpha's learning rate: the harder the ramp of a mask, the more a change of alpha shows."""
-    return 1.0 if alpha.kind == "blend" else min(alpha.hardness, HARDEST) ** -0.5
+    return min(alpha.hardness, HARDEST) ** -0.5 if alpha.kind == "mask" else 1.0
 
 
 class Stepper:

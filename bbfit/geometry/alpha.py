@@ -1,4 +1,4 @@
-"""The three alpha modes: how a program that draws a model uses alpha."""
+"""The four alpha modes: how a program that draws a model uses alpha."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal, get_args
 
-from bbfit.checks import Range, check_choice, check_range, fail
+from bbfit.checks import Range, check_choice, check_count, check_range, fail
 
-AlphaKind = Literal["mask", "blend", "hash"]
+AlphaKind = Literal["mask", "blend", "hash", "coverage"]
 Cutoff = Annotated[float, Range(0, 1, open_low=True, open_high=True)]
 """Least alpha that shows with mask, in (0, 1)."""
+SAMPLES = 4
+"""Samples of a pixel in programs that smooth edges, as WebGL and most others have them."""
 
 
 @dataclass(frozen=True)
@@ -19,19 +21,31 @@ class AlphaMode:
 
     kind: AlphaKind = "blend"
     """blend: as opaque as alpha says. mask: opaque where alpha is at least the cutoff, and nothing elsewhere (glTF 2.0, section 3.9.4).
-    hash: opaque with alpha as the probability, drawn anew for every pixel and texture (Wyman and McGuire 2017, "Hashed Alpha Testing")."""
+    hash: opaque with alpha as the probability, drawn anew for every pixel and texture (Wyman and McGuire 2017, "Hashed Alpha Testing").
+    coverage: alpha is the share of a pixel's samples that the texture covers (alpha to coverage; OpenGL 4.6, section 17.3.1), where
+    ``antialiased``; without, for programs that do not smooth edges, it is a mask."""
     cutoff: float = 0.5
-    """Least alpha that shows with mask, in (0, 1)."""
+    """Least alpha that shows with mask, and with coverage that is not antialiased, in (0, 1)."""
     hardness: float = math.inf
     """Slope, with mask, of the ramp from nothing to opaque, whose middle is the cutoff. Finite only while textures are fitted; at least
     the slope at which alpha 0 is nothing and alpha 1 opaque."""
     antialiased: bool = False
-    """Whether a mask is drawn with alpha to coverage, which smooths its edges: the opacity rises from nothing to opaque over one pixel
-    around the cutoff (:func:`bbfit.operators.drawing.compositing.opacity`). Other modes are never antialiased."""
+    """Whether a mask or coverage is drawn with alpha to coverage. The opacity of a mask then rises from nothing to opaque over one pixel
+    around the cutoff, so that its edges are smooth; that of coverage is alpha (:func:`bbfit.operators.drawing.compositing.opacity`). Other
+    modes are never antialiased."""
+    samples: int = 0
+    """Samples of a pixel for antialiased coverage, which covers a whole number of them; 0: so many that this does not show."""
 
     def __post_init__(self) -> None:
         check_choice("alpha", self.kind, get_args(AlphaKind))
-        if self.antialiased and self.kind != "mask":
-            fail("antialiased", f"alpha to coverage smooths masks, not {self.kind}", "choose mask")
+        if self.antialiased and not self.tested:
+            fail("antialiased", f"alpha to coverage smooths masks, not {self.kind}", "choose mask or coverage")
+        check_count("samples", self.samples, 0)
         check_range("alpha_cutoff", self.cutoff, 0, 1, open_low=True, open_high=True)
         check_range("hardness", min(self.hardness, 1e30), 0.5 / min(self.cutoff, 1 - self.cutoff), 1e30)
+
+    @property
+    def tested(self) -> bool:
+        """Whether programs test alpha: they draw all or nothing of a pixel, or with alpha to coverage some of its samples, and need not
+        sort."""
+        return self.kind in ("mask", "coverage")

@@ -166,7 +166,7 @@ class CardRenderer:
         alpha = self._cards.alpha
         if alpha.kind == "hash":
             alphas = (alphas >= thresholds(met.x, met.y, self._sheets.first[met.sheet])).to(alphas)
-        elif alpha.antialiased:
+        elif alpha.antialiased and alpha.kind == "mask":
             across, down = ((filtered(self._levels, uv, met.detail)[:, 3] / 255 - alphas).abs() for uv in _beside(met))
             alphas = coverage(alphas, across + down, alpha)
         else:

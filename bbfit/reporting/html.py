@@ -71,7 +71,7 @@ def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunF
     cloud, worst = model.cloud, _worst(report.views)
     angles = np.array([(view.azimuth_degrees, view.elevation_degrees) for view in report.views])
     shown = sorted({*spread_views(angles, _MAX_VIEWS), *(entry["index"] for entry in worst)}, key=lambda index: (*angles[index], index))
-    layered = report.alpha.kind != "mask" and not model.config.split
+    layered = not report.alpha.tested and not model.config.split
     azimuth, plan = azimuth_chart(report.views), plan_chart(cloud)
     environment = Environment(
         loader=PackageLoader("bbfit.reporting", "page"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -112,7 +112,7 @@ def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunF
 
 def _least_seen(cloud: BillboardCloud) -> float:
     """The alpha from which a texel counts as opaque."""
-    return cloud.alpha.cutoff if cloud.alpha.kind == "mask" else 0.5
+    return cloud.alpha.cutoff if cloud.alpha.tested else 0.5
 
 
 def _view(model: ShippedModel, views: ViewSet, score: ViewScore, index: int) -> dict[str, Any]:

@@ -37,7 +37,7 @@ _MAX_CONNECTIONS, _TIMEOUT = 64, 10
 _SHARES = (0.9, 0.3, 0.2)
 _FILES = {"/": ("viewer.html", "text/html"), "/viewer.css": ("viewer.css", "text/css")}
 _FILES |= {f"/{name}": (name, "text/javascript") for name in ("viewer.js", "original.js")}
-_MODEL = re.compile(r"/([0-9]{1,9})/model/([0-9]{1,4})/([0-4])/(mask|blend|hash)(-split)?\.glb")
+_MODEL = re.compile(r"/([0-9]{1,9})/model/([0-9]{1,4})/([0-4])/(mask|blend|hash|coverage)(-split)?\.glb")
 _FIELD = re.compile(r"/([0-9]{1,9})/field/([0-9]{1,5})/([0-9]{1,9})")
 _ORIGINAL = re.compile(r"/([0-9]{1,9})/original\.glb")
 # The page may use nothing but its own files, and no other site may show it in a frame. trimesh's page has its scripts inside.

@@ -73,6 +73,16 @@ def test_tests_of_alpha_are_those_of_the_reference(mode: AlphaMode, clouds: dict
         assert int(((image - expected).abs().amax(-1) > 1e-5).sum()) <= 1
 
 
+def test_coverage_is_that_of_the_reference(clouds: dict[str, BillboardCloud], orbit: Camera) -> None:
+    """By four samples; only rounding could give a pixel one sample more or less: measured no pixel, one is allowed."""
+    for kind in KINDS:
+        texels, mode = (clouds[kind].texels * 255).round() / 255, AlphaMode("coverage", antialiased=True, samples=4)
+        cloud = replace(clouds[kind], alpha=mode, texels=texels)
+        expected, image = render_reference(cloud, orbit).float(), draw_cards(cloud_cards(cloud, 4), orbit)
+        assert set(image[..., 3].unique().tolist()) == {0.0, 0.25, 0.5, 0.75, 1.0}
+        assert int(((image - expected).abs().amax(-1) > 1e-5).sum()) <= 1
+
+
 def test_antialiased_masks_are_those_of_the_reference(clouds: dict[str, BillboardCloud], orbit: Camera) -> None:
     """Planes seen nearly edge-on differ, in 4 of 11,520 pixels (measured): there the next pixel reads another texture of the atlas."""
     for kind in KINDS:

@@ -33,6 +33,9 @@ def tree_of(path: Path) -> tuple[dict[str, Any], list[bytes]]:
         (AlphaMode("mask", 0.3), ExportConfig(), ("MASK", 0.3)),
         (AlphaMode("blend"), ExportConfig(), ("BLEND", None)),
         (AlphaMode("hash"), ExportConfig(), ("BLEND", None)),
+        (AlphaMode("coverage", 0.4), ExportConfig(), ("MASK", 0.4)),
+        (AlphaMode("coverage", 0.4), ExportConfig(profile="vtk"), ("BLEND", None)),
+        (AlphaMode("blend", 0.4), ExportConfig(alpha="coverage"), ("MASK", 0.4)),
         (AlphaMode("mask", 0.3), ExportConfig(alpha="blend"), ("BLEND", None)),
         (AlphaMode("blend"), ExportConfig(alpha="mask", alpha_cutoff=0.7), ("MASK", 0.7)),
         (AlphaMode("mask", 0.3), ExportConfig(alpha_cutoff=0.6), ("MASK", 0.6)),
@@ -46,9 +49,9 @@ def test_a_file_has_the_mode_that_its_cloud_was_fitted_for_unless_another_is_ask
     (material,) = tree_of(path)[0]["materials"]
     assert (material["alphaMode"], material.get("alphaCutoff")) == expected
     shipped = shipped_model(cloud, config).cloud.alpha
-    assert ("MASK" if shipped.kind == "mask" else "BLEND") == expected[0]
-    assert shipped.kind != "mask" or shipped.cutoff == expected[1]
-    assert material.get("extras") == ({"alphaMode": "HASH"} if shipped.kind == "hash" else None)
+    assert ("MASK" if shipped.tested else "BLEND") == expected[0]
+    assert not shipped.tested or shipped.cutoff == expected[1]
+    assert material.get("extras") == {"hash": {"alphaMode": "HASH"}, "coverage": {"alphaMode": "COVERAGE"}}.get(shipped.kind)
 
 
 @pytest.mark.parametrize("fallback", [True, False])
@@ -88,6 +91,7 @@ def test_other_textures_stand_beside_png_or_in_its_place(
         (AlphaMode("mask"), ExportConfig(mipmaps=True), 9987),
         (AlphaMode("blend"), ExportConfig(mipmaps=False), 9729),
         (AlphaMode("hash"), ExportConfig(), 9987),
+        (AlphaMode("coverage"), ExportConfig(), 9987),
     ],
 )
 def test_the_sampler_reads_mip_levels_where_leaves_survive_them(

@@ -91,7 +91,7 @@ def test_all_that_shows_is_inside_few_pieces_of_few_corners(picture: str, least:
     st.sampled_from([0.0, 0.25, 0.5]),
     st.integers(4, 8),
     st.integers(1, 12),
-    st.sampled_from(["mask", "hash", "blend"]),
+    st.sampled_from(["mask", "hash", "blend", "coverage"]),
 )
 def test_random_pictures_are_kept(seed: int, width: int, height: int, least: float, corners: int, pieces: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
@@ -136,7 +136,7 @@ def test_split_cards_stay_as_they_are(crossed: BillboardCloud) -> None:
         np.testing.assert_array_equal(card.corners, hull.corners)
 
 
-@pytest.mark.parametrize("kind", ["blend", "mask", "hash"])
+@pytest.mark.parametrize("kind", ["blend", "mask", "hash", "coverage"])
 def test_the_picture_is_that_of_the_rectangles(kind: str, orbit: Camera, tmp_path: Path) -> None:
     cards = of_kind(cards_of(angle(), leaf(0.6), apart()), kind)
     made = with_pieces(cards, 4, 8, cards.outlined_alpha)

@@ -27,7 +27,7 @@ def cloud_of(kind: str) -> BillboardCloud:
     return replace(cloud.with_texels(texels), alpha=AlphaMode(kind))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("kind", ["mask", "blend", "hash"])
+@pytest.mark.parametrize("kind", ["mask", "blend", "hash", "coverage"])
 @pytest.mark.parametrize("count", [256, 64])
 def test_few_colors_near_the_old_ones(kind: str, count: int) -> None:
     """All four channels are random here, which is the hardest case; transparent texels stay as they are."""

@@ -19,7 +19,7 @@ const SHOWN = 0;
 const HIDDEN = 1;
 
 // With ?smooth=centered, masks are drawn with alpha to coverage as docs/engines.md describes: three.js gets the usual ramp around the cutoff.
-// With ?smooth=own it keeps its own, which begins at the cutoff.
+// With ?smooth=own it keeps its own, which begins at the cutoff. With ?smooth=coverage, models for it are drawn so.
 const smooth = query.get("smooth");
 if (smooth === "centered") {
   THREE.ShaderChunk.alphatest_fragment = THREE.ShaderChunk.alphatest_fragment.replace(
@@ -31,8 +31,9 @@ if (smooth === "centered") {
 // instances that are turned by 90 degrees.
 const { loadImpostor } = query.has("impostor") ? await import("/impostor_three.js") : {};
 // Without alpha of its own: three.js always asks for one, and what alpha to coverage writes there lets the page through.
-const context = canvas.getContext("webgl2", { alpha: false, antialias: smooth !== null });
-const renderer = new THREE.WebGLRenderer({ canvas, context });
+// Materials for coverage keep the alpha of the canvas, so that they work with a context as three.js makes it.
+const context = smooth === "coverage" ? undefined : canvas.getContext("webgl2", { alpha: false, antialias: smooth !== null });
+const renderer = new THREE.WebGLRenderer({ canvas, context, antialias: true });
 renderer.setPixelRatio(1);
 renderer.setClearColor(0xffffff, 1);
 renderer.outputColorSpace = THREE.SRGBColorSpace;
@@ -64,8 +65,16 @@ export async function load(node) {
     if (!object.isMesh || !object.layers.isEnabled(SHOWN)) return;
     materials.add(object.material);
     object.material.alphaToCoverage = smooth !== null && object.material.alphaTest > 0;
+    if (object.material.userData.alphaMode === "COVERAGE" && smooth !== null) cover(object.material);
   });
   return [...materials].map(describe);
+}
+
+// As docs/engines.md describes.
+function cover(material) {
+  Object.assign(material, { alphaToCoverage: true, alphaTest: 0, blending: THREE.CustomBlending });
+  Object.assign(material, { blendSrc: THREE.OneFactor, blendDst: THREE.ZeroFactor });
+  Object.assign(material, { blendSrcAlpha: THREE.ZeroFactor, blendDstAlpha: THREE.OneFactor });
 }
 
 function turned({ geometry, material }) {

@@ -137,7 +137,7 @@ def test_outlines_are_drawn_around_the_billboards_alone(opened: Opened) -> None:
     assert changed.sum() > 300
 
 
-@pytest.mark.parametrize("alpha", ["blend", "hash"])
+@pytest.mark.parametrize("alpha", ["blend", "hash", "coverage"])
 def test_alpha_modes_change_the_billboards_alone(opened: Opened, alpha: str) -> None:
     _, tab = opened
     before = tab.picture("left"), tab.picture("right")
@@ -146,7 +146,8 @@ def test_alpha_modes_change_the_billboards_alone(opened: Opened, alpha: str) -> 
     assert (abs(before[1] - tab.picture("right")).max(-1) > 16).mean() > 0.005
     assert f" · {alpha}" in tab.text("#right header")
     assert "fitted for mask" in tab.text("#alpha-note")
-    assert ("glTF has no hash" in tab.text("#alpha-note")) == (alpha == "hash")
+    for lacking in ("hash", "coverage"):
+        assert (f"glTF has no {lacking}" in tab.text("#alpha-note")) == (alpha == lacking)
 
 
 def test_a_model_can_be_cut_up_for_sorting(opened: Opened) -> None:

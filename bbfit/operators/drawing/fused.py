@@ -17,7 +17,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.drawing.compositing import STEEPEST
 from bbfit.operators.drawing.kernels import Plane, kernels
 from bbfit.operators.drawing.projection import Projection, project
-from bbfit.operators.drawing.sampling_kernels import BLOCK
+from bbfit.operators.drawing.sampling_kernels import BLOCK, COVERAGE, SMOOTH
 from bbfit.operators.image_loss.fused import PixelLoss
 from bbfit.operators.image_loss.kernels import LOSSES
 from bbfit.operators.launching import in_parallel, pieces_of, struct_array, warp_array
@@ -170,7 +170,9 @@ def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -
 
 def _test(mode: AlphaMode) -> Any:
     """An alpha mode as :func:`~bbfit.operators.drawing.sampling_kernels.opacity` expects it."""
-    if mode.kind != "mask":
+    if not mode.tested:
         return wp.vec4(0.0 if mode.kind == "blend" else -1.0, 0.0, 0.0, 0.0)
+    if mode.antialiased and mode.kind == "coverage":
+        return wp.vec4(mode.cutoff, float(mode.samples), 0.0, COVERAGE)
     hardness = 0.0 if math.isinf(mode.hardness) else mode.hardness
-    return wp.vec4(mode.cutoff, hardness, min(mode.hardness, STEEPEST), float(mode.antialiased))
+    return wp.vec4(mode.cutoff, hardness, min(mode.hardness, STEEPEST), SMOOTH if mode.antialiased else 0.0)

@@ -18,9 +18,9 @@ derivative (t_u, t_v) in texel coordinates the rows of the homography receive
 
     dL/dm_1 = t_u p / w,    dL/dm_2 = t_v p / w,    dL/dm_3 = -(u t_u + v t_v) p / w.
 
-**Antialiased masks.** Alpha to coverage gives every layer the same samples of a pixel first, so that of a layer only what the layers in
-front leave uncovered shows. With the coverage m_k = max over j < k of a_j, its weight is max(a_k - m_k, 0) instead of T_k a_k. If a layer
-shows, the next layer that shows loses what it gains: dL/da_k = e_k - e_next, where e_next is 0 if there is none. Otherwise it is 0.
+**Alpha to coverage.** Every layer gets the same samples of a pixel first, so a layer shows where those in front leave samples free. With
+m_k = max over j < k of a_j, its weight is max(a_k - m_k, 0) instead of T_k a_k. If a layer shows, the next layer that shows loses what it
+gains: dL/da_k = e_k - e_next, where e_next is 0 if there is none. Otherwise it is 0.
 
 **Colors of their own.** With ``own_colors``, the colors do not minimize the picture's loss but the squared difference to the view's
 straight color C, weighted by the view's alpha A and by the layer's weight w_k (which is held constant):
@@ -32,9 +32,8 @@ Colors have this gradient in place of that of the pixel loss, and that of ``imag
 **Schedule.** A thread processes a run of pixels in a row: a whole row on a CPU, one pixel on CUDA. Layers are sorted per pixel. The
 backward kernel blends again instead of reading stored layers.
 
-The two kernels share code only in part: a function that returned a pixel's layers would copy them, which took 1.5 times as long. Two
-oddities are for speed (a tenth, and a half): ``while`` instead of ``for``, because Warp's ``range`` hides from the compiler that an index
-is not negative; and different names in every loop, because a vector that two loops assign is kept in memory.
+The kernels share little code: a function that returned a pixel's layers would copy them, which took 1.5 times as long. Two oddities save
+time (a tenth, and a half): ``while``, as ``range`` hides that an index is not negative; different names in loops, to keep registers.
 """
 
 # mypy: ignore-errors
@@ -47,6 +46,7 @@ import warp as wp
 
 from bbfit.operators.drawing.compositing import TIE as TIE_VALUE
 from bbfit.operators.drawing.sampling_kernels import (
+    SMOOTH,
     contrast,
     empty,
     fetch,
@@ -208,7 +208,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
                         texture = wp.vec3i(firsts[layer], heights[layer], widths[layer])
                         s = fetch(texels, texture, left[layer, c], top[layer, c], fx[layer, c], fy[layer, c])
                         rate = float(0.0)
-                        if test[3] != 0.0:
+                        if test[3] == SMOOTH:
                             matrix = planes[view * count + ids[layer]].to_texel
                             rate = ramp_rate(contrast(texels, texture, matrix, column + c, row, s[3]), test)
                         alpha = opacity(s[3], test, rate)
@@ -332,7 +332,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
                         texture = wp.vec3i(firsts[layer], heights[layer], widths[layer])
                         s = fetch(texels, texture, left[layer, c], top[layer, c], fx[layer, c], fy[layer, c])
                         rate = float(0.0)
-                        if test[3] != 0.0:
+                        if test[3] == SMOOTH:
                             matrix = planes[view * count + ids[layer]].to_texel
                             rate = ramp_rate(contrast(texels, texture, matrix, column + c, row, s[3]), test)
                         alpha = opacity(s[3], test, rate)

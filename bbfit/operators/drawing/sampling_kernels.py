@@ -25,6 +25,8 @@ BLOCK = 4
 """Consecutive texels that share one byte of occupancy and that Adam updates together."""
 BLOCK_BITS = wp.constant(2)
 LEAST_CONTRAST, STEEPEST = wp.constant(LEAST_CONTRAST_VALUE), wp.constant(STEEPEST_VALUE)
+SMOOTH, COVERAGE = wp.constant(1.0), wp.constant(2.0)
+"""An antialiased mask, and antialiased coverage, in the last place of the vector that :func:`opacity` takes."""
 OF_X, OF_Y, OF_TEXTURE, FIRST_ROUND, SECOND_ROUND = (wp.constant(wp.uint32(factor)) for factor in HASH)
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
@@ -173,9 +175,12 @@ def ramp_rate(contrast: float, test: wp.vec4) -> float:
 @wp.func
 def opacity(alpha: float, test: wp.vec4, rate: float) -> float:
     """Opacity of a sample (:func:`bbfit.operators.drawing.compositing.opacity`). ``test`` encodes the alpha mode: the cutoff (0: blend,
-    -1: hash), the hardness (0: a step), the slope of the gradient, and whether a mask is antialiased, with the ramp's slope ``rate``."""
+    -1: hash), the hardness (0: a step), the slope of the gradient, and :data:`SMOOTH` for an antialiased mask, with the ramp's slope
+    ``rate``, or :data:`COVERAGE`, with the samples of a pixel (0: any number) in place of the hardness."""
     if test[0] == 0.0:
         return alpha
+    if test[3] == COVERAGE:
+        return wp.where(test[1] == 0.0, alpha, wp.floor(alpha * test[1] + 0.5) / wp.max(test[1], 1.0))
     if test[3] != 0.0:
         return wp.where(alpha > 0.0, wp.clamp(0.5 + (alpha - test[0]) * rate, 0.0, 1.0), 0.0)
     if test[1] == 0.0:
@@ -186,7 +191,7 @@ def opacity(alpha: float, test: wp.vec4, rate: float) -> float:
 @wp.func
 def opacity_slope(alpha: float, test: wp.vec4, rate: float) -> float:
     """Derivative of :func:`opacity`, or its straight-through estimate."""
-    if test[0] == 0.0:
+    if test[0] == 0.0 or test[3] == COVERAGE:
         return 1.0
     slope = wp.where(test[3] != 0.0, wp.min(rate, STEEPEST), test[2])
     return wp.where(wp.abs(alpha - test[0]) * slope <= 0.5 and (alpha > 0.0 or test[3] == 0.0), slope, 0.0)

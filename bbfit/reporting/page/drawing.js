@@ -60,9 +60,13 @@ window.bbfit = (() => {
   }
 
   // The scene in the bytes of a GLB file. In a layered one, texels that are at least half opaque are drawn first and hide what is behind
-  // them. The rest is blended over them in any order.
+  // them. The rest is blended over them in any order. A material for coverage covers samples; blending only keeps the alpha of the canvas.
   async function loadModel(THREE, buffer, layered) {
     const { scene } = await new THREE.GLTFLoader().parseAsync(buffer, "");
+    const covering = { alphaToCoverage: true, alphaTest: 0, blending: THREE.CustomBlending };
+    Object.assign(covering, { blendSrc: THREE.OneFactor, blendDst: THREE.ZeroFactor });
+    Object.assign(covering, { blendSrcAlpha: THREE.ZeroFactor, blendDstAlpha: THREE.OneFactor });
+    scene.traverse(({ material }) => { if (material?.userData.alphaMode === "COVERAGE") Object.assign(material, covering); });
     const blended = [];
     scene.traverse((item) => { if (layered && item.isMesh && item.material.transparent) blended.push(item); });
     for (const mesh of blended) {

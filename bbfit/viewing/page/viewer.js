@@ -283,7 +283,8 @@
     controls.split.disabled = controls.alpha.value !== "blend";
     const notes = controls.alpha.value === tree.alpha ? [] : [`The textures were fitted for ${tree.alpha}.`];
     if (controls.alpha.value === "hash") notes.push("glTF has no hash: the file says BLEND and names HASH in its extras, and viewers blend.");
-    if (controls.alpha.value !== "mask" && !isSplit()) notes.push("Here texels that are at least half opaque hide what is behind them; the rest is blended in any order.");
+    if (controls.alpha.value === "coverage") notes.push("glTF has no coverage: the file says MASK and names COVERAGE in its extras, and most viewers draw hard edges.");
+    if (["blend", "hash"].includes(controls.alpha.value) && !isSplit()) notes.push("Here texels that are at least half opaque hide what is behind them; the rest is blended in any order.");
     $("alpha-note").textContent = notes.join(" ");
     controls.slider.value = stepOf(orbit.distance);
     if (document.activeElement !== controls.meters) controls.meters.value = Number(orbit.distance.toPrecision(4));
