@@ -108,7 +108,7 @@ def billboards(subject: Subject, cloud: BillboardCloud, export: ExportConfig, se
     """
     started = time.perf_counter()
     model = shipped_model(cloud, export)
-    drawn = model.antialiased() if cloud.alpha.tested else model
+    drawn = model.antialiased() if cloud.alpha.kind == "mask" else model
     glb = model.glb
     return SystemResult(
         glb,

@@ -103,7 +103,7 @@ def evaluate_model(
 ) -> Report:
     """Do what :func:`evaluate` does for a model whose polygons or file may already be computed."""
     started, original, on_progress = time.perf_counter(), original or OriginalTree(), on_progress or (lambda done, total: None)
-    smooth = model.antialiased().draw if model.cloud.alpha.tested else None
+    smooth = model.antialiased().draw if model.cloud.alpha.kind == "mask" else None
     baked = views.light[[0]] if views.light is not None else None
     suns = len(lit.other_suns(baked)) if lit is not None and baked is not None else 0
     total, trunks, off = len(views) + HALVINGS + 1 + (turned is not None) + suns, list[TrunkView | None](), list[float]()
@@ -158,7 +158,7 @@ def score_model_light(
     model: ShippedModel, lit: LitViews, baked: Light, on_view: Callable[[int, int], None] | None = None
 ) -> LightScore | None:
     """Do what :func:`~bbfit.evaluation.light.score_light` does for a model, whose masks are drawn with alpha to coverage."""
-    shown, has_maps = model.antialiased() if model.cloud.alpha.tested else model, model.cloud.surface is not None
+    shown, has_maps = model.antialiased() if model.cloud.alpha.kind == "mask" else model, model.cloud.surface is not None
     draw = shown.draw if has_maps else lambda camera, light: shown.draw(camera)
     return score_light(draw, lit, baked, model.surfaces if has_maps else None, on_view)
 

@@ -179,6 +179,8 @@ def _coverage(visible: _VisibleTexels, alphas: list[NDArray[np.uint8]], level: i
 def _covered(visible: _VisibleTexels, alpha: Tensor, mode: AlphaMode) -> float:
     """Mean alpha of the pictures in [0, 1], given the filtered alpha of the hits in [0, 255], [M]."""
     alpha = alpha / 255
+    if mode.kind == "coverage":  # all layers cover the same samples of a pixel first
+        return float(torch.zeros(visible.count).scatter_reduce_(0, visible.pixels, opacity(alpha, mode), "amax").double().mean())
     alpha = opacity(alpha, mode) if mode.kind == "mask" else alpha
     clear = torch.ones(visible.count).scatter_reduce_(0, visible.pixels, 1 - alpha, "prod")  # in any order of depth
     return 1 - float(clear.double().mean())

@@ -23,7 +23,7 @@ from bbfit.exporting.outlines import with_pieces
 from bbfit.exporting.smoothing import smoothed
 from bbfit.exporting.splitting import split
 from bbfit.files import write_bytes
-from bbfit.geometry.alpha import SAMPLES, AlphaMode
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
@@ -129,9 +129,8 @@ class ShippedModel:
         return self._renderer.surfaces(camera)
 
     def antialiased(self) -> ShippedModel:
-        """The same model as a program draws it that has alpha to coverage: a mask with smooth edges, or coverage by four samples."""
-        alpha = replace(self.cloud.alpha, antialiased=True, samples=SAMPLES)
-        model = replace(self, cloud=replace(self.cloud, alpha=alpha))
+        """The same model as a program draws it that smooths the edges of masks by alpha to coverage."""
+        model = replace(self, cloud=replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=True)))
         vars(model)["cards"] = self.cards  # of the same files, so that they are not computed twice
         return model
 

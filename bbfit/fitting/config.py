@@ -126,7 +126,7 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
         "alpha_cutoff": 0.4,
         "least_alpha": 0.12,
         "colors": "views",
-        "antialiased": True,
+        "antialiased": False,
         "sharpness_weight": 0.2,
         "binarization_weight": 0.0,
     },
@@ -328,9 +328,9 @@ class ResolvedFit(FitConfig):
     @property
     def drawn_alpha(self) -> AlphaMode:
         """The alpha mode in which finished textures are drawn to fit their colors; on average, ``hash`` looks like ``blend``."""
-        if self.alpha in ("mask", "coverage"):
-            return AlphaMode(self.alpha, self.alpha_cutoff, antialiased=self.antialiased or self.alpha == "coverage")
-        return AlphaMode()
+        if self.alpha == "mask":
+            return AlphaMode("mask", self.alpha_cutoff, antialiased=self.antialiased)
+        return AlphaMode("coverage", self.alpha_cutoff, samples=0) if self.alpha == "coverage" else AlphaMode()
 
     def counted(self, count: int) -> ResolvedFit:
         """The same with a number of billboards, if it is not chosen yet, and with a search of the length that suits it."""

@@ -166,13 +166,13 @@ class CardRenderer:
         alpha = self._cards.alpha
         if alpha.kind == "hash":
             alphas = (alphas >= thresholds(met.x, met.y, self._sheets.first[met.sheet])).to(alphas)
-        elif alpha.antialiased and alpha.kind == "mask":
+        elif alpha.antialiased:
             across, down = ((filtered(self._levels, uv, met.detail)[:, 3] / 255 - alphas).abs() for uv in _beside(met))
             alphas = coverage(alphas, across + down, alpha)
         else:
             alphas = opacity(alphas, alpha)
         shown, pixels, count = alphas > 0, met.y * camera.width + met.x, camera.height * camera.width
-        image = composite_fragments(values[shown], alphas[shown], met.depth[shown], pixels[shown], count, nested=alpha.antialiased)
+        image = composite_fragments(values[shown], alphas[shown], met.depth[shown], pixels[shown], count, nested=alpha.nested)
         return image.unflatten(0, (camera.height, camera.width))
 
     def fragments(self, camera: Camera) -> int:

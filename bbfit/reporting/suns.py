@@ -48,7 +48,7 @@ def under_suns(model: ShippedModel, lit: LitViews, scores: Sequence[LightView]) 
         chosen.append(farthest)
         rest.remove(farthest)
 
-    shown, sunny = model.antialiased() if model.cloud.alpha.tested else model, lit.under(*SUNNY)
+    shown, sunny = model.antialiased() if model.cloud.alpha.kind == "mask" else model, lit.under(*SUNNY)
     assert sunny.light is not None
     strip = []
     for score in sorted(chosen, key=lambda score: score.sun_azimuth_degrees):

@@ -76,7 +76,7 @@ def test_tests_of_alpha_are_those_of_the_reference(mode: AlphaMode, clouds: dict
 def test_coverage_is_that_of_the_reference(clouds: dict[str, BillboardCloud], orbit: Camera) -> None:
     """By four samples; only rounding could give a pixel one sample more or less: measured no pixel, one is allowed."""
     for kind in KINDS:
-        texels, mode = (clouds[kind].texels * 255).round() / 255, AlphaMode("coverage", antialiased=True, samples=4)
+        texels, mode = (clouds[kind].texels * 255).round() / 255, AlphaMode("coverage")
         cloud = replace(clouds[kind], alpha=mode, texels=texels)
         expected, image = render_reference(cloud, orbit).float(), draw_cards(cloud_cards(cloud, 4), orbit)
         assert set(image[..., 3].unique().tolist()) == {0.0, 0.25, 0.5, 0.75, 1.0}
@@ -275,12 +275,12 @@ def share(cards: Cards, camera: Camera, chain: list[NDArray[np.uint8]], wanted: 
     return float(torch.stack(drawn).mean() / wanted.mean())
 
 
-@pytest.mark.parametrize(("kind", "least", "most"), [("mask", 0.2, 0.05), ("blend", 0.04, 0.01)])
+@pytest.mark.parametrize(("kind", "least", "most"), [("mask", 0.2, 0.05), ("blend", 0.04, 0.01), ("coverage", 0.2, 0.05)])
 def test_matched_levels_cover_as_much_as_the_views_from_everywhere(kind: str, least: float, most: float) -> None:
     """From views that they were not matched to, of a half and an eighth of the size.
 
     A mask is farther off than a blend, twelve views being few; other rounding may move a texel of 12 x 12 pixels' textures.
-    Unmatched, at an eighth, a mask covers 0.68 and a blend 1.07 of what it should.
+    Unmatched, at an eighth, a mask covers 0.65, a blend 1.07 and coverage 0.55 of what it should.
     """
     cloud, camera = leafy(kind)
     cards = cloud_cards(cloud, 8)

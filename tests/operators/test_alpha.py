@@ -23,9 +23,8 @@ MODES = {
     "steep": AlphaMode("mask", 0.3, 11.0),
     "antialiased": AlphaMode("mask", 0.4, antialiased=True),
     "antialiased ramp": AlphaMode("mask", 0.5, 3.0, antialiased=True),
-    "coverage": AlphaMode("coverage", antialiased=True),
-    "four samples": AlphaMode("coverage", antialiased=True, samples=4),
-    "hard coverage": AlphaMode("coverage", 0.4),
+    "coverage": AlphaMode("coverage", samples=0),
+    "four samples": AlphaMode("coverage"),
     "hash": AlphaMode("hash"),
 }
 # Layers that cover equally many samples have no unique gradient, and fits draw coverage with any number of samples.
@@ -130,14 +129,13 @@ def test_layers_of_an_antialiased_mask_cover_the_same_samples_first() -> None:
         assert [float(weights[order.index(i)][0, 0, 0, 0]) for i in range(4)] == [0.25, 0.5, 0, 0.25]
 
 
-def test_coverage_is_a_whole_number_of_samples_and_a_mask_where_programs_do_not_smooth() -> None:
+def test_coverage_is_a_whole_number_of_samples() -> None:
     alpha = torch.linspace(0, 1, 1001, dtype=torch.float64, requires_grad=True)
-    assert opacity(alpha, AlphaMode("coverage", antialiased=True)) is alpha
-    four = opacity(alpha, AlphaMode("coverage", antialiased=True, samples=4))
+    assert opacity(alpha, AlphaMode("coverage", samples=0)) is alpha
+    four = opacity(alpha, AlphaMode("coverage"))
     assert four.detach().unique().tolist() == [0, 0.25, 0.5, 0.75, 1]
     assert float((four - alpha).detach().abs().max()) <= 0.125 + 1e-9
     assert torch.equal(torch.autograd.grad(four.sum(), alpha)[0], torch.ones(1001).double())
-    assert torch.equal(opacity(alpha, AlphaMode("coverage", 0.3)), opacity(alpha, AlphaMode("mask", 0.3)))
 
 
 def test_an_antialiased_mask_is_what_four_samples_a_pixel_show() -> None:
@@ -172,6 +170,7 @@ def test_the_mode_stays_with_the_cloud(known_cloud: BillboardCloud, tmp_path: ob
     [
         {"kind": "opaque"},
         {"kind": "blend", "antialiased": True},
+        {"kind": "coverage", "antialiased": True},
         {"kind": "coverage", "samples": -1},
         {"cutoff": 0.0},
         {"cutoff": 1},

@@ -1,8 +1,10 @@
 // PlayCanvas, without tone mapping. Canvases are in the colors of the screen by default.
-import { canvas, refuse } from "/page.js";
+import { canvas, query, refuse } from "/page.js";
 import * as pc from "playcanvas";
 
-const app = new pc.Application(canvas, { graphicsDeviceOptions: { antialias: false, alpha: false } });
+// With ?smooth=coverage, alpha is the share of a pixel's samples that a model covers.
+const covers = query.get("smooth") === "coverage";
+const app = new pc.Application(canvas, { graphicsDeviceOptions: { antialias: covers, alpha: false } });
 app.autoRender = false;
 app.start();
 const camera = new pc.Entity("camera");
@@ -24,6 +26,13 @@ export async function load(node) {
   });
   shown = asset.resource.instantiateRenderEntity();
   app.root.addChild(shown);
+  if (!covers) return;
+  for (const { meshInstances } of shown.findComponents("render")) {
+    for (const { material } of meshInstances) {
+      Object.assign(material, { alphaToCoverage: true, alphaTest: 0 });
+      material.update();
+    }
+  }
 }
 
 export function draw({ projection, cameraToWorld, width, height }) {

@@ -98,12 +98,12 @@ def opacity(alpha: Tensor, mode: AlphaMode) -> Tensor:
     A mask is a ramp around its cutoff, or a step. An antialiased mask is a ramp that rises over one pixel: its slope is one over the
     :func:`contrast` of the pixel, at most the mode's hardness (Golus 2017, "Anti-aliased Alpha Test: The Esoteric Alpha To Coverage"; the
     slope is not differentiated). Where the ramp is steeper than :data:`STEEPEST`, the derivative is that of a ramp of this slope (a
-    straight-through estimator; Bengio et al. 2013, section 4). Antialiased coverage is alpha, rounded to a whole number of the pixel's
-    samples; the derivative is 1.
+    straight-through estimator; Bengio et al. 2013, section 4). Coverage is alpha, rounded to a whole number of the pixel's samples; the
+    derivative is 1.
     """
     if mode.kind == "blend":
         return alpha
-    if mode.antialiased and mode.kind == "coverage":
+    if mode.kind == "coverage":
         return (alpha.detach() * mode.samples + 0.5).floor() / mode.samples + (alpha - alpha.detach()) if mode.samples else alpha
     if mode.antialiased:
         return coverage(alpha, contrast(alpha.detach()), mode)

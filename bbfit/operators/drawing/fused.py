@@ -172,7 +172,7 @@ def _test(mode: AlphaMode) -> Any:
     """An alpha mode as :func:`~bbfit.operators.drawing.sampling_kernels.opacity` expects it."""
     if not mode.tested:
         return wp.vec4(0.0 if mode.kind == "blend" else -1.0, 0.0, 0.0, 0.0)
-    if mode.antialiased and mode.kind == "coverage":
+    if mode.kind == "coverage":
         return wp.vec4(mode.cutoff, float(mode.samples), 0.0, COVERAGE)
     hardness = 0.0 if math.isinf(mode.hardness) else mode.hardness
     return wp.vec4(mode.cutoff, hardness, min(mode.hardness, STEEPEST), SMOOTH if mode.antialiased else 0.0)

@@ -37,7 +37,7 @@ def render_reference(cloud: BillboardCloud, camera: Camera) -> Tensor:
         image = cloud.texels.new_zeros(views, camera.height, camera.width, 4) + cloud.texels.sum()  # of no texels, so that backward() works
     else:
         colors, alphas, depths = _layers(cloud, camera)
-        image = composite(colors, alphas, depths, nested=cloud.alpha.antialiased).permute(0, 2, 3, 1)
+        image = composite(colors, alphas, depths, nested=cloud.alpha.nested).permute(0, 2, 3, 1)
     return image if camera.batched else image[0]
 
 
@@ -52,7 +52,7 @@ def render_layers_reference(cloud: BillboardCloud, camera: Camera) -> tuple[list
         Weights of the layers in the image, N of [V, 1, H, W].
     """
     colors, alphas, depths = _layers(cloud, camera)
-    return colors, layer_weights(alphas, depths, nested=cloud.alpha.antialiased)
+    return colors, layer_weights(alphas, depths, nested=cloud.alpha.nested)
 
 
 def joined_layers(colors: list[Tensor], weights: list[Tensor]) -> Tensor:

@@ -26,7 +26,7 @@ BLOCK = 4
 BLOCK_BITS = wp.constant(2)
 LEAST_CONTRAST, STEEPEST = wp.constant(LEAST_CONTRAST_VALUE), wp.constant(STEEPEST_VALUE)
 SMOOTH, COVERAGE = wp.constant(1.0), wp.constant(2.0)
-"""An antialiased mask, and antialiased coverage, in the last place of the vector that :func:`opacity` takes."""
+"""An antialiased mask, and coverage, in the last place of the vector that :func:`opacity` takes."""
 OF_X, OF_Y, OF_TEXTURE, FIRST_ROUND, SECOND_ROUND = (wp.constant(wp.uint32(factor)) for factor in HASH)
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
