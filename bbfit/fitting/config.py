@@ -145,10 +145,10 @@ class FitConfig:
     Preset: mask; thesis: blend."""
     alpha_cutoff: Cutoff | None = None
     """Least alpha that shows with mask, in (0, 1). The lower, the more leaves remain where mip levels average alpha.
-    Preset: 0.2 (mask) or 0.5; thesis: 0.5."""
+    With coverage it is the cutoff for programs that have masks alone. Preset: 0.2 (mask), 0.4 (coverage) or 0.5; thesis: 0.5."""
     least_alpha: _Unit | None = None
     """Least alpha that remains. Fainter texels become transparent in the end: nobody sees them, but a graphics card would shade them.
-    Preset: 0.08 (blend, hash) or 0 (mask); thesis: 0."""
+    Preset: 0.08 (blend, hash), 0.12 (coverage) or 0 (mask); thesis: 0."""
     billboards: Count | None = None
     """Number of billboards. Preset: as many as pay for this tree, within least_billboards and most_billboards; thesis: 4."""
     least_billboards: Count = 16
@@ -157,7 +157,7 @@ class FitConfig:
     """Largest number of billboards that the preset chooses by itself."""
     most_layers: _Layers | None = None
     """How many billboards may lie before each other, on average over the rectangle around the tree, when the fit chooses their number.
-    More layers look better, and a graphics card shades all of them. Preset: 1.85 (mask) or 3.2."""
+    More layers look better, and a graphics card shades all of them. Preset: 1.85 (mask), 2.6 (coverage) or 3.2."""
     light: Lighting = "baked"
     """baked: colors contain the light of the views. maps: base color, normals and occlusion, which take the light of a program.
     Maps need views under many lights (suns)."""
@@ -180,7 +180,7 @@ class FitConfig:
     margin: _Unit | None = None
     """Margin around what a compact billboard stands for, as a fraction of the tree's radius.
     The wider it is, the more billboards share leaves, which looks better, and the more pixels a graphics card shades.
-    Preset: 0.02 (mask) or 0.05."""
+    Preset: 0.02 (mask), 0.03 (coverage) or 0.05."""
     trunk_billboards: _Number | None = None
     """Number of billboards, out of all, that cross in the trunk below the crown; for clusters, and trees with such a trunk.
     Three cross in each part of the trunk, from the ground up. Default: 9 for 48 billboards or more, 6 for 32, 3 for 12, else none."""
@@ -211,7 +211,7 @@ class FitConfig:
     colors: Colors | None = None
     """What colors are fitted to: the color of the views, whatever alpha is (views), or the loss, together with alpha (joint, matched).
     With views and matched, one factor per channel makes the mean color that of the views in the end.
-    Preset: views (mask, hash) or matched (blend); thesis: joint."""
+    Preset: views (mask, coverage, hash) or matched (blend); thesis: joint."""
     antialiased: bool | None = None
     """Fit a mask for programs that smooth its edges by alpha to coverage. Preset: yes; thesis: no. Other alpha modes ignore it."""
     max_texels: Count | None = None
@@ -223,10 +223,10 @@ class FitConfig:
     """Weight of 1 - SSIM, which preserves structure, beside the loss. Preset: 0.01; thesis: 0."""
     sharpness_weight: _Sharpness | None = None
     """Weight of the sharpness loss: the squared difference in mean contrast between neighboring pixels, at full resolution.
-    Preset: 4 (mask), 0.2 (blend) or 1 (hash); thesis: 0."""
+    Preset: 4 (mask), 0.2 (blend, coverage) or 1 (hash); thesis: 0."""
     binarization_weight: _Binarization | None = None
     """Weight that pushes alpha to 0 or 1: of alpha * (1 - alpha), summed over texels, over a view's pixels, at full resolution.
-    Preset: 0.02 (mask), 0.03 (hash) or 0 (blend); thesis: 0."""
+    Preset: 0.02 (mask), 0.03 (hash) or 0 (blend, coverage); thesis: 0."""
     levels: Count | None = None
     """Number of resolutions, from coarse to fine; each doubles the sides of the one before. Steps are divided evenly among them.
     Preset: 4; thesis: 1."""
