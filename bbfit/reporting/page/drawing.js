@@ -60,10 +60,11 @@ window.bbfit = (() => {
   }
 
   // The scene in the bytes of a GLB file. In a layered one, texels that are at least half opaque are drawn first and hide what is behind
-  // them. The rest is blended over them in any order. A material for coverage covers samples; blending only keeps the alpha of the canvas.
+  // them. The rest is blended over them in any order. A material for coverage covers samples. Blending only keeps the
+  // alpha of the canvas, and the alpha test drops what covers none of four samples, also where a context has one sample alone.
   async function loadModel(THREE, buffer, layered) {
     const { scene } = await new THREE.GLTFLoader().parseAsync(buffer, "");
-    const covering = { alphaToCoverage: true, alphaTest: 0, blending: THREE.CustomBlending };
+    const covering = { alphaToCoverage: true, alphaTest: 0.125, blending: THREE.CustomBlending };
     Object.assign(covering, { blendSrc: THREE.OneFactor, blendDst: THREE.ZeroFactor });
     Object.assign(covering, { blendSrcAlpha: THREE.ZeroFactor, blendDstAlpha: THREE.OneFactor });
     scene.traverse(({ material }) => { if (material?.userData.alphaMode === "COVERAGE") Object.assign(material, covering); });
