@@ -93,6 +93,33 @@ def matched_coverage(cloud: BillboardCloud, views: ViewSet, backend: Backend = "
         return shifted(balanced(shifts, cameras))
 
 
+def scaled_coverage(cloud: BillboardCloud, views: ViewSet, backend: Backend = "auto") -> BillboardCloud:
+    """Multiply the alpha of a cloud with the mode ``coverage`` by one number so that it covers as much of the views as the tree does.
+
+    Rounding to a few samples takes more from faint texels than it gives, and the fit knows nothing of it: without this, a cherry covers
+    0.9 of what it should with four samples. At most 24 views, evenly spaced, are compared.
+    """
+    shown = list(filter(views.shows, range(len(views))))
+    indices = shown[:: -(-len(shown) // _VIEWS)] if shown else []
+    if len(cloud) == 0 or not indices:
+        return cloud
+    cameras, target = (
+        views.cameras.to(cloud.texels.device),
+        sum(float(views.image(index)[..., 3].double().mean()) / 255 for index in indices),
+    )
+
+    def scaled(excess: float) -> BillboardCloud:
+        alpha = ((cloud.texels[:, 3:] * (1 + excess)).clamp(0, 1) * 255).round() / 255
+        return cloud.with_texels(torch.cat([cloud.texels[:, :3], alpha], 1))
+
+    def missed(excess: float) -> float:
+        pictures = (render(scaled(excess), cameras[[index]], backend=backend) for index in indices)
+        return sum(float(picture[..., 3].double().mean()) for picture in pictures) - target
+
+    with torch.no_grad():
+        return scaled(_root(missed))
+
+
 def _root(excess: Callable[[float], float]) -> float:
     """Find the root of an increasing function in [-``_MAX_SHIFT``, ``_MAX_SHIFT``] by bisection, or the end that is closest to one."""
     low, high = -_MAX_SHIFT, _MAX_SHIFT

@@ -19,7 +19,7 @@ from bbfit.files import write_tensors
 from bbfit.fitting.bounds import opaque_bounds, trimmed
 from bbfit.fitting.colors import matched_colors, smoothed_colors
 from bbfit.fitting.config import FitConfig, ResolvedFit
-from bbfit.fitting.coverage import matched_coverage
+from bbfit.fitting.coverage import matched_coverage, scaled_coverage
 from bbfit.fitting.initialize import bounded, pixels_per_meter, random_textures, sized, start_cloud, tree_radius
 from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
 from bbfit.fitting.maps import fit_maps
@@ -201,7 +201,9 @@ def fit(
     fitted.texels[:, 3] *= fitted.texels[:, 3] >= config.least_alpha
     if config.alpha == "mask":
         fitted = matched_coverage(replace(fitted, alpha=config.drawn_alpha), views.train, config.backend)
-    fitted = replace(fitted, alpha=config.drawn_alpha if config.alpha == "coverage" else shipped)
+    fitted = replace(fitted, alpha=shipped)
+    if config.alpha == "coverage":
+        fitted = scaled_coverage(fitted, views.train, config.backend)
     # No view determines the colors of transparent texels, but filtering shows them.
     bled = [bleed_color(side).reshape(-1, 4) for texture in fitted.textures() for side in texture]
     fitted = fitted.with_texels(torch.cat(bled))
@@ -210,7 +212,7 @@ def fit(
         fitted = fit_maps(fitted, views, config, None if on_step is None else partial(_report_map_step, on_step, fitted, config))
     if config.colors != "joint":
         fitted = matched_colors(smoothed_colors(fitted), views.train, config.backend)
-    fitted = replace(palettized(fitted, config.palette), alpha=shipped)
+    fitted = palettized(fitted, config.palette)
     if config.placement != "even" or config.placement_learning_rate:
         fitted = trimmed(fitted)
     try:

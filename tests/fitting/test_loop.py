@@ -377,4 +377,7 @@ def test_a_fit_for_coverage_covers_samples_better_than_one_for_blend(data_views:
     covering, blended = (fit(data_views, dataclasses.replace(config, alpha=alpha)).cloud for alpha in ("coverage", "blend"))
     assert covering.alpha == AlphaMode("coverage", 0.4)
     scores = [over_white(dataclasses.replace(cloud, alpha=covering.alpha), data_views.test) for cloud in (covering, blended)]
-    assert scores[0] > scores[1] + 0.1  # measured: 0.21 dB
+    assert scores[0] > scores[1] + 0.1  # measured: 0.15 dB
+    test = data_views.test
+    covered = render_reference(covering, test.cameras)[..., 3].mean() / test.targets(range(len(test)))[..., 3].mean()
+    assert abs(float(covered) - 1) < 0.03  # measured: 0.986
