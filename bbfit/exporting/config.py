@@ -71,7 +71,7 @@ class ExportConfig:
     """Program that will open the file; it decides the options below that are not given. Default: any program."""
     alpha: AlphaKind | None = None
     """Alpha mode: mask draws where alpha reaches the cutoff, and needs no sorting; blend is smooth, and drawn back to front;
-    hash draws at random with alpha as the probability.
+    hash draws at random with alpha as the probability; coverage covers a share of a pixel's samples, once you set the material.
     Default: the mode that the textures were fitted for, which suits them best."""
     alpha_cutoff: Cutoff | None = None
     """Least alpha that is drawn with mask, in (0, 1). Default: the cutoff that the textures were fitted for."""

@@ -140,9 +140,8 @@ class FitConfig:
     preset: Preset = "default"
     """default is the best that bbfit can do; thesis follows the thesis: 10,000 steps of one random view, no bounds, L2."""
     alpha: AlphaKind | None = None
-    """Alpha mode to fit for: cut off below the cutoff (mask), blended (blend), drawn at random with alpha as the probability (hash), or
-    alpha to coverage by the samples of a pixel (coverage).
-    Preset: mask; thesis: blend."""
+    """Alpha mode to fit for: mask cuts off below the cutoff; blend blends; hash draws at random with alpha as the probability;
+    coverage covers a share of a pixel's samples. Preset: mask; thesis: blend."""
     alpha_cutoff: Cutoff | None = None
     """Least alpha that shows with mask, in (0, 1). The lower, the more leaves remain where mip levels average alpha.
     With coverage it is the cutoff for programs that have masks alone. Preset: 0.2 (mask), 0.4 (coverage) or 0.5; thesis: 0.5."""
