@@ -179,8 +179,8 @@ def test_web_programs_cover_samples(
     """With four samples a pixel, they show bbfit's coverage, but for how the graphics card rounds alpha to samples.
 
     Chromium's, SwiftShader, covers a sample more at each fifth of alpha; bbfit rounds to the nearest number. Measured 42.7 and 42.1 dB
-    from bbfit's drawing with fifths, and 27.7 and 27.8 dB from its own. Scores differ by 0.01 and 0.03 dB from those of fifths, and are 0.20 and
-    0.18 dB below bbfit's own.
+    from bbfit's drawing with fifths, and 27.7 and 27.8 dB from its own. Scores differ by 0.01 and 0.03 dB from those of fifths, and are
+    0.20 and 0.18 dB below bbfit's own.
     """
     model = shipped_model(fits["coverage"], THREE)
     cameras, drawn = twice(model, views)
