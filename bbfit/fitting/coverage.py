@@ -1,4 +1,4 @@
-"""Matching of coverage: a masked cloud covers as much of the pictures as the tree, from every side as far as possible."""
+"""Matching of coverage: a cloud covers as much of the pictures as the tree does; a mask from every side, as far as possible."""
 
 from __future__ import annotations
 
@@ -40,12 +40,10 @@ def matched_coverage(cloud: BillboardCloud, views: ViewSet, backend: Backend = "
     more quality than they gain: for an acer the standard deviation of the coverage error over views is 8.8 % without shifts and 6.8 %
     with them, for 0.08 dB; a willow gains 0.04 dB.
     """
-    shown = list(filter(views.shows, range(len(views))))  # the relative error of an empty view is not defined
-    if len(cloud) == 0 or not shown:
+    indices = _compared(views)
+    if len(cloud) == 0 or not indices:
         return cloud
-    count = min(_VIEWS, len(shown))
-    indices = [shown[index * len(shown) // count] for index in range(count)]
-    cameras = views.cameras[indices].to(cloud.texels.device)
+    count, cameras = len(indices), views.cameras[indices].to(cloud.texels.device)
     target = torch.stack([views.image(index)[..., 3].double().mean() / 255 for index in indices])
     rounded = (cloud.texels * 255).round() / 255
     alpha, cutoff = cloud.texels[:, 3], cloud.alpha.cutoff
@@ -99,14 +97,10 @@ def scaled_coverage(cloud: BillboardCloud, views: ViewSet, backend: Backend = "a
     Rounding to a few samples takes more from faint texels than it gives, and the fit knows nothing of it: without this, a cherry covers
     0.9 of what it should with four samples. At most 24 views, evenly spaced, are compared.
     """
-    shown = list(filter(views.shows, range(len(views))))
-    indices = shown[:: -(-len(shown) // _VIEWS)] if shown else []
+    indices, cameras = _compared(views), views.cameras.to(cloud.texels.device)
     if len(cloud) == 0 or not indices:
         return cloud
-    cameras, target = (
-        views.cameras.to(cloud.texels.device),
-        sum(float(views.image(index)[..., 3].double().mean()) / 255 for index in indices),
-    )
+    target = sum(float(views.image(index)[..., 3].double().mean()) / 255 for index in indices)
 
     def scaled(excess: float) -> BillboardCloud:
         alpha = ((cloud.texels[:, 3:] * (1 + excess)).clamp(0, 1) * 255).round() / 255
@@ -118,6 +112,13 @@ def scaled_coverage(cloud: BillboardCloud, views: ViewSet, backend: Backend = "a
 
     with torch.no_grad():
         return scaled(_root(missed))
+
+
+def _compared(views: ViewSet) -> list[int]:
+    """Indices of at most :data:`_VIEWS` views, evenly spaced among those that show something: an empty one has no relative error."""
+    shown = list(filter(views.shows, range(len(views))))
+    count = min(_VIEWS, len(shown))
+    return [shown[index * len(shown) // count] for index in range(count)]
 
 
 def _root(excess: Callable[[float], float]) -> float:
