@@ -22,7 +22,7 @@ VERSIONS: Mapping[str, int] = {
     "convert": 1,
     "views": 6,
     "budget": 10,
-    "fit": 22,
+    "fit": 23,
     "export": 14,
     "evaluate": 16,
     "report": 8,

@@ -15,8 +15,10 @@ from bbfit.evaluation.backgrounds import mean_psnr
 from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import ShippedModel, shipped_model
+from bbfit.fitting.bark import Bark
 from bbfit.fitting.config import FitConfig, Placement, Sides
-from bbfit.fitting.loop import fit, placement_points
+from bbfit.fitting.loop import fit
+from bbfit.fitting.points import placement_points
 from bbfit.fitting.requirements import check_cameras, check_device
 from bbfit.fitting.search import QUICK, find_placement
 from bbfit.geometry.cloud import BillboardCloud
@@ -90,7 +92,7 @@ class Trials:
     ) -> None:
         self._views, self._config, self._tree, self._export = views, config, tree, export
         self._known, self._on_trial = known or (lambda config: None), on_trial or (lambda trials, total: None)
-        self._points: Tensor | None = None
+        self._points: tuple[Tensor, Bark | None] | None = None
         self._placements = dict[tuple[int | None, Sides], BillboardCloud]()
         self.done: list[Trial] = []
         """All trials, in order."""
@@ -123,7 +125,8 @@ class Trials:
                 views.train.check()
                 check_cameras(views.train.cameras, config.resolve(), mesh=self._tree is not None)
                 self._points = placement_points(views, config, self._tree)
-            self._placements[kind] = find_placement(views.train, self._points, config.resolve(), effort=QUICK)
+            points, bark = self._points
+            self._placements[kind] = find_placement(views.train, points, config.resolve(), effort=QUICK, bark=bark)
         return self._placements[kind]
 
 

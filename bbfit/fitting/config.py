@@ -18,6 +18,7 @@ Bounds = Literal["viewport", "thesis", "silhouette"]
 Schedule = Literal["cosine", "growth"]
 Colors = Literal["views", "matched", "joint"]
 Lighting = Literal["baked", "maps"]
+Trunk = Literal["mesh", "crossed"]
 _Binarization = Annotated[float, Range(0, 10)]
 _Density = Annotated[float, Range(0, 16, open_low=True)]
 _Rate = Annotated[float, Range(0, 10, open_low=True)]
@@ -180,9 +181,13 @@ class FitConfig:
     """Margin around what a compact billboard stands for, as a fraction of the tree's radius.
     The wider it is, the more billboards share leaves, which looks better, and the more pixels a graphics card shades.
     Preset: 0.02 (mask), 0.03 (coverage) or 0.05."""
+    trunk: Trunk = "crossed"
+    """What shows the trunk, among clustered billboards. crossed: planes that cross in the trunk below the crown, three in each of its
+    parts. mesh: facets on the bark of the trunk and of thick branches, up into the crown, if the fit has the tree's mesh.
+    Facets are solid from near by, and take more vertices and shaded pixels."""
     trunk_billboards: _Number | None = None
-    """Number of billboards, out of all, that cross in the trunk below the crown; for clusters, and trees with such a trunk.
-    Three cross in each part of the trunk, from the ground up. Default: 9 for 48 billboards or more, 6 for 32, 3 for 12, else none."""
+    """Number of billboards, out of all, that show the trunk. Default with mesh: the share of bark in what the views show of the tree.
+    Default with crossed: 9 for 48 billboards or more, 6 for 32, 3 for 12, else none."""
     restarts: Count | None = None
     """Independent searches for a placement; the best result is kept. Default: two for eight to eleven billboards, else one."""
     candidates: Count | None = None
@@ -277,19 +282,23 @@ class FitConfig:
         values = _BY_ALPHA[given.get("alpha", preset["alpha"])] | preset | given
         if values["placement"] == "even":
             values = {"billboards": EVEN} | values
-        return ResolvedFit(**_effort(values.get("billboards")) | values)
+        return ResolvedFit(**_effort(values.get("billboards"), self.trunk) | values)
 
 
-def _effort(count: int | None) -> dict[str, Any]:
+def _effort(count: int | None, trunk: Trunk) -> dict[str, Any]:
     """The defaults that depend on the number of billboards: how long to search for a placement, and how many show the trunk."""
     if count is None:
         return {}
+    shown = {"trunk_billboards": crossed_in_trunk(count)} if trunk == "crossed" else {}
     if count >= _MANY:
-        trunk = TRUNK_PLANES * min(max(count // _PER_PART, 1), _MOST_PARTS)
-        candidates = 4 if count < _VERY_MANY else 1
-        return {"restarts": 1, "candidates": candidates, "refinement_rounds": 0, "locality": _LOCALITY, "trunk_billboards": trunk}
+        return {"restarts": 1, "candidates": 4 if count < _VERY_MANY else 1, "refinement_rounds": 0, "locality": _LOCALITY} | shown
     rounds = min(6, max(1, count - 3))
-    return {"restarts": min(2, max(1, count // 4)), "candidates": 12, "refinement_rounds": rounds, "locality": 0.0, "trunk_billboards": 0}
+    return {"restarts": min(2, max(1, count // 4)), "candidates": 12, "refinement_rounds": rounds, "locality": 0.0} | shown
+
+
+def crossed_in_trunk(count: int) -> int:
+    """How many of ``count`` billboards cross in the trunk by default."""
+    return TRUNK_PLANES * min(max(count // _PER_PART, 1), _MOST_PARTS) if count >= _MANY else 0
 
 
 class ResolvedFit(FitConfig):
@@ -334,7 +343,7 @@ class ResolvedFit(FitConfig):
     def counted(self, count: int) -> ResolvedFit:
         """The same with a number of billboards, if it is not chosen yet, and with a search of the length that suits it."""
         given = {name: value for name, value in vars(self).items() if value is not None}
-        return ResolvedFit(**{"billboards": count} | _effort(count) | given)
+        return ResolvedFit(**{"billboards": count} | _effort(count, self.trunk) | given)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -25,11 +25,10 @@ from bbfit.fitting.levels import LEAST_SIDE, Targets, resampled, shrunk_sizes
 from bbfit.fitting.maps import fit_maps
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.palette import palettized
-from bbfit.fitting.points import COUNT, hull_points, mesh_points
+from bbfit.fitting.points import placement_points
 from bbfit.fitting.requirements import check_cameras, check_device, check_lights
 from bbfit.fitting.search import find_placement
 from bbfit.fitting.steps import BLEND, HARDEST, Stepper
-from bbfit.fitting.visibility import visible_points
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
@@ -45,8 +44,6 @@ _START, _PLACEMENT = "start.", "found."
 _ANEW = "remove it to start the fit anew"
 # More texels in a checkpoint than any fit has.
 _MOST_TEXELS = 1 << 28
-# Points on the mesh for each one that is chosen because views see it.
-_DENSE = 5
 # Fraction of the steps at full resolution during which a mask hardens.
 _HARDENING = 0.3
 
@@ -174,7 +171,7 @@ def fit(
         sizes = shrunk_sizes(start, level.halvings)
         cloud = random_textures(start, sizes, config.seed) if fitted is None else resampled(fitted, start, sizes)
         # Compact billboards do not grow: more of them gain more for as many drawn pixels.
-        movement = Movement(cloud, radius, grow=not config.locality) if config.placement_learning_rate else None
+        movement = Movement(cloud, radius, grow=not config.locality, steps=config.steps) if config.placement_learning_rate else None
         level_config = config.coarse() if level.halvings else config
         stepper = Stepper(cloud.to(device), Targets.at(views.train, level.halvings), level_config, movement)
         del cloud  # the stepper has its own copy of the texels, which can take hundreds of megabytes
@@ -250,19 +247,8 @@ def _initial_state(
         except (torch.linalg.LinAlgError, InputError) as error:
             fail("views", f"their cameras do not show a tree from around it ({error})", "check the cameras")
         return _FitState([], start, None, {}, 0.0)
-    return _placed_state(views, config, find_placement(views.train, placement_points(views, config, tree), config, on_place))
-
-
-def placement_points(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> Tensor:
-    """Sample the points on the tree that a search for a placement clusters, float64 [P, 3]: on its mesh, or in the views' visual hull.
-
-    Raises the errors of :func:`~bbfit.fitting.points.mesh_points` and :func:`~bbfit.fitting.points.hull_points`.
-    """
-    if tree is None:
-        return hull_points(views.train, seed=config.seed, own=views.own)
-    rendered = views.request.tree if views.request else None
-    points = mesh_points(tree, views.train, rendered=rendered, count=_DENSE * COUNT, seed=config.seed)
-    return visible_points(points, float(tree.mesh().area), views.train.cameras, COUNT, config.seed)
+    points, bark = placement_points(views, config, tree)
+    return _placed_state(views, config, find_placement(views.train, points, config, on_place, bark=bark))
 
 
 def _placed_state(views: ViewDataset, config: ResolvedFit, placement: BillboardCloud) -> _FitState:

@@ -11,25 +11,28 @@ from torch import Tensor
 from bbfit.geometry.cloud import BillboardCloud
 
 BETAS, EPSILON = (0.8, 0.95), 1e-12
-# Learning rate of extents, as a fraction of the rate of positions. It is low because textures can shrink by becoming transparent, and
-# grow when the billboards get new bounds.
-_EXTENT_RATE = 0.3
+# Learning rate of extents, as a fraction of the rate of positions, for at most so many steps. It is low because textures can shrink by
+# becoming transparent, and grow when the billboards get new bounds. Extents move no farther in a longer fit: rectangles that only shrink
+# would end too small.
+_EXTENT_RATE, _EXTENT_STEPS = 0.3, 800
 
 
 class Movement:
     """The movement of N billboards from their initial placement, as eight parameters each, and the state of Adam over them.
 
     Three parameters are a translation, in multiples of ``reach`` meters. Three are a rotation vector about the billboard's center, in
-    radians. Two are the logarithms of the growth of its half extents, in units of 0.3. Their gradients come from the homographies.
+    radians. Two are the logarithms of the growth of its half extents, in units of 0.3, or of less if there are more than 800 ``steps`` in
+    all. Their gradients come from the homographies.
 
     Unless they may ``grow``, half extents stay at most as large as they are at the start. A larger billboard nearly always lowers the loss,
     and no loss knows that a graphics card shades all of its pixels.
     """
 
-    def __init__(self, cloud: BillboardCloud, reach: float, *, grow: bool = True) -> None:
+    def __init__(self, cloud: BillboardCloud, reach: float, *, grow: bool = True, steps: int = _EXTENT_STEPS) -> None:
         cloud = cloud.without_textures().to("cpu")
         self._cloud = replace(cloud, **{name: getattr(cloud, name).double() for name in ("centers", "rights", "ups", "half_extents")})
-        self._units = torch.tensor([reach] * 3 + [1.0] * 3 + [_EXTENT_RATE] * 2, dtype=torch.float64)
+        extent = _EXTENT_RATE * min(1, _EXTENT_STEPS / steps)
+        self._units = torch.tensor([reach] * 3 + [1.0] * 3 + [extent] * 2, dtype=torch.float64)
         self._state = torch.zeros(3, len(cloud), 8, dtype=torch.float64)  # parameters, their first and second moments
         self._most = math.inf if grow else 0.0
         self._steps = 0

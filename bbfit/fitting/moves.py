@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from bbfit.fitting.bark import facets
 from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, splatted, split_planes, view_projection
 from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.initialize import pixels_per_meter
@@ -64,6 +65,13 @@ class Moves:
             planes = crossed_planes(self._points[members[part]], number)
             billboards += [self._on_plane(members[part], *plane) for plane in zip(planes.normals, planes.offsets, strict=True)]
         return BillboardCloud.joined(billboards)
+
+    def faceted(self, normals: Tensor, count: int) -> BillboardCloud:
+        """At most ``count`` billboards on the surface of wood, for points on its bark with unit normals, [P, 3].
+
+        See :func:`~bbfit.fitting.bark.facets`.
+        """
+        return self._textured(torch.arange(len(self._points)), facets(self._points, normals, count, self._generator))
 
     def extended(self, cloud: BillboardCloud, losses: Losses) -> list[BillboardCloud]:
         """Add one billboard to a cloud in :data:`ADDITIONS` ways: split a billboard, or place one where the loss is large."""

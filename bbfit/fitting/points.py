@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from bbfit.blender.request import RenderedTree
 from bbfit.checks import fail
+from bbfit.fitting.bark import Bark, bark_of
+from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_per_meter
-from bbfit.fitting.visibility import pixels_of
+from bbfit.fitting.visibility import pixels_of, seen_indices, visibility
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, convergence_point
 from bbfit.tree_files.tree_file import TreeFile
+from bbfit.views.dataset import ViewDataset
 from bbfit.views.view_set import ViewSet
+
+if TYPE_CHECKING:
+    import trimesh
 
 COUNT = 20_000
 """Default number of points."""
+# Points on the mesh for each one that is chosen because views see it.
+_DENSE = 5
+# Least thickness of wood that has facets, in pixels of the views at the tree's axis, and least number of points on its bark.
+_THICK, _LEAST_ON_BARK = 1.5, 30
 # Least fraction of the mesh's points, averaged over views, that must project onto the tree in the views.
 _AGREEMENT = 0.95
 # Pixels that cover less of the mesh than this can be empty in a picture: its few samples miss thin parts. Such points of the mesh must be
@@ -34,6 +47,26 @@ _ROUNDS = 64
 _HULL_SIDE = 256
 
 
+def placement_points(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> tuple[Tensor, Bark | None]:
+    """Sample the points on a tree that a search for a placement clusters, float64 [P, 3], and find those on thick bark.
+
+    The points are on the tree's mesh, in proportion to what views see of it, or in the visual hull of the views, which does not show what
+    is bark. Raises the errors of :func:`mesh_points` and :func:`hull_points`.
+    """
+    if tree is None:
+        return hull_points(views.train, seed=config.seed, own=views.own), None
+    cameras, rendered = views.train.cameras, views.request.tree if views.request else None
+    points = mesh_points(tree, views.train, rendered=rendered, count=_DENSE * COUNT, seed=config.seed)
+    mesh = tree.mesh()
+    chosen = seen_indices(visibility(points, float(mesh.area), cameras), COUNT, config.seed)
+    places, faces = mesh_samples(mesh, _DENSE * COUNT, config.seed)
+    on_bark = torch.zeros(len(points), dtype=torch.bool)
+    on_bark[bark_of(mesh, places, faces, _THICK / float(pixels_per_meter(cameras)))] = True
+    members = torch.nonzero(on_bark[chosen])[:, 0]
+    normals = in_world(mesh.face_normals[faces[chosen[members].numpy()]], tree)
+    return points[chosen], Bark(members, normals) if len(members) >= _LEAST_ON_BARK else None
+
+
 def mesh_points(tree: TreeFile, views: ViewSet, *, rendered: RenderedTree | None = None, count: int = COUNT, seed: int = 0) -> Tensor:
     """Sample ``count`` points on the triangles of a tree's mesh, uniformly by area, float64 [P, 3] in the world of the views.
 
@@ -41,14 +74,9 @@ def mesh_points(tree: TreeFile, views: ViewSet, *, rendered: RenderedTree | None
     it as Blender does. Otherwise the views verify that the mesh lies where they show the tree. Raises MissingFileError if the file is
     missing, and InputError if it cannot be read, has no triangles, or is not of the tree that the views show.
     """
-    import trimesh
-
     mesh = tree.mesh()
-    samples, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
-    points, bounds = torch.tensor(samples, dtype=torch.float64), torch.tensor(mesh.bounds, dtype=torch.float64)
-    if tree.up_axis == "z":
-        y_up = torch.tensor(Z_UP_TO_Y_UP, dtype=torch.float64)[:3, :3].mT
-        points, bounds = points @ y_up, (bounds @ y_up).sort(0).values
+    points = in_world(mesh_samples(mesh, count, seed)[0], tree)
+    bounds = in_world(mesh.bounds, tree).sort(0).values
     known = rendered if rendered is not None and rendered.sha256 == tree.digest else None
     if known and known.bounds:
         difference = (bounds - torch.tensor(known.bounds, dtype=torch.float64)).abs().amax()
@@ -59,6 +87,20 @@ def mesh_points(tree: TreeFile, views: ViewSet, *, rendered: RenderedTree | None
             fail("tree", f"bbfit finds the triangles of {tree.path} elsewhere than Blender", "export it from Blender as .glb")
         fail("tree", f"{tree.path} is not where the views show a tree", "give the mesh that they were rendered from, or no mesh")
     return points
+
+
+def mesh_samples(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Sample ``count`` points on a mesh, uniformly by area: the points, [P, 3], and the triangles that they lie on, [P]."""
+    import trimesh
+
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    return np.asarray(points, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+
+
+def in_world(vectors: NDArray[np.float64], tree: TreeFile) -> Tensor:
+    """Turn points or directions in the axes of a tree's file, [P, 3], to the world of the views, whose Y is up, float64 [P, 3]."""
+    turned = torch.tensor(np.asarray(vectors), dtype=torch.float64)
+    return turned @ torch.tensor(Z_UP_TO_Y_UP, dtype=torch.float64)[:3, :3].mT if tree.up_axis == "z" else turned
 
 
 def _agreement(points: Tensor, area: float, views: ViewSet) -> float:

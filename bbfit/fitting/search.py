@@ -11,7 +11,8 @@ from operator import attrgetter, itemgetter
 import torch
 from torch import Tensor
 
-from bbfit.fitting.config import ResolvedFit
+from bbfit.fitting.bark import Bark
+from bbfit.fitting.config import TRUNK_PLANES, ResolvedFit, crossed_in_trunk
 from bbfit.fitting.initialize import pixels_per_meter, tree_radius
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.movement import Movement
@@ -61,12 +62,21 @@ LEAST_GAIN_DB = 0.3
 _FIRST = 32
 # Most searches for that choice.
 _SEARCHES = 3
+# Share of bark above which a tree is bare, and all billboards are for all of its points.
+_BARE = 0.9
+# Margin around the points of a facet of bark, as a fraction of the tree's radius.
+_FACET_MARGIN = 0.005
 # Least alpha of a texel that counts in layers.
 _VISIBLE = 0.05
 
 
 def find_placement(
-    views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None] | None = None, effort: Effort = USUAL
+    views: ViewSet,
+    points: Tensor,
+    config: ResolvedFit,
+    on_progress: Callable[[int, int], None] | None = None,
+    effort: Effort = USUAL,
+    bark: Bark | None = None,
 ) -> BillboardCloud:
     """Search for the placement of billboards that explains the training views best at a low resolution.
 
@@ -78,8 +88,10 @@ def find_placement(
     ``refinement_rounds`` rounds then refine the cloud with the least loss (:meth:`~bbfit.fitting.moves.Moves.refined`). A round keeps the
     best change only if it lowers the loss.
 
-    ``trunk_billboards`` of the billboards are not searched for. They cross in the parts of the trunk below the crown
-    (:func:`~bbfit.fitting.trunk.trunk_points`), unless the tree has none, and their textures show the points there.
+    ``trunk_billboards`` of the billboards are not searched for. With ``trunk`` mesh they are facets of the ``bark``, if it is known which
+    points are on it, and as many as its share of all points, unless their number is given. Else, or if that makes fewer than three, they
+    cross in the parts of the trunk below the crown (:func:`~bbfit.fitting.trunk.trunk_points`), unless the tree has none. Their textures
+    show the points there.
 
     If ``billboards`` is None, their number is chosen at the knee of the curve, within ``least_billboards`` and ``most_billboards``. What a
     graphics card pays for is the pixels that it shades, and they grow with the number of layers before each other. Two quick
@@ -91,30 +103,45 @@ def find_placement(
     """
     if config.billboards is None:
         on_progress = on_progress or (lambda done, total: None)
-        cloud = _at_the_knee(views, points, config, on_progress)
+        cloud = _at_the_knee(views, points, config, on_progress, bark)
         on_progress(_SEARCHES, _SEARCHES)
         return cloud
-    return _found(views, points, config, on_progress, effort)[0]
+    return _found(views, points, config, on_progress, effort, bark)[0]
 
 
 def _found(
-    views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None] | None = None, effort: Effort = USUAL
+    views: ViewSet,
+    points: Tensor,
+    config: ResolvedFit,
+    on_progress: Callable[[int, int], None] | None,
+    effort: Effort,
+    bark: Bark | None,
 ) -> tuple[BillboardCloud, _Search]:
     """The placement of a known number of billboards, and the search that found it."""
-    on_progress, own = on_progress or (lambda done, total: None), config.trunk_billboards or 0
+    on_progress, own, count = on_progress or (lambda done, total: None), config.trunk_billboards, config.billboards
+    assert count is not None  # see counted()
+    share = 0.0 if bark is None or config.trunk != "mesh" else len(bark.members) / len(points)
+    faceted = min(round(count * share) if own is None else own, count - 1)
+    if bark is not None and share and faceted >= TRUNK_PLANES:
+        others = torch.ones(len(points), dtype=torch.bool)
+        others[bark.members] = share > _BARE
+        search = _Search(views, points[others], replace(config, billboards=count - faceted), on_progress, effort)
+        return BillboardCloud.joined([search.best(), search.faceted(points[bark.members], bark.normals, faceted)]), search
+    usual = crossed_in_trunk(count)
+    own = usual if own is None else own if config.trunk == "crossed" else min(own, usual)
     trunk = trunk_points(points, views) if own else points.new_zeros(0)
-    assert config.billboards is not None  # see counted()
-    crown = config.billboards - (own if len(trunk) else 0)
-    search = _Search(views, points, replace(config, billboards=crown), on_progress, effort)
+    search = _Search(views, points, replace(config, billboards=count - (own if len(trunk) else 0)), on_progress, effort)
     best = search.best()
     return (BillboardCloud.joined([best, search.moves.crossed(trunk, own)]) if len(trunk) else best), search
 
 
-def _at_the_knee(views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None]) -> BillboardCloud:
+def _at_the_knee(
+    views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None], bark: Bark | None
+) -> BillboardCloud:
     """The placement of as many billboards as pay for the tree; see :func:`find_placement`."""
 
     def tried(number: int, count: int) -> _Trial:
-        cloud, search = _found(views, points, config.counted(count), None, QUICK)
+        cloud, search = _found(views, points, config.counted(count), None, QUICK, bark)
         on_progress(number, _SEARCHES)
         return _Trial(count, cloud, search.layers(cloud), search.decibels(cloud))
 
@@ -164,6 +191,11 @@ class _Search:
         completed = sum(max(1, self._chains >> addition) for addition in range(self._added))
         each = effort.steps * config.candidates + effort.more_steps * self._survivors + effort.mend_steps * ADDITIONS * completed
         self._total = config.restarts * each + effort.mend_steps * (1 + REFINEMENTS) * config.refinement_rounds
+
+    def faceted(self, points: Tensor, normals: Tensor, count: int) -> BillboardCloud:
+        """At most ``count`` billboards for points on bark, float64 [P, 3], with unit normals, [P, 3], with hardly a margin."""
+        config = replace(self._config, margin=_FACET_MARGIN, locality=1.0)
+        return Moves(points, self._targets.cameras, self._pictures, config, self._radius, self._generator).faceted(normals, count)
 
     def layers(self, cloud: BillboardCloud) -> float:
         """How many visible texels of a cloud lie before each other in a pixel of the rectangle around the tree, on average over views."""

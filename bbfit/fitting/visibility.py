@@ -13,14 +13,13 @@ _CAMERAS, _WIDTH = 24, 96
 _LEAST = 0.01
 
 
-def visible_points(points: Tensor, area: float, cameras: Camera, count: int, seed: int) -> Tensor:
-    """Choose ``count`` of P > ``count`` points on a surface of ``area`` square meters, float64 [P, 3], in proportion to their visibility.
+def seen_indices(visibility: Tensor, count: int, seed: int) -> Tensor:
+    """Choose ``count`` of P > ``count`` points in proportion to their :func:`visibility`, float64 [P]. Returns their indices, int64.
 
     Without it, a clustering of a dense tree's points would place most billboards inside the crown, where no view sees them.
     """
-    weights = visibility(points, area, cameras).clamp_min(_LEAST)
-    chosen = torch.multinomial(weights, count, replacement=False, generator=torch.Generator().manual_seed(seed))
-    return points[chosen]
+    generator = torch.Generator().manual_seed(seed)
+    return torch.multinomial(visibility.clamp_min(_LEAST), count, replacement=False, generator=generator)
 
 
 def visibility(points: Tensor, area: float, cameras: Camera) -> Tensor:

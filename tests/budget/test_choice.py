@@ -23,8 +23,10 @@ from bbfit.checks import InputError
 from bbfit.evaluation.scoring import evaluate
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
+from bbfit.fitting.bark import Bark
 from bbfit.fitting.config import FitConfig, Placement, Sides
-from bbfit.fitting.loop import fit, placement_points
+from bbfit.fitting.loop import fit
+from bbfit.fitting.points import placement_points
 from bbfit.fitting.search import QUICK as QUICK_SEARCH
 from bbfit.fitting.search import find_placement
 from bbfit.geometry.cloud import BillboardCloud
@@ -583,11 +585,11 @@ def test_a_trial_is_a_short_fit_measured_on_views_it_has_not_seen(views: ViewDat
     assert found.validation == tuple(held.names)
     kinds = [(trial.billboards, trial.sides, trial.placement) for trial in found.trials]
     assert kinds == [(1, "one", "clusters"), (2, "one", "clusters"), (1, "two", "clusters"), (2, "one", "even")]
-    points = placement_points(rest, asked, tree)
+    points, bark = placement_points(rest, asked, tree)
     for trial, kind in zip(found.trials, kinds, strict=True):
         config, start = short_config(asked, *kind, None), None
         if trial.placement == "clusters":
-            start = find_placement(rest.train, points, config.resolve(), effort=QUICK_SEARCH)
+            start = find_placement(rest.train, points, config.resolve(), effort=QUICK_SEARCH, bark=bark)
         cloud = fit(rest, config, tree=tree, placement=start).cloud
         assert trial.max_texels is None
         assert (trial.vertices, trial.texels, trial.bytes) == (cloud.vertex_count, len(cloud.texels), model_bytes(cloud, export))
@@ -600,11 +602,11 @@ def test_a_number_is_searched_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever number of texels its trials may have; points are sampled once."""
     searched, sampled = list[tuple[int | None, Sides]](), list[object]()
 
-    def search(views: object, points: object, config: FitConfig, effort: object) -> BillboardCloud:
+    def search(views: object, points: object, config: FitConfig, effort: object, bark: object) -> BillboardCloud:
         searched.append((config.billboards, config.sides))
-        return find_placement(views, points, config, effort=effort)  # type: ignore[arg-type]
+        return find_placement(views, points, config, effort=effort, bark=bark)  # type: ignore[arg-type]
 
-    def sample(*given: object) -> torch.Tensor:
+    def sample(*given: object) -> tuple[torch.Tensor, Bark | None]:
         sampled.append(given)
         return placement_points(*given)  # type: ignore[arg-type]
 
@@ -754,7 +756,7 @@ def test_a_choice_on_real_views() -> None:
     start = (
         None
         if best.placement == "even"
-        else find_placement(rest.train, placement_points(rest, config, None), config.resolve(), effort=QUICK_SEARCH)
+        else find_placement(rest.train, placement_points(rest, config, None)[0], config.resolve(), effort=QUICK_SEARCH)
     )
     cloud = fit(rest, config, placement=start).cloud
     assert (best.vertices, best.texels, best.bytes) == (cloud.vertex_count, len(cloud.texels), model_bytes(cloud, ExportConfig()))

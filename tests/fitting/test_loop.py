@@ -24,11 +24,11 @@ from bbfit.fitting.loop import (
     Step,
     fit,
     learning_rate,
-    placement_points,
     resolution_levels,
     sample_views,
     step_alpha,
 )
+from bbfit.fitting.points import placement_points
 from bbfit.fitting.search import find_placement
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
@@ -173,7 +173,7 @@ def test_a_killed_fit_goes_on_to_the_same_result(views: ViewDataset, tmp_path: P
 def test_a_fit_from_a_placement_is_the_fit_that_finds_it(data_views: ViewDataset, tmp_path: Path) -> None:
     """Bit for bit; another placement gives another result, and a checkpoint, which would not know of it, is refused."""
     config = quick(billboards=2, steps=8, views_per_step=1).resolve()
-    points = placement_points(data_views, config, None)
+    points, _ = placement_points(data_views, config, None)
     found = find_placement(data_views.train, points, config)
     assert same(fit(data_views, config, placement=found), fit(data_views, config))
     other = dataclasses.replace(found, centers=found.centers + 0.1)

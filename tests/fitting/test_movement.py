@@ -39,6 +39,18 @@ def moved(cloud: BillboardCloud, *numbers: float) -> BillboardCloud:
     return Movement(cloud, REACH).placed(parameters, cloud.texels)
 
 
+def test_extents_move_as_far_in_many_steps_as_in_800() -> None:
+    """A parameter of 1 in 800 steps is one of 4 in 3,200; positions and angles do not depend on the number of steps."""
+    cloud, parameters = leaning_cloud(), uniform(3, 8)
+    movements = Movement(cloud, REACH), Movement(cloud, REACH, steps=800), Movement(cloud, REACH, steps=3200)
+    usual, same, long = (movement.placed(parameters, cloud.texels) for movement in movements)
+    for name in PLACEMENT:
+        assert torch.equal(getattr(usual, name), getattr(same, name))
+        assert torch.equal(getattr(usual, name), getattr(long, name)) == (name != "half_extents")
+    growth, slow = ((placed.half_extents / cloud.half_extents).log() for placed in (usual, long))
+    torch.testing.assert_close(growth, 4 * slow)
+
+
 def test_no_movement_is_the_cloud() -> None:
     cloud = leaning_cloud()
     movement = Movement(cloud, REACH)
