@@ -182,12 +182,14 @@ class FitConfig:
     The wider it is, the more billboards share leaves, which looks better, and the more pixels a graphics card shades.
     Preset: 0.02 (mask), 0.03 (coverage) or 0.05."""
     trunk: Trunk = "crossed"
-    """What shows the trunk, among clustered billboards. crossed: planes that cross in the trunk below the crown, three in each of its
-    parts. mesh: facets on the bark of the trunk and of thick branches, up into the crown, if the fit has the tree's mesh.
-    Facets are solid from near by, and take more vertices and shaded pixels."""
+    """What shows the trunk, among clustered billboards.
+    crossed: planes that cross in the trunk below the crown, three in each of its parts.
+    mesh: facets on the bark of the trunk and of thick branches, up into the crown. They need the tree's mesh; without it, planes cross.
+    Facets look more solid from near by, and shade more pixels."""
     trunk_billboards: _Number | None = None
-    """Number of billboards, out of all, that show the trunk. Default with mesh: the share of bark in what the views show of the tree.
-    Default with crossed: 9 for 48 billboards or more, 6 for 32, 3 for 12, else none."""
+    """Number of billboards, out of all, that show the trunk.
+    Default with crossed: 9 for 48 billboards or more, 6 for 32, 3 for 12, else none.
+    Default with mesh: the share of bark in what the views show of the tree; planes cross if that makes fewer than three."""
     restarts: Count | None = None
     """Independent searches for a placement; the best result is kept. Default: two for eight to eleven billboards, else one."""
     candidates: Count | None = None
