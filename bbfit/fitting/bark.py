@@ -90,8 +90,8 @@ def _parts(mesh: trimesh.Trimesh) -> tuple[NDArray[np.int64], NDArray[np.float64
     """The connected part that each triangle belongs to, [F], and the diagonals in meters of the boxes around the parts."""
     places = np.asarray(mesh.vertices)
     grid = np.round((places - places.min(0)) / (_SAME * float(mesh.extents.max()))).astype(np.int64)
-    _, vertex = np.unique(grid, axis=0, return_inverse=True)
-    corners = vertex.reshape(-1)[mesh.faces]
+    _, vertex = np.unique(grid @ [1 << 42, 1 << 21, 1], return_inverse=True)  # 20 bits hold a coordinate
+    corners = vertex[mesh.faces]
     count = int(corners.max()) + 1
     edges = np.concatenate([corners[:, :2], corners[:, 1:]])
     _, part = connected_components(coo_matrix((np.ones(len(edges), dtype=bool), edges.T), shape=(count, count)), directed=False)

@@ -48,10 +48,11 @@ _HULL_SIDE = 256
 
 
 def placement_points(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> tuple[Tensor, Bark | None]:
-    """Sample the points on a tree that a search for a placement clusters, float64 [P, 3], and find those on thick bark.
+    """Sample the points on a tree that a search for a placement clusters, float64 [P, 3], and find those on thick bark if it asks for them.
 
     The points are on the tree's mesh, in proportion to what views see of it, or in the visual hull of the views, which does not show what
-    is bark. Raises the errors of :func:`mesh_points` and :func:`hull_points`.
+    is bark. The bark is ``None`` unless ``trunk`` is mesh, and if there is hardly any. Raises the errors of :func:`mesh_points` and
+    :func:`hull_points`.
     """
     if tree is None:
         return hull_points(views.train, seed=config.seed, own=views.own), None
@@ -59,6 +60,8 @@ def placement_points(views: ViewDataset, config: FitConfig, tree: TreeFile | Non
     points = mesh_points(tree, views.train, rendered=rendered, count=_DENSE * COUNT, seed=config.seed)
     mesh = tree.mesh()
     chosen = seen_indices(visibility(points, float(mesh.area), cameras), COUNT, config.seed)
+    if config.trunk != "mesh":
+        return points[chosen], None
     places, faces = mesh_samples(mesh, _DENSE * COUNT, config.seed)
     on_bark = torch.zeros(len(points), dtype=torch.bool)
     on_bark[bark_of(mesh, places, faces, _THICK / float(pixels_per_meter(cameras)))] = True

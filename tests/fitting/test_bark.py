@@ -87,7 +87,7 @@ def views() -> ViewDataset:
 
 @pytest.fixture(scope="module")
 def shape(views: ViewDataset) -> tuple[torch.Tensor, Bark | None]:
-    return placement_points(views, FitConfig(), TreeFile.open(DATA / "tree.glb"))
+    return placement_points(views, FitConfig(trunk="mesh"), TreeFile.open(DATA / "tree.glb"))
 
 
 def asked(count: int, **fields: object) -> ResolvedFit:
@@ -131,6 +131,8 @@ def test_the_number_of_facets_is_the_share_of_bark(
     assert counts == expected and len(counts) == 2
 
 
-def test_without_a_mesh_the_trunk_is_crossed(views: ViewDataset) -> None:
-    assert placement_points(views, FitConfig(), None)[1] is None
+def test_without_a_mesh_the_trunk_is_crossed(views: ViewDataset, shape: tuple[torch.Tensor, Bark | None]) -> None:
+    assert placement_points(views, FitConfig(trunk="mesh"), None)[1] is None
+    points, bark = placement_points(views, FitConfig(), TreeFile.open(DATA / "tree.glb"))
+    assert bark is None and torch.equal(points, shape[0])  # the same points, whether bark is sought or not
     assert asked(48).trunk_billboards is None and FitConfig(billboards=48).resolve().trunk_billboards == 9
