@@ -7,10 +7,10 @@ other as the view turns, as the wood does. Planes through its middle do neither.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -19,6 +19,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bbfit.fitting.clusters import Planes
+
+if TYPE_CHECKING:
+    import trimesh
 
 # Least diagonal of a connected part of the mesh that can be wood, as a share of the tree's longest side. Leaves are smaller.
 _LEAST_PART = 0.05
@@ -29,8 +32,8 @@ _THICKEST, _SHRINKINGS = 0.1, 16
 _INSIDE, _ACROSS = 0.999, 0.5
 # Vertices closer than this share of the tree's longest side are the same.
 _SAME = 1e-6
-# Iterations of the clustering of facets. The costs of square meters from the middle of a facet, and of normals at right angles to its
-# normal in square meters for each square meter of the tree's radius, against square meters from its plane.
+# Iterations of the clustering of facets. The costs of a point against its squared distance from the facet's plane: the weight of its
+# squared distance from the facet's middle, and the cost of a normal at right angles, in mean squared distances of the bark from its middle.
 _ITERATIONS, _LOCALITY, _TURNED = 25, 0.1, 0.01
 
 

@@ -57,12 +57,11 @@ def placement_points(views: ViewDataset, config: FitConfig, tree: TreeFile | Non
     if tree is None:
         return hull_points(views.train, seed=config.seed, own=views.own), None
     cameras, rendered = views.train.cameras, views.request.tree if views.request else None
-    points = mesh_points(tree, views.train, rendered=rendered, count=_DENSE * COUNT, seed=config.seed)
-    mesh = tree.mesh()
+    mesh, places, faces = _sampled(tree, views.train, rendered, _DENSE * COUNT, config.seed)
+    points = in_world(places, tree)
     chosen = seen_indices(visibility(points, float(mesh.area), cameras), COUNT, config.seed)
     if config.trunk != "mesh":
         return points[chosen], None
-    places, faces = mesh_samples(mesh, _DENSE * COUNT, config.seed)
     on_bark = torch.zeros(len(points), dtype=torch.bool)
     on_bark[bark_of(mesh, places, faces, _THICK / float(pixels_per_meter(cameras)))] = True
     members = torch.nonzero(on_bark[chosen])[:, 0]
@@ -77,19 +76,26 @@ def mesh_points(tree: TreeFile, views: ViewSet, *, rendered: RenderedTree | None
     it as Blender does. Otherwise the views verify that the mesh lies where they show the tree. Raises MissingFileError if the file is
     missing, and InputError if it cannot be read, has no triangles, or is not of the tree that the views show.
     """
+    return in_world(_sampled(tree, views, rendered, count, seed)[1], tree)
+
+
+def _sampled(
+    tree: TreeFile, views: ViewSet, rendered: RenderedTree | None, count: int, seed: int
+) -> tuple[trimesh.Trimesh, NDArray[np.float64], NDArray[np.int64]]:
+    """The mesh of :func:`mesh_points`, checked as there, and samples of it in the axes of the file (:func:`mesh_samples`)."""
     mesh = tree.mesh()
-    points = in_world(mesh_samples(mesh, count, seed)[0], tree)
-    bounds = in_world(mesh.bounds, tree).sort(0).values
+    places, faces = mesh_samples(mesh, count, seed)
+    points, bounds = in_world(places, tree), in_world(mesh.bounds, tree).sort(0).values
     known = rendered if rendered is not None and rendered.sha256 == tree.digest else None
     if known and known.bounds:
         difference = (bounds - torch.tensor(known.bounds, dtype=torch.float64)).abs().amax()
         if float(difference) <= _SAME_BOUNDS * float((bounds[1] - bounds[0]).norm()):
-            return points
+            return mesh, places, faces
     if _agreement(points, float(mesh.area), views) < _AGREEMENT:
         if known:
             fail("tree", f"bbfit finds the triangles of {tree.path} elsewhere than Blender", "export it from Blender as .glb")
         fail("tree", f"{tree.path} is not where the views show a tree", "give the mesh that they were rendered from, or no mesh")
-    return points
+    return mesh, places, faces
 
 
 def mesh_samples(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -120,19 +120,25 @@ def _found(
     """The placement of a known number of billboards, and the search that found it."""
     on_progress, own, count = on_progress or (lambda done, total: None), config.trunk_billboards, config.billboards
     assert count is not None  # see counted()
-    share = 0.0 if bark is None or config.trunk != "mesh" else len(bark.members) / len(points)
-    faceted = min(round(count * share) if own is None else own, count - 1)
-    if bark is not None and share and faceted >= TRUNK_PLANES:
-        others = torch.ones(len(points), dtype=torch.bool)
-        others[bark.members] = share > _BARE
-        search = _Search(views, points[others], replace(config, billboards=count - faceted), on_progress, effort)
-        return BillboardCloud.joined([search.best(), search.faceted(points[bark.members], bark.normals, faceted)]), search
-    usual = crossed_in_trunk(count)
-    own = usual if own is None else own if config.trunk == "crossed" else min(own, usual)
+    if config.trunk == "mesh":
+        share = 0.0 if bark is None else len(bark.members) / len(points)
+        faceted = min(round(count * share) if own is None else own, count - 1)
+        if bark is not None and faceted >= TRUNK_PLANES:
+            others = torch.ones(len(points), dtype=torch.bool)
+            others[bark.members] = share > _BARE
+            search = _Search(views, points[others], _of_the_crown(config, count - faceted), on_progress, effort)
+            return BillboardCloud.joined([search.best(), search.faceted(points[bark.members], bark.normals, faceted)]), search
+        own = min(crossed_in_trunk(count), count if own is None else own)
+    assert own is not None  # see counted()
     trunk = trunk_points(points, views) if own else points.new_zeros(0)
-    search = _Search(views, points, replace(config, billboards=count - (own if len(trunk) else 0)), on_progress, effort)
+    search = _Search(views, points, _of_the_crown(config, count - (own if len(trunk) else 0)), on_progress, effort)
     best = search.best()
     return (BillboardCloud.joined([best, search.moves.crossed(trunk, own)]) if len(trunk) else best), search
+
+
+def _of_the_crown(config: ResolvedFit, count: int) -> ResolvedFit:
+    """The same for the ``count`` billboards that the search finds, without those of the trunk."""
+    return replace(config, billboards=count, trunk_billboards=0)
 
 
 def _at_the_knee(

@@ -131,6 +131,12 @@ def test_the_number_of_facets_is_the_share_of_bark(
     assert counts == expected and len(counts) == 2
 
 
+def test_a_bare_tree_has_facets_and_other_billboards(views: ViewDataset, shape: tuple[torch.Tensor, Bark | None]) -> None:
+    points = shape[0][:2_000]
+    bare = Bark(torch.arange(len(points)), torch.nn.functional.normalize(points - points.mean(0), dim=-1))
+    assert 8 <= len(find_placement(views.train, points, asked(16, trunk_billboards=8), effort=BRIEF, bark=bare)) <= 16
+
+
 def test_without_a_mesh_the_trunk_is_crossed(views: ViewDataset, shape: tuple[torch.Tensor, Bark | None]) -> None:
     assert placement_points(views, FitConfig(trunk="mesh"), None)[1] is None
     points, bark = placement_points(views, FitConfig(), TreeFile.open(DATA / "tree.glb"))

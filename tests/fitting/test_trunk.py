@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -162,6 +163,7 @@ def test_the_trunk_has_billboards_of_its_own_within_the_number_of_billboards() -
     low, high = ((found.centers + sign * found.half_extents[:, 1:] * found.ups)[:, 1] for sign in (-1, 1))
     assert (high[3:] < CROWN_AT + 0.5).all() and (low[3:] < 0.1).all() and (high[:3] > 2).all()
     assert found.normals[3:, 1].abs().max() < 1e-6 and float((found.normals[3] * found.normals[4]).sum().abs()) < 1e-5
+    assert len(find_placement(views, points, replace(asked, trunk_billboards=4), effort=brief)) == 5  # more than the crown's
     assert len(find_placement(tree_views(hidden=True), points, asked, effort=brief)) == 5  # without a trunk, all are the crown's
 
 
