@@ -42,6 +42,8 @@ GROUPS = (
     ("stages", "workers"),
     ("pipeline",),
     ("lod", "sweep", "comparison", "viewing"),
+    ("library", "frames"),
+    ("forest",),
     ("cli",),
     ("__main__",),
 )

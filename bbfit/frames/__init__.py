@@ -1,0 +1,1 @@
+"""Frame times of fields of trees, measured in programs."""
