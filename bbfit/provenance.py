@@ -26,7 +26,7 @@ VERSIONS: Mapping[str, int] = {
     "export": 14,
     "evaluate": 16,
     "report": 8,
-    "lod": 5,
+    "lod": 6,
     "compare": 6,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""

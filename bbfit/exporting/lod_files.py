@@ -118,7 +118,7 @@ def _tileset(document: Mapping[str, Any]) -> str:
 
 # For each profile the names of its files, and what makes each; None for a script of the package.
 _PROGRAMS: Mapping[str | None, Mapping[str, Callable[[Mapping[str, Any]], str] | None]] = {
-    "three": {"lod_three.js": None},
+    "three": {"lod_three.js": None, "lod_field_three.js": None},
     "babylon": {"lod_babylon.js": None},
     "playcanvas": {"lod_playcanvas.js": None},
     "godot": {"{name}.tscn": _godot_scene},

@@ -21,6 +21,23 @@ const programs = {
     };
   },
 
+  // Copies of the tree: ?matrices= lists their matrices, column after column. By default it is one, where the tree is.
+  async field() {
+    const THREE = await import("three");
+    const { loadField } = await import("/levels/lod_field_three.js");
+    const renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
+    const scene = new THREE.Scene();
+    const camera = new THREE.PerspectiveCamera(FOV, 1, 1, 10000);
+    const matrices = JSON.parse(query.get("matrices")) ?? new THREE.Matrix4().toArray();
+    const field = await loadField("/levels/lod.json", new Float32Array(matrices), { height: SIZE, fov: FOV });
+    scene.add(field);
+    return (distance) => {
+      camera.position.set(center[0], center[1], center[2] + distance);
+      field.update(camera);
+      renderer.render(scene, camera);
+    };
+  },
+
   async babylon() {
     const at = (path) => import(`@babylonjs/core/${path}.js`);
     const [{ Engine }, { Scene }, { FreeCamera }, { Vector3 }, { Color4 }] = await Promise.all(

@@ -103,23 +103,40 @@ def share(distance: float, side: float = 2.0) -> float:
     return (side * 48 / np.tan(np.radians(1)) / distance / 96) ** 2
 
 
-@pytest.mark.parametrize("program", ["three", "babylon", "playcanvas", "cesium"])
+@pytest.mark.parametrize("program", ["three", "field", "babylon", "playcanvas", "cesium"])
 def test_programs_show_the_level_of_the_distance_alone(program: str, chromium: tuple[Browser, ThreadPoolExecutor], tmp_path: Path) -> None:
-    with closing(Levels(*chromium, levels_folder(tmp_path / "levels", program), f"program={program}")) as page:
+    profile = "three" if program == "field" else program
+    with closing(Levels(*chromium, levels_folder(tmp_path / "levels", profile), f"program={program}")) as page:
         for distance in (*SHOWN, *SHOWN[::-1]):
             found, level = page.shares(distance), sum(distance >= start for start in DISTANCES) - 1
             assert found[level] == pytest.approx(share(distance, SIDES[level]), rel=0.15)
             assert found.sum() == found[level]
 
 
-def test_levels_fade_into_each_other_in_three(chromium: tuple[Browser, ThreadPoolExecutor], tmp_path: Path) -> None:
+@pytest.mark.parametrize("program", ["three", "field"])
+def test_levels_fade_into_each_other_in_three(program: str, chromium: tuple[Browser, ThreadPoolExecutor], tmp_path: Path) -> None:
     """Half of the way through the fade, which is a tenth of the distance, each shows about half of the pixels and none is left out."""
-    with closing(Levels(*chromium, levels_folder(tmp_path / "levels", "three", (2.0, 2.0, 2.0)), "program=three")) as page:
+    with closing(Levels(*chromium, levels_folder(tmp_path / "levels", "three", (2.0, 2.0, 2.0)), f"program={program}")) as page:
         for portion in (0.25, 0.5, 0.75):
             distance = 100.0 * (1 + 0.1 * portion)
             red, green, blue = page.shares(distance)
             assert red + green == pytest.approx(share(distance), rel=0.1) and blue == 0
             assert green / (red + green) == pytest.approx(portion, abs=0.05)
+
+
+def test_each_copy_of_a_field_has_the_level_for_its_own_distance_and_size(
+    chromium: tuple[Browser, ThreadPoolExecutor], tmp_path: Path
+) -> None:
+    """A copy of half the size shows the level of twice the distance; others are outside the picture and behind the camera."""
+    copies = [(0.5, -1.3, 0.5, 0.0), (2.0, 1.2, -1.0, 0.0), (1.0, 10.0, 0.0, 0.0), (1.0, 0.0, 0.0, 400.0)]  # size and place
+    matrices = [value for size, *place in copies for value in (size, 0, 0, 0, 0, size, 0, 0, 0, 0, size, 0, *place, 1)]
+    query = f"program=field&matrices={json.dumps(matrices, separators=(',', ':'))}"
+    with closing(Levels(*chromium, levels_folder(tmp_path / "levels", "three", (2.0, 2.0, 2.0)), query)) as page:
+        red, green, blue = page.shares(150.0)
+    edge = 150.0 * np.tan(np.radians(1))
+    assert blue == pytest.approx(share(300.0), rel=0.1)
+    assert red == pytest.approx((edge + 0.8) * 4 / (2 * edge) ** 2, rel=0.05)
+    assert green == 0
 
 
 @pytest.mark.parametrize("name", ["joined.glb", "babylon.glb"])
