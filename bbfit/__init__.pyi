@@ -16,6 +16,8 @@ from .exporting.model import export as export
 from .fitting.config import FitConfig as FitConfig
 from .fitting.loop import FitResult as FitResult
 from .fitting.loop import fit as fit
+from .frames.config import FramesConfig as FramesConfig
+from .frames.measurement import measure_frames as measure_frames
 from .geometry.camera import Camera as Camera
 from .geometry.cloud import BillboardCloud as BillboardCloud
 from .geometry.orbit import Orbit as Orbit

@@ -28,6 +28,7 @@ VERSIONS: Mapping[str, int] = {
     "report": 8,
     "lod": 6,
     "compare": 6,
+    "frames": 1,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""
 EXECUTION = {"affects_result": False}

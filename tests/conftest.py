@@ -46,7 +46,7 @@ MARKED = {
         "test_notebooks.py",
         "test_pipeline.py",
     ),
-    "browser": ("reporting/test_html.py", "reporting/test_suns.py", "viewers", "viewing"),
+    "browser": ("frames/test_measurement.py", "reporting/test_html.py", "reporting/test_suns.py", "viewers", "viewing"),
     "node": ("exporting/test_formats.py", "exporting/test_lod.py", "exporting/test_model.py"),
     "ray": ("sweep/test_cluster.py",),
     "slow": (

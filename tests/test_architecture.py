@@ -71,8 +71,9 @@ ONLY_IN = {
     "drjit": {"rivals/mesh_rays.py"},
     "fast_simplification": {"rivals/decimation.py", "rivals/learned_mesh.py"},
     "DracoPy": {"rivals/draco.py"},
+    "playwright": {"frames/browser.py"},
 }
-NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "jinja2")
+NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "jinja2", "playwright")
 
 
 def unit(path: Path) -> str:

@@ -31,6 +31,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "view": deferred(viewing.view_command),
     "sweep": deferred(studies.sweep_command),
     "compare": deferred(studies.compare_command),
+    "frames": deferred(studies.frames_command),
 }
 """The commands by their names."""
 

@@ -1,4 +1,4 @@
-"""The commands that compare: many configurations on many trees, and many systems."""
+"""The commands that compare: many configurations on many trees, many systems, and frame times."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from bbfit.cli.console import out_console, progress
 from bbfit.comparison.config import CompareConfig
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
+from bbfit.frames.config import FramesConfig
 from bbfit.inputs import InputLimits
 from bbfit.sweep.config import SweepConfig
 from bbfit.trees.config import GrowConfig
@@ -125,3 +126,34 @@ def compare_command(
     for name, reason in compared.failures.items():
         out_console.print(f"{name} failed: {reason}", style="yellow", soft_wrap=True)
     out_console.print(f"in {compared.folder}: summary.md, summary.csv, pareto.png, and a comparison for each tree in trees", soft_wrap=True)
+
+
+def frames_command(
+    sources: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[FOLDERS AND GLB FILES]")] = (),
+    /,
+    out: Path = Path("runs/frames"),
+    tree: Path | None = None,
+    frames: FramesConfig = FramesConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
+) -> None:
+    """Measure frame times: draw fields of hundreds to a hundred thousand trees in a browser, by three.js and Babylon.js.
+
+    Interrupted and started again, it resumes where it stopped.
+
+    For example: bbfit frames runs/compare lod --tree tree.glb --out runs/frames
+
+    Args:
+        sources: Folders of bbfit run, compare and lod, and GLB files, all of one tree.
+        out: Folder for the results.
+        tree: The tree itself, which is drawn too (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
+        frames: Which fields of trees are drawn, and in what.
+        limits: What the inputs may refer to, and how large they may be.
+    """
+    from bbfit.frames.measurement import measure_frames
+    from bbfit.reporting.tables import frames_table
+
+    with progress() as on_progress:
+        result = measure_frames(sources, out, frames, tree=tree, limits=limits, on_progress=on_progress)
+    for table in frames_table(result.rows):
+        out_console.print(table)
+    out_console.print(f"in {result.folder}: frames.md, frames.csv, frames.json, frames.png", soft_wrap=True)

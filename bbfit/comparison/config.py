@@ -35,6 +35,7 @@ SYSTEMS = (
     "decimated-bytes",
     "thinned",
     "thinned-large",
+    "thinned-triangles",
     "height-fields",
     "draco",
     "learned",
@@ -77,6 +78,8 @@ class CompareConfig(WorkersConfig):
     """Whether all of these directions are above the horizon. Otherwise half of them are below."""
     large_bytes: Count = 1_000_000
     """Most bytes of the larger tree that is thinned out."""
+    thinned_triangles: Count = 10_000
+    """Triangles of a tree that is thinned out to a number of them."""
     mesh_vertices: Count = 500
     """Vertices of the smaller learned mesh."""
     mesh_vertices_many: Count = 2000

@@ -66,6 +66,9 @@ def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]
         "thinned-large": System(
             f"thinned out to {config.large_bytes:,} bytes", partial(_thinned, limit=config.large_bytes), (config.large_bytes,)
         ),
+        "thinned-triangles": System(
+            f"thinned out to {config.thinned_triangles:,} triangles", _thinned_to_triangles, (config.thinned_triangles,)
+        ),
         "height-fields": System("the tree as coded height fields", _height_fields),
         "draco": System("the tree, with Draco", _draco),
         "learned": System(f"learned mesh, {few} vertices", partial(_learned, few), (few, steps)),
@@ -175,6 +178,14 @@ def _thinned(subject: Subject, folder: Path, limit: int | None = None) -> System
     path.unlink()
     note = "Blender; enlarged leaves" if len(model) <= limit else "Blender; enlarged leaves; no smaller size is possible"
     return _rendered(model, subject, folder, time.perf_counter() - started, note)
+
+
+def _thinned_to_triangles(subject: Subject, folder: Path) -> SystemResult:
+    started, path = time.perf_counter(), folder / "thinned.glb"
+    tree_as_glb(subject.tree, path, triangles=subject.config.thinned_triangles)
+    model = path.read_bytes()
+    path.unlink()
+    return _rendered(model, subject, folder, time.perf_counter() - started, "Blender; enlarged leaves")
 
 
 def _draco(subject: Subject, folder: Path) -> SystemResult:

@@ -9,6 +9,7 @@ from bbfit.evaluation.report import Cost, Report
 from bbfit.exporting.lod import LodLevel
 from bbfit.reporting.comparison_summary import summaries
 from bbfit.reporting.comparison_tables import CompareRow
+from bbfit.reporting.frame_tables import FrameRow
 from bbfit.reporting.sweep_tables import MEASURES, SweepRow, label_names
 from bbfit.trees.species import Species
 
@@ -187,6 +188,23 @@ def summary_table(rows: Mapping[str, Sequence[CompareRow]]) -> Table:
         costs = ("-" if (spread := each.costs[name]) is None else f"{spread.mean:,.{digits}f}" for name, digits in _COSTS)
         table.add_row(each.title, f"{each.psnr.mean:.2f}", f"{each.psnr.deviation:.2f}", f"{each.flip.mean:.3f}", *costs)
     return table
+
+
+def frames_table(rows: Sequence[FrameRow]) -> list[Table]:
+    """A ``rich`` table for each program and height, with one line per model: milliseconds of a frame by the number of trees."""
+    tables = []
+    for program, pixels in dict.fromkeys((row.program, row.tree_pixels) for row in rows):
+        of_field = [row for row in rows if (row.program, row.tree_pixels) == (program, pixels)]
+        counts = sorted({row.count for row in of_field})
+        table = _table(["model"], [*(f"{count:,}" for count in counts), "FLIP", "triangles"])
+        table.title, table.title_justify = f"{program}: ms a frame by the number of trees of {pixels} pixels", "left"
+        for name in dict.fromkeys(row.model for row in of_field):
+            own = {row.count: row for row in of_field if row.model == name}
+            last = own[max(own)]
+            times = [f"{own[count].ms:,.1f}" if count in own else "-" for count in counts]
+            table.add_row(last.title, *times, "-" if last.flip is None else f"{last.flip:.3f}", f"{last.triangles / last.count:,.0f}")
+        tables.append(table)
+    return tables
 
 
 def _table(texts: Sequence[str], numbers: Sequence[str], *, no_wrap: bool = False) -> Table:

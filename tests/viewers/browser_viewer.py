@@ -22,6 +22,7 @@ from playwright.sync_api import Browser, ConsoleMessage, Page, Route
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.light import Light
+from bbfit.geometry.opengl import camera_to_world_matrix, projection_matrix
 from bbfit.glb import gltf_parts
 
 HERE = Path(__file__).parent
@@ -40,8 +41,6 @@ PACKAGES = {
     "cesium": "cesium",
     "filament": "filament",
 }
-# OpenCV's camera axes to OpenGL's: +Y up, -Z forward.
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -195,27 +194,13 @@ def extent(glb: Path) -> NDArray[np.float64]:
     return np.stack([np.min(corners, 0), np.max(corners, 0)])
 
 
-def projection_matrix(camera: Camera, near: float, far: float) -> NDArray[np.float64]:
-    """OpenGL's projection of one camera, [4, 4]: from its axes as OpenGL has them (+Y up, -Z forward) to clip coordinates.
-
-    Pixel x, whose center is the whole number, lies at (2 x + 1) / width - 1 of OpenGL's picture, which reaches from -1 to 1.
-    """
-    to_clip = np.array([[2 / camera.width, 0, 1 / camera.width - 1], [0, -2 / camera.height, 1 - 1 / camera.height], [0, 0, 1]])
-    x, y, w = to_clip @ camera.camera_to_pixel.double().numpy()
-    if camera.orthographic:
-        z = np.array([0, 0, 2 / (far - near), -(far + near) / (far - near)])
-    else:
-        z = np.array([0, 0, (far + near) / (far - near), -2 * far * near / (far - near)])
-    return np.stack([x, y, z, w]) @ FLIP
-
-
 def _draw(page: Page, camera: Camera, bounds: NDArray[np.float64], light: Light | None) -> tuple[NDArray[np.float64], int, int]:
     distance = float(np.linalg.norm(camera.position.double().numpy() - bounds.mean(0)))
     radius = 1.01 * float(np.linalg.norm(bounds[1] - bounds[0])) / 2
     near, far = max(distance - radius, 1e-3 * distance), distance + radius
     view = {
         "projection": projection_matrix(camera, near, far).T.ravel().tolist(),
-        "cameraToWorld": (camera.camera_to_world.double().numpy() @ FLIP).T.ravel().tolist(),
+        "cameraToWorld": camera_to_world_matrix(camera).T.ravel().tolist(),
         "near": near,
         "far": far,
         "width": camera.width,

@@ -1,0 +1,129 @@
+"""The models whose frame times are measured, read from the folders of other commands."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from bbfit.checks import check_file, check_folder, check_record, fail
+from bbfit.exporting.lod import LodLevel
+from bbfit.exporting.lod_files import LOD_FILE
+from bbfit.files import read_json
+from bbfit.glb import gltf_parts
+from bbfit.inputs import InputLimits, reading
+from bbfit.layout import REQUEST_FILE
+from bbfit.reporting.comparison_tables import CompareRow
+from bbfit.reporting.frame_tables import ModelKind
+from bbfit.rivals.octahedral_files import THREE_PROGRAM
+from bbfit.views.dataset import ViewDataset
+
+_FOLDERS = "give folders of bbfit run, compare and lod, and GLB files"
+
+
+@dataclass(frozen=True)
+class DrawnModel:
+    """A model as it is drawn."""
+
+    name: str
+    """Its short name, unique in a measurement."""
+    title: str
+    """What it is, for the reader."""
+    kind: ModelKind
+    """What it consists of."""
+    files: tuple[Path, ...]
+    """Its GLB files: one, or one for each level of detail, finest first."""
+    distances: tuple[float, ...] = (0.0,)
+    """The distance from which each is shown, over the focal length in pixels: meters for each pixel of a meter's length."""
+    pictures: Path | None = None
+    """A folder with its pictures of the held-out views, if Blender drew them in the light of the views."""
+
+    @cached_property
+    def bytes(self) -> int:
+        """Size of its files."""
+        return sum(file.stat().st_size for file in self.files)
+
+    @cached_property
+    def lit(self) -> tuple[bool, ...]:
+        """Whether a program lights each file, so that its colors are not those of the views."""
+        if self.kind == "impostor":
+            return (False,)
+        trees = [gltf_parts(file.read_bytes(), "model", file)[0] for file in self.files]
+        return tuple(not all("KHR_materials_unlit" in each.get("extensions", {}) for each in tree.get("materials", [{}])) for tree in trees)
+
+
+def drawn_models(sources: Sequence[str | Path], limits: InputLimits | None = None) -> tuple[list[DrawnModel], ViewDataset | None]:
+    """The models in folders of ``bbfit run``, ``compare`` and ``lod`` and in GLB files, and the first views in those folders.
+
+    Of a comparison these are the models that programs draw as they are, and octahedral impostors. Models of one name get numbers. Raises
+    MissingFileError or InputError if there is none in a folder, or if one cannot be read.
+    """
+    limits, models, views = limits or InputLimits(), list[DrawnModel](), None
+    if not sources:
+        fail("sources", "there is nothing to draw", _FOLDERS)
+    for source in map(Path, sources):
+        if source.suffix.lower() == ".glb" and not source.is_dir():
+            models.append(_single(check_file("sources", source), source.stem))
+            continue
+        folder = check_folder("sources", source)
+        with reading("sources", folder, "start bbfit again for this folder"):
+            models += _in_folder(folder)
+        if views is None and (folder / "views" / REQUEST_FILE).is_file():
+            views = ViewDataset.load(folder / "views", limits=limits)
+    for model in models:
+        with reading("model", model.files[0], "export it again"):
+            _ = model.lit
+    return _with_different_names(models), views
+
+
+def _with_different_names(models: Sequence[DrawnModel]) -> list[DrawnModel]:
+    """The models; of those with one name, all but the first get a number."""
+    named = dict[str, DrawnModel]()
+    for model in models:
+        numbers = (f"{model.name}-{number}" for number in itertools.count(2))
+        name = next(name for name in itertools.chain([model.name], numbers) if name not in named)
+        named[name] = replace(model, name=name)
+    return list(named.values())
+
+
+def _in_folder(folder: Path) -> list[DrawnModel]:
+    if (folder / "levels" / LOD_FILE).is_file():
+        return [_levels(folder)]
+    if (folder / "compare.json").is_file():
+        rows = [CompareRow.from_json(row) for row in read_json("comparison", folder / "compare.json")]
+        models = [model for row in rows if (model := _compared(folder / row.system, row)) is not None]
+    else:
+        models = [_single(folder / "model.glb", folder.resolve().name)] if (folder / "model.glb").is_file() else []
+    if not models:
+        fail("sources", f"{folder} contains no model", _FOLDERS)
+    return models
+
+
+def _single(path: Path, name: str) -> DrawnModel:
+    return DrawnModel(name, name, "mesh", (path,))
+
+
+def _compared(folder: Path, row: CompareRow) -> DrawnModel | None:
+    """A system of a comparison; ``None`` if it has no model, or one that needs a shader that bbfit does not write."""
+    path, program = folder / "model.glb", folder / THREE_PROGRAM
+    if not path.is_file() or (row.costs.shader and not program.is_file()):
+        return None
+    pictures = folder / "held_out"
+    return DrawnModel(
+        row.system, row.title, "impostor" if row.costs.shader else "mesh", (path,), pictures=pictures if pictures.is_dir() else None
+    )
+
+
+def _levels(folder: Path) -> DrawnModel:
+    stored = read_json("levels of detail", folder / "levels" / LOD_FILE)
+    levels = tuple(LodLevel(**level) for level in stored["levels"])
+    check_record("levels", levels, tuple[LodLevel, ...])
+    # lod.json has distances for its own screen. Over its focal length they hold for any other.
+    focal = float(stored["config"]["screen_height"]) / 2 / math.tan(math.radians(float(stored["config"]["screen_fov_degrees"])) / 2)
+    names = " ".join("tree" if level.planes is None else str(level.planes) for level in levels)
+    files = tuple(check_file("levels of detail", folder / "levels" / level.file) for level in levels)
+    distances = tuple(level.distance_meters / focal for level in levels)
+    return DrawnModel(f"{folder.resolve().name}-levels", f"levels of detail: {names}", "levels", files, distances)

@@ -1,0 +1,186 @@
+"""Tables and pictures of frame times."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from bbfit.reporting.plots import write_figure
+from bbfit.reporting.sweep_tables import markdown
+
+ModelKind = Literal["mesh", "impostor", "levels"]
+"""One model, an octahedral impostor, or several levels of detail."""
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """The frame time of a field of one model."""
+
+    program: str
+    """The program that drew, with its version."""
+    model: str
+    """The model's short name."""
+    title: str
+    """What the model is, for the reader."""
+    kind: ModelKind
+    """What it consists of."""
+    tree_pixels: int
+    """Height of a tree in the picture, in pixels."""
+    count: int
+    """Number of trees."""
+    ms: float
+    """Median time of a frame in milliseconds."""
+    update_ms: float
+    """The part of it in which levels are chosen and trees are sorted."""
+    frames: int
+    """Number of frames of the median."""
+    calls: int
+    """Draw calls of a frame."""
+    triangles: int
+    """Triangles of a frame."""
+    fragments: float | None
+    """Fragments of these triangles, hidden and transparent ones included; ``None`` where they were not counted."""
+    card_bytes: int | None
+    """Bytes of vertices, indices, matrices and textures on the graphics card; ``None`` where they were not counted."""
+    file_bytes: int
+    """Bytes of the model's files."""
+    flip: float | None
+    """FLIP at this height in three.js, the mean over backgrounds and held-out views; 0 for the tree itself, ``None`` if not known."""
+    psnr: float | None
+    """PSNR in dB at this height; ``None`` for the tree itself, or if not known."""
+    error_pixels: float | None
+    """The height of the tree in the pictures of ``flip``, which is at most that in the views."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What drew the frames."""
+
+    processor: str
+    """The processor, with its number of cores."""
+    renderer: str
+    """What the browser says that it draws with."""
+    browser: str
+    """The browser and its version."""
+    picture: str
+    """Size and samples of the picture."""
+    load: float
+    """Mean number of other processes that wanted a core when the measurement began."""
+
+
+def frames_csv(rows: Sequence[FrameRow]) -> bytes:
+    """CSV with one line for each field."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([field.name for field in fields(FrameRow)])
+    writer.writerows([["" if value is None else value for value in vars(row).values()] for row in rows])
+    return text.getvalue().encode(errors="backslashreplace")
+
+
+def frames_json(rows: Sequence[FrameRow], machine: Machine) -> dict[str, Any]:
+    """The machine and all rows."""
+    return {"machine": asdict(machine), "rows": [asdict(row) for row in rows]}
+
+
+def frames_markdown(rows: Sequence[FrameRow], machine: Machine) -> str:
+    """A Markdown document: for each program and height a table of milliseconds by the number of trees, and what a tree costs."""
+    parts = [
+        "# Frame times",
+        f"Medians in milliseconds of frames that were drawn to their end, on {machine.processor}, by {machine.renderer} in "
+        f"{machine.browser}; {machine.picture}. {machine.load:.1f} other processes wanted a core when the measurement began. A dash is a "
+        "number of trees that was left out because fewer took too long. *Fragments* are those of a tree's triangles, hidden and "
+        "transparent ones included, in thousands. FLIP and PSNR are means over four backgrounds and held-out views, drawn by three.js at "
+        "this height, or at that of the views if they are smaller.",
+    ]
+    for program in dict.fromkeys(row.program for row in rows):
+        for pixels in dict.fromkeys(row.tree_pixels for row in rows):
+            of_field = [row for row in rows if (row.program, row.tree_pixels) == (program, pixels)]
+            counts = sorted({row.count for row in of_field})
+            head = [
+                "model",
+                *(f"{count:,}" for count in counts),
+                "FLIP",
+                "PSNR, dB",
+                "draw calls",
+                "triangles",
+                "fragments",
+                "MB on the card",
+            ]
+            table = [_line([row for row in of_field if row.model == name], counts) for name in dict.fromkeys(row.model for row in of_field)]
+            parts += [f"## {program}, {pixels} pixels high", markdown(head, table)]
+    return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
+
+
+def _line(rows: Sequence[FrameRow], counts: Sequence[int]) -> list[str]:
+    """A line of a table: the rows of one model by their numbers of trees."""
+    times, last = {row.count: row.ms for row in rows}, rows[-1]
+    return [
+        last.title,
+        *(f"{times[count]:,.1f}" if count in times else "-" for count in counts),
+        "" if last.flip is None else f"{last.flip:.4f}",
+        "" if last.psnr is None else f"{last.psnr:.2f}",
+        f"{last.calls:,}",
+        f"{last.triangles / last.count:,.0f}",
+        "" if last.fragments is None else f"{last.fragments / last.count / 1000:,.1f}",
+        "" if last.card_bytes is None else f"{last.card_bytes / 1e6:,.1f}",
+    ]
+
+
+def frames_plot(rows: Sequence[FrameRow], path: Path) -> None:
+    """Write a PNG with a panel for each height: FLIP against the time of a frame in three.js, and how it grows with the number of trees.
+
+    The upper row is at the largest number of trees that every model was drawn with. Without errors it is left out, and without rows no file
+    is written.
+    """
+    rows = [row for row in rows if row.program.startswith("three")] or list(rows)
+    if not rows:
+        return
+    from matplotlib.figure import Figure
+
+    heights, names = list(dict.fromkeys(row.tree_pixels for row in rows)), list(dict.fromkeys(row.model for row in rows))
+    scored = any(row.flip for row in rows)
+    figure = Figure(figsize=(7 * len(heights), 10 if scored else 5.5), dpi=100, layout="constrained")
+    panels = figure.subplots(1 + scored, len(heights), squeeze=False)
+    for column, pixels in enumerate(heights):
+        of_height = [row for row in rows if row.tree_pixels == pixels]
+        if scored:
+            _errors(panels[0][column], of_height, names, pixels)
+        _growth(panels[-1][column], of_height, names, pixels)
+    panels[-1][0].legend(fontsize=8, loc="upper left")
+    write_figure(figure, path)
+
+
+def _errors(axis: Any, rows: Sequence[FrameRow], names: Sequence[str], pixels: int) -> None:
+    counts = [{row.count for row in rows if row.model == name} for name in names if any(row.model == name for row in rows)]
+    count = max(set.intersection(*counts), default=min(row.count for row in rows))
+    for row in rows:
+        if row.count == count and row.flip is not None:
+            own = row.model.startswith("bbfit") or row.kind == "levels"
+            color = f"C{names.index(row.model) % 10}"
+            axis.scatter(row.ms, row.flip, s=120 if own else 50, marker="*" if own else "o", color=color, zorder=3)
+            axis.annotate(row.model, (row.ms, row.flip), (6, 4), textcoords="offset points", fontsize=8, color="#70767e")
+    axis.set_xscale("log")
+    axis.set_title(f"{count:,} trees, {pixels} pixels high", fontsize=10)
+    axis.set_xlabel("milliseconds a frame")
+    axis.set_ylabel("FLIP, mean over backgrounds, lower is better")
+    axis.margins(x=0.25)
+    axis.grid(alpha=0.3)
+
+
+def _growth(axis: Any, rows: Sequence[FrameRow], names: Sequence[str], pixels: int) -> None:
+    for number, name in enumerate(names):
+        times = [(row.count, row.ms) for row in rows if row.model == name]
+        if times:
+            own = name.startswith("bbfit") or rows[0].kind == "levels"
+            line = {"color": f"C{number % 10}", "linestyle": "-" if number < 10 else "--", "marker": "*" if own else "o"}
+            axis.plot(*zip(*times, strict=True), label=name, markersize=8 if own else 4, **line)
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    axis.set_title(f"trees of {pixels} pixels", fontsize=10)
+    axis.set_xlabel("number of trees")
+    axis.set_ylabel("milliseconds a frame")
+    axis.grid(alpha=0.3)
