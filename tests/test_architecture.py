@@ -56,7 +56,10 @@ def relative(path: Path) -> str:
 
 # Heavy or optional modules, and the only files that import them.
 ONLY_IN = {
-    "bpy": {f"blender/{name}.py" for name in ("worker", "worker_scene", "worker_glb", "worker_lights", "worker_thin", "worker_depth")},
+    "bpy": {
+        f"blender/{name}.py"
+        for name in ("worker", "worker_scene", "worker_glb", "worker_lights", "worker_thin", "worker_depth", "worker_field")
+    },
     "cv2": {"images.py", "fitting/bounds.py"},
     "xatlas": {"exporting/packing.py"},
     "warp": {

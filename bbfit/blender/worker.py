@@ -4,7 +4,8 @@ The parent starts this file by path. It imports only the files beside it, not bb
 lines of JSON. On standard input, the first line contains the settings. Each further line requests a picture. On standard output, the worker
 answers ``ready`` (followed by the vertices as raw float32 if the settings request them), then ``done`` for each picture. It answers
 ``refused`` with a reason if an input cannot be used. If the settings contain ``convert``, ``worker_glb.py`` writes the tree as a GLB file,
-and the worker answers ``converted`` or ``refused``. If they contain ``check``, it checks the device and the panorama without a tree, and
+and the worker answers ``converted`` or ``refused``. If they contain ``field``, ``worker_field.py`` plants copies of the tree, and the
+worker answers ``rendered`` with the costs of a picture. If they contain ``check``, it checks the device and the panorama without a tree, and
 answers ``usable`` or ``refused``. The output of Blender itself goes to standard error. Standard input ends when the
 parent closes it or dies. The worker then ends too, if need be in the middle of a render.
 
@@ -66,6 +67,9 @@ def main() -> NoReturn:
         if "convert" in settings:
             convert(settings, answer)
             os._exit(0)
+        if "field" in settings:
+            render_field(settings, answer)
+            os._exit(0)
         prepare(settings, answer)
         while True:
             frame = requests.get()
@@ -113,12 +117,28 @@ def convert(settings: dict[str, Any], answer: Any) -> None:
     answer("converted", **facts, triangles=count)
 
 
+def render_field(settings: dict[str, Any], answer: Any) -> None:
+    """Load the tree and render a field of copies of it."""
+    field, frame = import_beside("worker_field"), settings["field"]["frame"]
+    THIN.read_transmission()
+    SCENE.open_tree(settings["tree"], settings["files"])
+    field.plant(settings["field"]["matrices"])
+    set_up(settings)
+    answer("rendered", **field.timed(lambda: render(frame, settings)))
+
+
 def prepare(settings: dict[str, Any], answer: Any) -> None:
     """Load the tree, set up light, camera and renderer, and report the measurements of the tree."""
-    import bpy
-
     THIN.read_transmission()
     points, facts = SCENE.open_tree(settings["tree"], settings["files"])
+    set_up(settings)
+    answer("ready", **facts, payload=points.tobytes() if settings["measure"] else b"")
+
+
+def set_up(settings: dict[str, Any]) -> None:
+    """Set up light, camera and renderer for the loaded scene."""
+    import bpy
+
     add_light(settings)
     set_up_cycles(settings)
     if settings["suns"]:
@@ -126,7 +146,6 @@ def prepare(settings: dict[str, Any], answer: Any) -> None:
     camera = bpy.data.objects.new("bbfit camera", bpy.data.cameras.new("bbfit camera"))
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
-    answer("ready", **facts, payload=points.tobytes() if settings["measure"] else b"")
 
 
 def add_light(settings: dict[str, Any]) -> None:

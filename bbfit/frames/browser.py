@@ -26,7 +26,7 @@ _SCRIPTS = (("bbfit.frames", "page"), ("bbfit.exporting", "lod_programs"), ("bbf
 
 
 class FieldPage:
-    """A page with a program; :func:`open_pages` opens it. Each method calls the function of this name in ``page/frames.js``."""
+    """A page with a program; :func:`open_pages` opens it. ``page/frames.js`` has its functions."""
 
     def __init__(self, thread: ThreadPoolExecutor, browser: Any, program: Program, modules: Path) -> None:
         """Open the page of a program."""
@@ -47,9 +47,9 @@ class FieldPage:
             reason = (self._errors or str(error).splitlines())[-1]
             raise InputError(f"frames: the browser cannot draw ({reason}); try fewer trees or pixels") from error
 
-    def close(self) -> None:
-        """Close the page."""
-        self._thread.submit(self._page.close).result()
+    def picture(self) -> bytes:
+        """The PNG of what the page shows."""
+        return bytes(self._thread.submit(lambda: self._page.locator("canvas").screenshot(type="png")).result())
 
     def _open(self, browser: Any, program: Program) -> Any:
         page = browser.new_page()
@@ -94,7 +94,7 @@ def open_pages(config: FramesConfig) -> Iterator[Mapping[Program, FieldPage]]:
         try:
             browser = thread.submit(lambda: driver.chromium.launch(executable_path=executable, args=flags)).result()
             try:
-                yield {program: FieldPage(thread, browser, program, modules) for program in config.programs}
+                yield {program: FieldPage(thread, browser, program, modules) for program in config.programs if PACKAGES[program]}
             finally:
                 thread.submit(browser.close).result()
         finally:

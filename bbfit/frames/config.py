@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 from bbfit.checks import Count, Range, check_fields, fail
 from bbfit.provenance import EXECUTION
 
-Program = Literal["three", "babylon"]
-PACKAGES: dict[Program, tuple[str, ...]] = {"three": ("three",), "babylon": ("@babylonjs/core", "@babylonjs/loaders")}
+Program = Literal["three", "babylon", "cycles"]
+PACKAGES: dict[Program, tuple[str, ...]] = {"three": ("three",), "babylon": ("@babylonjs/core", "@babylonjs/loaders"), "cycles": ()}
 """The packages of npm that the page of each program needs."""
 
 
@@ -25,7 +25,11 @@ class FramesConfig:
     longest_ms: Annotated[float, Range(0, 600_000, open_low=True)] = 2000.0
     """Time of a frame in milliseconds after which larger numbers of trees are left out."""
     programs: tuple[Program, ...] = ("three", "babylon")
-    """Programs that draw."""
+    """Programs that draw. cycles is Blender's renderer, whose pictures take seconds; it needs the extra blender."""
+    cycles_counts: tuple[Count, ...] = (1, 100, 10_000)
+    """Numbers of trees in the pictures of Cycles."""
+    samples: Count = 16
+    """Samples a pixel in the pictures of Cycles."""
     width: Count = 1280
     """Width of the picture in pixels."""
     height: Count = 720
@@ -49,7 +53,7 @@ class FramesConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name in ("tree_heights", "counts", "programs"):
+        for name in ("tree_heights", "counts", "cycles_counts", "programs"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
                 fail(name, f"expected one or more different ones, got {list(values)}")

@@ -6,9 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from bbfit.frames.config import FramesConfig
+from bbfit.geometry.camera import Camera, look_at
 
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 """The lowest and the highest corner of a tree in meters, Y up."""
@@ -24,6 +26,14 @@ class Field:
     """Height of the picture in meters."""
     reach: float
     """Distance of the camera from the origin in meters; nothing is farther away from the origin."""
+
+    def camera(self, size: int, elevation_degrees: float) -> Camera:
+        """The camera, with the middle of the picture as a square of ``size`` x ``size`` pixels."""
+        angle = math.radians(elevation_degrees)
+        position = torch.tensor([[0.0, math.sin(angle), math.cos(angle)]], dtype=torch.float64) * self.reach
+        scale, middle = size / self.meters_high, (size - 1) / 2
+        intrinsics = torch.tensor([[[scale, 0, middle], [0, scale, middle], [0, 0, 1]]], dtype=torch.float64)
+        return Camera(look_at(position, torch.zeros(3, dtype=torch.float64)), intrinsics, size, size, orthographic=True)[0]
 
 
 def planted(bounds: Bounds, tree_pixels: int, count: int, config: FramesConfig) -> Field:

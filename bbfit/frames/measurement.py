@@ -7,14 +7,17 @@ import math
 import os
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+from bbfit.blender.config import ViewsConfig
+from bbfit.blender.fields import render_field
 from bbfit.checks import check_record, fail
+from bbfit.exporting.lod import glb_counts
 from bbfit.files import read_json, write_bytes, write_json
 from bbfit.frames.browser import FieldPage, open_pages
 from bbfit.frames.config import FramesConfig, Program
@@ -25,6 +28,7 @@ from bbfit.inputs import InputLimits, reading
 from bbfit.outputs import claimed_folder, output_folder
 from bbfit.provenance import digest_file
 from bbfit.reporting.frame_tables import FrameRow, Machine, frames_csv, frames_json, frames_markdown, frames_plot
+from bbfit.scratch import ScratchFolder
 from bbfit.stages.stage import OnProgress, Record, Stage, silent
 from bbfit.stages.trees import convert_stage
 from bbfit.tree_files.tree_file import TreeFile
@@ -135,16 +139,18 @@ class _Fields:
         model, config, rows = self._model, self._config, list[FrameRow]()
         files = [digest_file(file) for file in model.files]
         renderer = (self._machine.processor, self._machine.renderer, self._machine.browser)
-        for program, page in self._pages.items():
+        for program in config.programs:
             if program != "three" and model.kind != "mesh":
                 continue
             for pixels in config.tree_heights:
                 error = self._error(pixels, files)
-                name = f"fields/{program}_{model.name}_{pixels}.json"
-                inputs = (files, model.distances, self._bounds, _fields_of(config), pixels, renderer)
-                work = partial(self._measure, page, program, pixels, self._record.folder / name, on_progress)
-                self._record.run(Stage(f"{program} {model.name} {pixels}", inputs, (name,), work, algorithm="frames"))
-                rows += [FrameRow(**(row | error)) for row in self._stored(name)]
+                name = f"fields/{program}_{model.name}_{pixels}"
+                inputs = (files, model.distances, self._bounds, _fields_of(config, program), pixels, renderer)
+                measure = self._render if program == "cycles" else partial(self._measure, program)
+                work = partial(self._store, name, partial(measure, pixels, on_progress))
+                outputs = (f"{name}.json", f"{name}.png")
+                self._record.run(Stage(f"{program} {model.name} {pixels}", inputs, outputs, work, algorithm="frames"))
+                rows += [FrameRow(**(row | error)) for row in self._stored(f"{name}.json")]
         return rows
 
     def _error(self, pixels: int, files: list[str]) -> dict[str, float | None]:
@@ -171,51 +177,56 @@ class _Fields:
             check_record("error", error, SizeError)
         return {"flip": error.flip, "psnr": error.psnr, "error_pixels": error.tree_pixels}
 
-    def _measure(
-        self, page: FieldPage, program: Program, pixels: int, path: Path, report: OnProgress, on_progress: OnProgress = silent
-    ) -> None:
-        """Draw more and more trees of a height until a frame takes too long, and store the rows."""
-        model, config, rows = self._model, self._config, list[dict[str, Any]]()
+    def _store(self, name: str, measure: Callable[[], tuple[list[dict[str, Any]], bytes]], _: OnProgress = silent) -> None:
+        """Store the rows of a program and height, and a picture of the field with the fewest trees."""
+        rows, picture = measure()
+        write_bytes(self._record.folder / f"{name}.png", picture)
+        write_json(self._record.folder / f"{name}.json", rows)
+
+    def _measure(self, program: Program, pixels: int, report: OnProgress) -> tuple[list[dict[str, Any]], bytes]:
+        """Draw more and more trees of a height until a frame takes too long."""
+        page, model, config = self._pages[program], self._model, self._config
         self._load(page)
-        version = page.call("machine")["version"]
+        version, rows, picture = page.call("machine")["version"], list[dict[str, Any]](), b""
         for number, count in enumerate(config.counts):
             report(f"{model.name}, {pixels} px, {program}", number, len(config.counts), f"{count:,} trees")
             field = planted(self._bounds, pixels, count, config)
             page.answers["matrices.bin"] = field.matrices.tobytes()
-            page.call(
-                "plant",
-                {
-                    "matrices": f"/matrices.bin?{count}-{pixels}",
-                    "width": config.width,
-                    "height": config.height,
-                    "metersHigh": field.meters_high,
-                    "elevation": math.radians(config.elevation_degrees),
-                    "reach": field.reach,
-                },
-            )
+            camera = {"metersHigh": field.meters_high, "elevation": math.radians(config.elevation_degrees), "reach": field.reach}
+            size = {"width": config.width, "height": config.height}
+            page.call("plant", {"matrices": f"/matrices.bin?{count}-{pixels}", **camera, **size})
             found = page.call("measure", {"frames": config.frames, "seconds": config.seconds, "longest_ms": config.longest_ms})
-            rows.append(
-                {
-                    "program": version,
-                    "model": model.name,
-                    "title": model.title,
-                    "kind": model.kind,
-                    "tree_pixels": pixels,
-                    "count": count,
-                    "ms": median(found["times"]),
-                    "update_ms": median(found["updates"]),
-                    "frames": len(found["times"]),
-                    "calls": found["calls"],
-                    "triangles": int(found["triangles"]),
-                    "fragments": page.call("fragments") if found["times"][0] < config.longest_ms else None,
-                    "card_bytes": found["bytes"],
-                    "file_bytes": model.bytes,
-                }
-            )
-            if rows[-1]["ms"] > config.longest_ms:
+            picture = picture or page.picture()
+            figures = {"ms": median(found["times"]), "update_ms": median(found["updates"]), "frames": len(found["times"])}
+            drawn = {"calls": found["calls"], "triangles": int(found["triangles"]), "card_bytes": found["bytes"]}
+            fragments = page.call("fragments") if found["times"][0] < config.longest_ms else None
+            rows.append(self._row(version, pixels, count, figures | drawn | {"fragments": fragments}))
+            if figures["ms"] > config.longest_ms:
                 break
         report(f"{model.name}, {pixels} px, {program}", len(config.counts), len(config.counts))
-        write_json(path, rows)
+        return rows, picture
+
+    def _render(self, pixels: int, report: OnProgress) -> tuple[list[dict[str, Any]], bytes]:
+        """Render fields with Cycles. Its pictures are square, and as high as those of the others."""
+        (model,), config, rows = self._model.files, self._config, list[dict[str, Any]]()
+        triangles, picture = glb_counts(model.read_bytes())[1], b""
+        with ScratchFolder() as scratch:
+            for number, count in enumerate(config.cycles_counts):
+                report(f"{self._model.name}, {pixels} px, Cycles", number, len(config.cycles_counts), f"{count:,} trees")
+                field = planted(self._bounds, pixels, count, config)
+                camera = field.camera(config.height, config.elevation_degrees)
+                views = ViewsConfig(samples=config.samples)
+                cost = render_field(model, field.matrices, camera, 2 * field.reach, scratch / "field.png", views)
+                picture = picture or (scratch / "field.png").read_bytes()
+                figures = {"ms": 1000 * cost.seconds, "update_ms": 0.0, "frames": 1, "calls": 0, "triangles": triangles * count}
+                rows.append(self._row("Cycles", pixels, count, figures | {"card_bytes": cost.bytes, "fragments": None}))
+        report(f"{self._model.name}, {pixels} px, Cycles", len(config.cycles_counts), len(config.cycles_counts))
+        return rows, picture
+
+    def _row(self, program: str, pixels: int, count: int, figures: dict[str, Any]) -> dict[str, Any]:
+        model = self._model
+        known = {"model": model.name, "title": model.title, "kind": model.kind, "file_bytes": model.bytes}
+        return {"program": program, "tree_pixels": pixels, "count": count} | known | figures
 
     def _stored(self, name: str) -> list[dict[str, Any]]:
         path = self._record.folder / name
@@ -237,8 +248,10 @@ class _Fields:
         self._loaded = page
 
 
-def _fields_of(config: FramesConfig) -> tuple[Any, ...]:
+def _fields_of(config: FramesConfig, program: Program) -> tuple[Any, ...]:
     """The options that a frame time depends on."""
+    if program == "cycles":
+        return (config.cycles_counts, config.samples, config.height, config.elevation_degrees, config.seed)
     size = (config.width, config.height, config.elevation_degrees, config.seed)
     return (config.counts, config.longest_ms, config.frames, config.seconds, *size, config.graphics_card)
 
@@ -267,10 +280,10 @@ def _machine(pages: Mapping[Program, FieldPage], config: FramesConfig) -> Machin
         _log.warning(
             "other processes use the processor (a load of %.1f); frame times are those of an idle machine only if it is idle", load
         )
-    page = next(iter(pages.values()))
-    found = page.call("machine")
     picture = f"{config.width} x {config.height} pixels, up to 4 samples a pixel"
-    return Machine(f"{_processor()}, {cores} cores", found["renderer"], page.browser, picture, load)
+    page = next(iter(pages.values()), None)
+    renderer, browser = ("", "") if page is None else (page.call("machine")["renderer"], page.browser)
+    return Machine(f"{_processor()}, {cores} cores", renderer, browser, picture, load)
 
 
 def _processor() -> str:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from billboard_scene import crossing_billboards, write_views
+from PIL import Image
 
 import bbfit.frames.measurement as measurement
 from bbfit.exporting.config import ExportConfig
@@ -21,6 +22,7 @@ from bbfit.frames.errors import size_error
 from bbfit.frames.measurement import measure_frames
 from bbfit.frames.models import DrawnModel
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.images import read_rgba
 
 NODE = Path(__file__).parents[1] / "node" / "node_modules"
 QUICK = FramesConfig((40, 20), (1, 6), width=200, height=120, frames=2, seconds=0.0, elevation_degrees=5.0, node_modules=NODE)
@@ -56,6 +58,10 @@ def test_both_programs_draw_all_copies_and_only_once(run_folder: Path, tmp_path:
         assert row.card_bytes is not None and row.card_bytes > 0
     # Copies of half the height have a quarter of the fragments.
     assert result.rows[1].fragments == pytest.approx(4 * (result.rows[3].fragments or 0), rel=0.1)
+
+    colors = np.asarray(Image.open(tmp_path / "fields" / f"three_{run_folder.name}_40.png").convert("RGB")).reshape(-1, 3)
+    orange = (np.abs(colors.astype(int) - [204, 102, 51]) < 12).all(-1).sum()  # of one copy, of 2 to 2.8 meters by 3
+    assert 0.8 * 2 / 3 * 40**2 < orange < 1.1 * 2 / 3 * 2**0.5 * 40**2
 
     assert {path.name for path in tmp_path.glob("frames.*")} == {"frames.csv", "frames.json", "frames.md", "frames.png"}
     assert len((tmp_path / "frames.csv").read_text().splitlines()) == 9
@@ -116,3 +122,15 @@ def test_the_coarser_level_is_drawn_at_the_smaller_size(tmp_path: Path) -> None:
     large, small = measure_frames([tmp_path / "oak"], tmp_path / "out", config).rows
     assert (large.triangles, small.triangles) == (5 * 8, 5 * 4)
     assert (large.calls, small.calls) == (1, 1)
+
+
+def test_cycles_renders_all_copies_of_a_model_that_is_in_memory_once(run_folder: Path, tmp_path: Path) -> None:
+    config = replace(QUICK, programs=("cycles",), cycles_counts=(1, 40), samples=1, tree_heights=(40,))
+    one, many = measure_frames([run_folder], tmp_path, config).rows
+    assert (one.triangles, many.triangles) == (4, 160)
+    assert 0 < one.ms and one.card_bytes is not None and many.card_bytes is not None
+    assert 50e6 < one.card_bytes < many.card_bytes + 50e6 < one.card_bytes + 150e6
+    picture = read_rgba(tmp_path / "fields" / f"cycles_{run_folder.name}_40.png")
+    rows, columns = np.nonzero(picture[..., 3] > 128)
+    assert picture.shape == (120, 120, 4)
+    assert np.ptp(rows) + 1 == pytest.approx(40, abs=4) and 2 / 3 * 40 - 4 < np.ptp(columns) + 1 < 2 / 3 * 40 * 2**0.5 + 4
