@@ -5,8 +5,8 @@ lines of JSON. On standard input, the first line contains the settings. Each fur
 answers ``ready`` (followed by the vertices as raw float32 if the settings request them), then ``done`` for each picture. It answers
 ``refused`` with a reason if an input cannot be used. If the settings contain ``convert``, ``worker_glb.py`` writes the tree as a GLB file,
 and the worker answers ``converted`` or ``refused``. If they contain ``field``, ``worker_field.py`` plants copies of the tree, and the
-worker answers ``rendered`` with the costs of a picture. If they contain ``check``, it checks the device and the panorama without a tree, and
-answers ``usable`` or ``refused``. The output of Blender itself goes to standard error. Standard input ends when the
+worker answers ``rendered`` with the costs of a picture. If they contain ``check``, it checks the device and the panorama without a tree,
+and answers ``usable`` or ``refused``. The output of Blender itself goes to standard error. Standard input ends when the
 parent closes it or dies. The worker then ends too, if need be in the middle of a render.
 
 One process renders one picture at a time, because two simultaneous renders crash Blender.

@@ -60,8 +60,8 @@ def test_both_programs_draw_all_copies_and_only_once(run_folder: Path, tmp_path:
     assert result.rows[1].fragments == pytest.approx(4 * (result.rows[3].fragments or 0), rel=0.1)
 
     colors = np.asarray(Image.open(tmp_path / "fields" / f"three_{run_folder.name}_40.png").convert("RGB")).reshape(-1, 3)
-    orange = (np.abs(colors.astype(int) - [204, 102, 51]) < 12).all(-1).sum()  # of one copy, of 2 to 2.8 meters by 3
-    assert 0.8 * 2 / 3 * 40**2 < orange < 1.1 * 2 / 3 * 2**0.5 * 40**2
+    orange = (np.abs(colors.astype(int) - [204, 102, 51]) < 30).all(-1).sum()  # of one copy, of 2 to 2.8 meters by 3
+    assert 0.75 * 2 / 3 * 40**2 < orange < 1.1 * 2 / 3 * 2**0.5 * 40**2
 
     assert {path.name for path in tmp_path.glob("frames.*")} == {"frames.csv", "frames.json", "frames.md", "frames.png"}
     assert len((tmp_path / "frames.csv").read_text().splitlines()) == 9

@@ -13,7 +13,10 @@ THREE.ShaderChunk.alphatest_fragment = THREE.ShaderChunk.alphatest_fragment.repl
   "smoothstep( alphaTest, alphaTest + fwidth( diffuseColor.a ), diffuseColor.a )",
   "clamp( ( diffuseColor.a - alphaTest ) / max( fwidth( diffuseColor.a ), 0.0001 ) + 0.5, 0.0, 1.0 )",
 );
-const renderer = new THREE.WebGLRenderer({ canvas: sized(1, 1), antialias: true, preserveDrawingBuffer: true });
+// Without alpha of its own: what alpha to coverage writes there would let the page through.
+const canvas = sized(1, 1);
+const context = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true });
+const renderer = new THREE.WebGLRenderer({ canvas, context });
 renderer.setPixelRatio(1);
 renderer.toneMapping = THREE.NoToneMapping;
 const gl = renderer.getContext();
