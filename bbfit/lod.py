@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import glob
 import math
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
+
 from bbfit.blender.requirements import check_blender
 from bbfit.checks import check_output_file, check_record, fail
-from bbfit.evaluation.color_error import mean_color_error, share_within
-from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
+from bbfit.evaluation.switching import Switch, mesh_cost, switches
 from bbfit.exporting.config import ExportConfig, LodConfig
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.lod_files import LOD_FILE, level_file, lod_document, program_file_names, program_files
@@ -23,6 +24,7 @@ from bbfit.outputs import claimed_folder, output_folder, used_folder
 from bbfit.pipeline import RunConfig, RunResult, needs_blender, run
 from bbfit.provenance import digest_file
 from bbfit.reporting.plots import lod_picture
+from bbfit.rivals.baking import tree_triangles
 from bbfit.stages.results import export_config
 from bbfit.stages.stage import OnProgress, Record, Stage, silent
 from bbfit.stages.trees import convert_stage, views_stage
@@ -67,7 +69,8 @@ def build_lod(
     its silhouette in the worst training view, in meters at the tree's axis, with a margin for the views in between. In pixels, it is
     inversely proportional to the distance. The colors must look the same too: their mean error at the size on the screen
     (:func:`~bbfit.evaluation.color_error.mean_color_error`) is at most ``config.color_error`` in the training views. No level is shown
-    larger than the views of its fit. The textures of a level have the resolution of the screen at its distance. The default format of
+    larger than the views of its fit. With ``config.fragments_per_triangle`` it must also draw faster there
+    (:mod:`bbfit.evaluation.switching`). The textures of a level have the resolution of the screen at its distance. The default format of
     textures is ``auto``: KTX2 with mip levels if its encoder is installed, and PNG; for PlayCanvas it is PNG.
 
     A killed build continues where it stopped. Stages with current results are skipped.
@@ -142,24 +145,29 @@ def _join_stage(
     def work(on_progress: OnProgress) -> None:
         steps = 2 * len(runs) + 1
         on_progress("join", 0, steps)
-        switches = _switches(views, runs, config, lambda done: on_progress("join", done, steps))
+        clouds, cost = [fitted.cloud for fitted in runs], None
+        if original and config.fragments_per_triangle is not None:
+            cost = mesh_cost(torch.tensor(tree_triangles(original)), views.train)
+        found = switches(views, clouds, config, export, tree=cost, on_level=lambda done: on_progress("join", done, steps))
+        kept = [(fitted, switch) for fitted, switch in zip(runs, found, strict=True) if switch]
         models, shipped = [original.read_bytes()] if original else [], list[ShippedModel]()
-        for number, (fitted, switch) in enumerate(zip(runs, switches, strict=True), 1 + len(runs)):
-            shipped.append(shipped_model(fitted.cloud, export, switch.halvings))
+        for number, (fitted, switch) in enumerate(kept, 1 + len(runs)):
+            own = export if switch.outline is None else replace(export, outline=switch.outline)
+            shipped.append(shipped_model(fitted.cloud, own, switch.halvings))
             models.append(shipped[-1].glb)
             on_progress("join", number, steps)
-        if original:
-            switches.insert(0, _Switch())
-        fits = [None] * (len(models) - len(runs)) + runs
-        levels = _levels(views, models, fits, switches, config, out.stem)
+        fits: list[tuple[RunResult | None, Switch]] = [(None, Switch(cost=cost))] if original else []
+        levels = _levels(views, models, [*fits, *kept], config, out.stem)
         document = lod_document(out.stem, levels, config, _bounds(views))
+        for file in (folder / LEVELS).glob(level_file(glob.escape(out.stem), "*")):  # of an earlier build with more levels
+            file.unlink()
         for level, model in zip(levels, models, strict=True):
             write_bytes(folder / LEVELS / level.file, model)
         for name, data in program_files(export.profile, document).items():
             write_bytes(folder / LEVELS / name, data)
         write_json(folder / LEVELS / LOD_FILE, document)
         write_bytes(out, lod_glb(models, levels, export.profile))
-        lod_picture(list(zip(levels[-len(shipped) :], shipped, strict=True)), views.test, folder / "lod.png")
+        lod_picture(list(zip(levels[len(levels) - len(shipped) :], shipped, strict=True)), views.test, folder / "lod.png")
         on_progress("join", steps, steps)
 
     clouds = [digest_file(fitted.folder / name) for fitted in runs for name in ("cloud.safetensors", "metrics.json")]
@@ -168,27 +176,9 @@ def _join_stage(
 
 
 def _outputs(out: Path, folder: Path, config: LodConfig, export: ExportConfig) -> tuple[str, ...]:
-    levels = [level_file(out.stem, number) for number in range(config.original + len(config.planes))]
-    shipped = (LOD_FILE, *levels, *program_file_names(export.profile, out.stem))
+    levels = level_file(glob.escape(out.stem), "*")
+    shipped = (LOD_FILE, levels, *program_file_names(export.profile, out.stem))
     return ("lod.png", *(f"{LEVELS}/{name}" for name in shipped), os.path.relpath(out, folder))
-
-
-@dataclass(frozen=True)
-class _Switch:
-    """The scale at which a level replaces the next finer one. The defaults are those of the tree itself."""
-
-    scale: float = math.inf
-    """The level is shown below this scale, in pixels per meter on the screen. Infinity for the finest level."""
-    silhouette_scale: float = math.inf
-    """The scale below which the error of its silhouette is within the bound."""
-    color_scale: float = math.inf
-    """The scale below which the error of its colors is."""
-    errors: tuple[float, float] = (0.0, 0.0)
-    """The error of its silhouette in the worst training view and in the worst held-out view, in meters."""
-    color_errors: tuple[float, float] = (0.0, 0.0)
-    """The mean error of its colors at ``scale`` in the training views and in the held-out views."""
-    halvings: int = 0
-    """How many times its textures can be halved and still have a texel for each pixel at that scale."""
 
 
 def _fitted(folder: Path, stages: RunConfig, planes: int, on_progress: OnProgress) -> RunResult:
@@ -212,25 +202,6 @@ def _converts(tree: TreeFile, config: LodConfig) -> bool:
     return config.original and not (config.triangles is None and is_self_contained(tree.path))
 
 
-def _switches(views: ViewDataset, runs: list[RunResult], config: LodConfig, on_level: Callable[[int], None]) -> list[_Switch]:
-    """The switch of each run. The first one has an infinite scale if it is the finest level."""
-    view_scale = float(pixels_per_meter(views.train.cameras))
-    switches, splits = list[_Switch](), (views.train, views.test)
-    for fitted in runs:
-        draw = shipped_model(fitted.cloud).draw
-        error, held_out_error = (worst_silhouette(fitted.cloud, split) / view_scale for split in splits)
-        silhouette = scale_within(error, config.error_pixels)
-        color = view_scale * share_within(draw, views.train, config.color_error)
-        scale = min([view_scale, silhouette, color, *(switch.scale for switch in switches)])
-        colors, held_out_colors = (mean_color_error(draw, split, scale / view_scale) for split in splits)
-        halvings = max(0, math.floor(math.log2(fitted.cloud.texel_density / scale)))
-        switches.append(_Switch(scale, silhouette, color, (error, held_out_error), (colors, held_out_colors), halvings))
-        on_level(len(switches))
-    if not config.original:
-        switches[0] = replace(switches[0], scale=math.inf, halvings=0)
-    return switches
-
-
 def _bounds(views: ViewDataset) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """The tree's lowest and highest corner in meters."""
     assert views.request and views.request.tree.bounds
@@ -238,16 +209,16 @@ def _bounds(views: ViewDataset) -> tuple[tuple[float, float, float], tuple[float
 
 
 def _levels(
-    views: ViewDataset, models: list[bytes], fits: list[RunResult | None], switches: list[_Switch], config: LodConfig, name: str
+    views: ViewDataset, models: list[bytes], fits: list[tuple[RunResult | None, Switch]], config: LodConfig, name: str
 ) -> tuple[LodLevel, ...]:
     """The measurements of the levels."""
     view_scale = float(pixels_per_meter(views.train.cameras))
     low, high = _bounds(views)
     height, radius = high[1] - low[1], math.dist(low, high) / 2
     focal = config.screen_height / 2 / math.tan(math.radians(config.screen_fov_degrees) / 2)
-    next_scales = [*(switch.scale for switch in switches[1:]), 0.0]
+    next_scales = [*(switch.scale for _, switch in fits[1:]), 0.0]
     levels = list[LodLevel]()
-    for model, fitted, switch, next_scale in zip(models, fits, switches, next_scales, strict=True):
+    for model, (fitted, switch), next_scale in zip(models, fits, next_scales, strict=True):
         vertices, triangles = glb_counts(model)
         largest_scale = min(switch.scale, view_scale)
         levels.append(
@@ -269,6 +240,8 @@ def _levels(
                 color_distance_meters=focal / switch.color_scale,
                 color_error=switch.color_errors[0],
                 held_out_color_error=switch.color_errors[1],
+                speed_distance_meters=focal / switch.faster_scale,
+                fragments=None if switch.cost is None else switch.cost.fragments * largest_scale**2,
             )
         )
     return tuple(levels)

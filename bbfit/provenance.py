@@ -26,7 +26,7 @@ VERSIONS: Mapping[str, int] = {
     "export": 14,
     "evaluate": 16,
     "report": 8,
-    "lod": 6,
+    "lod": 7,
     "compare": 6,
     "frames": 1,
 }

@@ -156,4 +156,7 @@ def frames_command(
         result = measure_frames(sources, out, frames, tree=tree, limits=limits, on_progress=on_progress)
     for table in frames_table(result.rows):
         out_console.print(table)
+    for cost in result.costs:
+        if cost.fragments_per_triangle is not None:
+            out_console.print(f"{cost.program}: a triangle takes as long as {cost.fragments_per_triangle:.2g} fragments", soft_wrap=True)
     out_console.print(f"in {result.folder}: frames.md, frames.csv, frames.json, frames.png", soft_wrap=True)

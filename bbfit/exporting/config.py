@@ -181,6 +181,10 @@ class LodConfig:
     """Keep the tree itself as the finest level."""
     triangles: Count | None = None
     """Triangles to which Blender decimates the tree itself. Default: all of them stay."""
+    fragments_per_triangle: Annotated[float, Range(0, 1e6)] | None = None
+    """How many pixels of triangles (fragments) are shaded in the time that a triangle takes; bbfit frames measures it.
+    A level then takes over only where it also draws faster, with the outline that draws fastest there.
+    A level that nowhere draws faster is left out. Default: the errors alone count."""
     screen_width: Count = 1920
     """Width in pixels of the screen for which distances and screen coverages are computed."""
     screen_height: Count = 1080

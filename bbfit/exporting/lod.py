@@ -52,6 +52,10 @@ class LodLevel:
     """Mean error of its colors in the training views where the level takes over, in [0, 1]; 0 for the tree itself."""
     held_out_color_error: float
     """The same error in the held-out views."""
+    speed_distance_meters: float = 0.0
+    """Distance from which it draws faster than the level before it; 0 where that does not count."""
+    fragments: float | None = None
+    """Fragments of a picture of it where it takes over, hidden and transparent ones included; ``None`` where that does not count."""
 
 
 def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel], profile: str | None = None) -> bytes:

@@ -50,8 +50,8 @@ def lod_document(
     }
 
 
-def level_file(name: str, number: int) -> str:
-    """The name of a level's own file; Unity's importers know levels by such names."""
+def level_file(name: str, number: int | str) -> str:
+    """The name of a level's own file; Unity's importers know levels by such names. ``number`` may be ``*``, for all of them."""
     return f"{name}_LOD{number}.glb"
 
 

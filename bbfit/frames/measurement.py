@@ -21,13 +21,14 @@ from bbfit.exporting.lod import glb_counts
 from bbfit.files import read_json, write_bytes, write_json
 from bbfit.frames.browser import FieldPage, open_pages
 from bbfit.frames.config import FramesConfig, Program
+from bbfit.frames.costs import frame_costs
 from bbfit.frames.errors import SizeError, size_error
 from bbfit.frames.fields import Bounds, planted
 from bbfit.frames.models import DrawnModel, drawn_models
 from bbfit.inputs import InputLimits, reading
 from bbfit.outputs import claimed_folder, output_folder
 from bbfit.provenance import digest_file
-from bbfit.reporting.frame_tables import FrameRow, Machine, frames_csv, frames_json, frames_markdown, frames_plot
+from bbfit.reporting.frame_tables import FrameCosts, FrameRow, Machine, frames_csv, frames_json, frames_markdown, frames_plot
 from bbfit.scratch import ScratchFolder
 from bbfit.stages.stage import OnProgress, Record, Stage, silent
 from bbfit.stages.trees import convert_stage
@@ -48,6 +49,8 @@ class FramesResult:
     """The folder with the tables and the picture."""
     rows: tuple[FrameRow, ...]
     """One row for each field that was drawn."""
+    costs: tuple[FrameCosts, ...]
+    """What the frames of each program take time for (:func:`~bbfit.frames.costs.frame_costs`)."""
     machine: Machine
 
 
@@ -107,14 +110,16 @@ def measure_frames(
         programs = list(dict.fromkeys(row.program for row in rows))
         rows.sort(key=lambda row: (programs.index(row.program), config.tree_heights.index(row.tree_pixels)))
 
+        costs = frame_costs(rows)
+
         def write_tables(on_progress: OnProgress) -> None:
             write_bytes(folder / "frames.csv", frames_csv(rows))
-            write_json(folder / "frames.json", frames_json(rows, machine))
-            write_bytes(folder / "frames.md", frames_markdown(rows, machine).encode(errors="backslashreplace"))
+            write_json(folder / "frames.json", frames_json(rows, costs, machine))
+            write_bytes(folder / "frames.md", frames_markdown(rows, costs, machine).encode(errors="backslashreplace"))
             frames_plot(rows, folder / "frames.png")
 
         record.run(Stage("tables", ([asdict(row) for row in rows], asdict(machine)), _TABLES, write_tables, algorithm="frames"))
-    return FramesResult(folder, tuple(rows), machine)
+    return FramesResult(folder, tuple(rows), costs, machine)
 
 
 class _Fields:

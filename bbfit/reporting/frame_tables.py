@@ -72,6 +72,45 @@ class Machine:
     """Mean number of other processes that wanted a core when the measurement began."""
 
 
+@dataclass(frozen=True)
+class FrameCosts:
+    """What the frames of a program take time for."""
+
+    program: str
+    """The program that drew, with its version."""
+    tree_ns: float
+    """Nanoseconds of a tree, whatever it consists of."""
+    triangle_ns: float
+    """Nanoseconds of a triangle."""
+    fragment_ns: float
+    """Nanoseconds of a fragment, whether it is hidden or not."""
+    error: float
+    """Median relative error of the frames' times that these three explain."""
+    fields: int
+    """Number of fields that they were found from."""
+
+    @property
+    def fragments_per_triangle(self) -> float | None:
+        """Fragments that take as long as a triangle; ``None`` where fragments take no time."""
+        return self.triangle_ns / self.fragment_ns if self.fragment_ns else None
+
+
+def fastest(rows: Sequence[FrameRow]) -> set[str]:
+    """The models of one program and height that no other model beats in both time and FLIP, at the largest number of trees of all models.
+
+    A model that is as good in one and better in the other beats it too. Models without FLIP do not take part.
+    """
+    scored = [row for row in rows if row.flip is not None]
+    counts = [{row.count for row in scored if row.model == name} for name in {row.model for row in scored}]
+    count = max(set.intersection(*counts), default=None) if counts else None
+    points = {row.model: (row.ms, row.flip or 0.0) for row in scored if row.count == count}
+
+    def beaten(own: tuple[float, float]) -> bool:
+        return any(all(a <= b for a, b in zip(other, own, strict=True)) and other != own for other in points.values())
+
+    return {name for name, point in points.items() if not beaten(point)}
+
+
 def frames_csv(rows: Sequence[FrameRow]) -> bytes:
     """CSV with one line for each field."""
     text = io.StringIO()
@@ -81,21 +120,26 @@ def frames_csv(rows: Sequence[FrameRow]) -> bytes:
     return text.getvalue().encode(errors="backslashreplace")
 
 
-def frames_json(rows: Sequence[FrameRow], machine: Machine) -> dict[str, Any]:
-    """The machine and all rows."""
-    return {"machine": asdict(machine), "rows": [asdict(row) for row in rows]}
+def frames_json(rows: Sequence[FrameRow], costs: Sequence[FrameCosts], machine: Machine) -> dict[str, Any]:
+    """The machine, all rows, and what frames take time for."""
+    return {"machine": asdict(machine), "rows": [asdict(row) for row in rows], "costs": [asdict(cost) for cost in costs]}
 
 
-def frames_markdown(rows: Sequence[FrameRow], machine: Machine) -> str:
-    """A Markdown document: for each program and height a table of milliseconds by the number of trees, and what a tree costs."""
+def frames_markdown(rows: Sequence[FrameRow], costs: Sequence[FrameCosts], machine: Machine) -> str:
+    """A Markdown document: for each program and height a table of milliseconds by the number of trees, and what frames take time for."""
     parts = [
         "# Frame times",
         f"Medians in milliseconds of frames that were drawn to their end, on {machine.processor}, by {machine.renderer} in "
         f"{machine.browser}; {machine.picture}. {machine.load:.1f} other processes wanted a core when the measurement began. A dash is a "
         "number of trees that was left out because fewer took too long. *Fragments* are those of a tree's triangles, hidden and "
         "transparent ones included, in thousands. FLIP and PSNR are means over four backgrounds and held-out views, drawn by three.js at "
-        "this height, or at that of the views if they are smaller.",
+        "this height, or at that of the views if they are smaller. A star marks the models that no other one beats in both time and FLIP.",
     ]
+    if costs:
+        parts += ["## What takes the time", markdown(["program", *_COSTS], [_cost_line(cost) for cost in costs])]
+        parts.append(
+            "Give the number of fragments to `bbfit lod --fragments-per-triangle`: levels then take over only where they draw faster."
+        )
     for program in dict.fromkeys(row.program for row in rows):
         for pixels in dict.fromkeys(row.tree_pixels for row in rows):
             of_field = [row for row in rows if (row.program, row.tree_pixels) == (program, pixels)]
@@ -110,16 +154,26 @@ def frames_markdown(rows: Sequence[FrameRow], machine: Machine) -> str:
                 "fragments",
                 "MB on the card",
             ]
-            table = [_line([row for row in of_field if row.model == name], counts) for name in dict.fromkeys(row.model for row in of_field)]
+            names, best = dict.fromkeys(row.model for row in of_field), fastest(of_field)
+            table = [_line([row for row in of_field if row.model == name], counts, star=name in best) for name in names]
             parts += [f"## {program}, {pixels} pixels high", markdown(head, table)]
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
-def _line(rows: Sequence[FrameRow], counts: Sequence[int]) -> list[str]:
+_COSTS = ("a tree, ns", "a triangle, ns", "a fragment, ns", "fragments that take as long as a triangle", "fields", "typical error")
+
+
+def _cost_line(cost: FrameCosts) -> list[str]:
+    ratio = cost.fragments_per_triangle
+    times = [f"{time:,.1f}" for time in (cost.tree_ns, cost.triangle_ns, cost.fragment_ns)]
+    return [cost.program, *times, "" if ratio is None else f"{ratio:.2g}", f"{cost.fields}", f"{100 * cost.error:.0f} %"]
+
+
+def _line(rows: Sequence[FrameRow], counts: Sequence[int], *, star: bool) -> list[str]:
     """A line of a table: the rows of one model by their numbers of trees."""
     times, last = {row.count: row.ms for row in rows}, rows[-1]
     return [
-        last.title,
+        f"{last.title} *" if star else last.title,
         *(f"{times[count]:,.1f}" if count in times else "-" for count in counts),
         "" if last.flip is None else f"{last.flip:.4f}",
         "" if last.psnr is None else f"{last.psnr:.2f}",

@@ -130,16 +130,21 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
 
 
 def lod_table(levels: Sequence[LodLevel]) -> Table:
-    """A ``rich`` table of levels of detail: costs, the distance of each and those that silhouette and colors ask for, and errors."""
-    columns = ["planes", "vertices", "bytes", "from, m", "outline", "colors", "px", "error", "FLIP"]
-    table = _table(["level"], columns, no_wrap=True)
-    table.caption = "outline, colors: distances that they ask for, m; px: height of the tree; error: of the outline, px"
+    """A ``rich`` table of levels of detail: costs, the distance of each and those that silhouette and colors ask for, and errors.
+
+    Where speed counts, it has a column too.
+    """
+    timed = any(level.fragments is not None for level in levels)
+    asking = ["outline", "colors", *(["speed"] if timed else [])]
+    table = _table(["level"], ["planes", "vertices", "bytes", "from, m", *asking, "px", "error", "FLIP"], no_wrap=True)
+    table.caption = f"{', '.join(asking)}: distances that they ask for, m; px: height of the tree; error: of the outline, px"
     table.caption_justify = "left"
     for level in levels:
         costs = ["tree" if level.planes is None else str(level.planes), _count(level.vertices), _count(level.bytes)]
-        cells = [f"{level.distance_meters:.1f}", *["-"] * 5]
+        cells = [f"{level.distance_meters:.1f}", *["-"] * (len(asking) + 3)]
         if level.planes is not None:
-            asked = [f"{distance:.1f}" for distance in (level.silhouette_distance_meters, level.color_distance_meters)]
+            distances = (level.silhouette_distance_meters, level.color_distance_meters, level.speed_distance_meters)
+            asked = [f"{distance:.1f}" for distance in distances[: len(asking)]]
             below = "-" if level.tree_pixels is None else f"{level.tree_pixels:.0f}"
             cells[1:] = [*asked, below, f"{level.error_pixels:.2f}", f"{level.color_error:.2f}"]
         table.add_row(level.name.rsplit("_", 1)[-1], *costs, *cells)

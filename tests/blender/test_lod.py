@@ -158,6 +158,32 @@ def test_without_the_tree_the_finest_cloud_is_shown_from_the_start(built: LodRes
     assert result.path.stat().st_size < built.path.stat().st_size - TREE.stat().st_size / 2
 
 
+def test_with_costly_triangles_levels_are_rectangles_and_with_cheap_ones_none_is_slower(built: LodResult) -> None:
+    """By the files alone: their triangles, and the fragments that lod.json states for each level."""
+    work = {"work": built.folder}
+    costly = build_lod(TREE, built.path.with_name("costly.glb"), replace(LEVELS, fragments_per_triangle=1e6), SMALL, **work)
+    assert [level.planes for level in costly.levels] == [None, 4, 2]
+    assert [level.distance_meters for level in costly.levels] == [level.distance_meters for level in built.levels]
+    for level, trimmed in zip(costly.levels[1:], built.levels[1:], strict=True):
+        assert level.planes and level.triangles == 2 * level.planes < trimmed.triangles
+    even = build_lod(TREE, built.path.with_name("costly.glb"), replace(LEVELS, fragments_per_triangle=4.0), SMALL, **work)
+    assert [level.file for level in even.levels] == sorted(path.name for path in (built.folder / "levels").glob("costly_LOD*"))
+    for finer, level in zip(even.levels, even.levels[1:], strict=False):
+        assert level.distance_meters >= level.speed_distance_meters and level.triangles < finer.triangles
+        # Both, where the level takes over. The tree itself is measured at the size of the views, and shown larger.
+        assert level.fragments and finer.fragments
+        scales = [(level.tree_pixels or 64) / (finer.tree_pixels or _pixels_of_views(built))]
+        assert 4 * level.triangles + level.fragments <= (4 * finer.triangles + finer.fragments * scales[0] ** 2) * (1 + 1e-6)
+
+
+def _pixels_of_views(built: LodResult) -> float:
+    """Height of the tree in its views, in pixels at the axis."""
+    views = ViewDataset.load(built.folder / "views")
+    assert views.request and views.request.tree.bounds and views.request.camera
+    low, high = views.request.tree.bounds
+    return (high[1] - low[1]) * float(views.train.cameras.intrinsics[0, 0, 0]) / views.request.camera["distance"]
+
+
 def test_a_profile_adds_what_its_program_needs(built: LodResult, tmp_path: Path) -> None:
     """Beside other levels in the same folder, and without replacing a file of the user."""
     config = replace(SMALL, export=ExportConfig(profile="babylon", textures="png"))
@@ -201,6 +227,7 @@ def test_bad_wishes(tmp_path: Path) -> None:
         ({"error_pixels": 0.0}, "error_pixels"),
         ({"triangles": 0}, "triangles"),
         ({"screen_width": 0}, "screen_width"),
+        ({"fragments_per_triangle": -1.0}, "fragments_per_triangle"),
         ({"screen_fov_degrees": 180.0}, "screen_fov_degrees"),
     ],
 )

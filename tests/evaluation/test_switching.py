@@ -1,0 +1,65 @@
+"""Where levels of detail take over, once they must also draw faster: against trying all of them at many sizes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from bbfit.evaluation.switching import DrawingCost, Switch, _fastest, mesh_cost
+from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics
+from bbfit.views.view_set import ViewSet
+
+
+def test_fewer_triangles_are_faster_below_the_scale_at_which_both_cost_the_same() -> None:
+    tree, planes = DrawingCost(100_000, 50.0), DrawingCost(2_000, 400.0)
+    scale = planes.faster_below(tree, 8.0)
+    assert planes.at(scale, 8.0) == pytest.approx(tree.at(scale, 8.0))
+    assert planes.at(0.99 * scale, 8.0) < tree.at(0.99 * scale, 8.0) and planes.at(1.01 * scale, 8.0) > tree.at(1.01 * scale, 8.0)
+    assert planes.faster_below(DrawingCost(100_000, 400.0), 8.0) == math.inf  # everywhere
+    assert tree.faster_below(planes, 8.0) == planes.faster_below(planes, 8.0) == 0  # nowhere
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_level_that_is_shown_is_the_fastest_whose_error_is_hidden(seed: int) -> None:
+    """At every scale; and a level that is left out is the fastest at none."""
+    random = np.random.default_rng(seed)
+    triangles = sorted(map(int, random.integers(10, 100_000, 6)), reverse=True)
+    tree, *costs = (DrawingCost(count, float(random.uniform(10, 2000))) for count in triangles)
+    bounds = sorted(map(float, np.exp(random.uniform(np.log(1), np.log(300), 5))), reverse=True)
+    price = float(np.exp(random.uniform(np.log(0.1), np.log(100))))
+    found = [Switch(scale=scale, cost=cost) for scale, cost in zip(bounds, costs, strict=True)]
+    chosen = _fastest([[switch] for switch in found], price, tree)
+    kept = [switch for switch in chosen if switch]
+    assert [switch.scale for switch in kept] == sorted((switch.scale for switch in kept), reverse=True)
+    for scale in np.exp(np.linspace(np.log(0.1), np.log(500), 400)):
+        acceptable = [tree, *(switch.cost for switch in found if scale <= switch.scale)]
+        shown = [tree, *(switch.cost for switch in kept if scale <= switch.scale)][-1]
+        assert shown.at(scale, price) == min(cost.at(scale, price) for cost in acceptable)
+
+
+def test_of_several_outlines_the_fastest_where_the_level_takes_over_is_taken() -> None:
+    tree, many, few = DrawingCost(100_000, 50.0), DrawingCost(500, 100.0), DrawingCost(16, 300.0)
+    for scale, outline in [(30.0, "pieces"), (1.0, "rectangle")]:
+        outlines = [Switch(scale, outline="pieces", cost=many), Switch(scale, outline="rectangle", cost=few)]
+        (chosen,) = _fastest([outlines], 1.0, tree)
+        assert chosen and (chosen.outline, chosen.scale) == (outline, scale)
+
+
+@pytest.mark.parametrize("size", [32, 64])
+def test_the_cost_of_a_mesh_is_its_triangles_and_their_area_in_square_meters(size: int) -> None:
+    """Two squares of one square meter, one behind the other, seen straight on by parallel rays."""
+    corners = torch.tensor([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]], dtype=torch.float64)
+    square = corners[torch.tensor([[0, 1, 2], [0, 2, 3]])]
+    camera = Camera(
+        look_at(torch.tensor([[0.0, 0.0, 5.0]], dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)),
+        orthographic_intrinsics(4.0, size, size)[None],
+        size,
+        size,
+        orthographic=True,
+    )
+    views = ViewSet.from_arrays(torch.zeros(1, size, size, 4), camera)
+    cost = mesh_cost(torch.cat([square, square - torch.tensor([0.0, 0.0, 1.0])]), views)
+    assert cost.triangles == 4 and cost.fragments == pytest.approx(2.0)
