@@ -23,7 +23,7 @@ from PIL import Image, UnidentifiedImageError
 from scipy import ndimage
 from torch import Tensor
 
-from bbfit.checks import MissingFileError, check_shape, fail
+from bbfit.checks import MissingFileError, check_count, check_shape, fail
 from bbfit.files import write_bytes
 from bbfit.inputs import InputLimits, reading
 
@@ -290,3 +290,26 @@ def bleed_color(texture: Tensor) -> Tensor:
     row, column = torch.from_numpy(nearest).long().to(texture.device)
     filled = torch.cat([texture[row, column, :3], torch.zeros_like(texture[..., 3:])], -1)
     return torch.where(hidden[..., None], filled, texture)
+
+
+def shrunk(picture: Tensor, width: int, height: int) -> Tensor:
+    """A picture at a smaller size, [H, W, C] -> [h, w, C]; each pixel is the mean, by area, of what it covers.
+
+    Raises InputError if the new size is larger, or not at least 1 x 1.
+    """
+    for name, side, old in (("width", width, picture.shape[1]), ("height", height, picture.shape[0])):
+        check_count(name, side)
+        if side > old:
+            fail(name, f"expected at most the picture's {old}, got {side}")
+    if tuple(picture.shape[:2]) == (height, width):
+        return picture
+    return _means(_means(picture.double(), height).transpose(0, 1), width).transpose(0, 1).to(picture)
+
+
+def _means(values: Tensor, count: int) -> Tensor:
+    """Means of ``count`` equal parts of the first axis, from differences of the running sum, which is linear within a value."""
+    edges = torch.arange(count + 1, dtype=values.dtype) * (len(values) / count)
+    whole = edges.long().clamp(max=len(values) - 1)
+    before = torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)[:-1]])
+    sums = before[whole] + (edges - whole).view(-1, *[1] * (values.ndim - 1)) * values[whole]
+    return sums.diff(dim=0) * (count / len(values))

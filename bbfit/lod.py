@@ -5,20 +5,24 @@ from __future__ import annotations
 import glob
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-import torch
+from torch import Tensor
 
 from bbfit.blender.requirements import check_blender
 from bbfit.checks import check_output_file, check_record, fail
-from bbfit.evaluation.switching import Switch, mesh_cost, switches
-from bbfit.exporting.config import ExportConfig, LodConfig
+from bbfit.evaluation.scoring import views_psnr
+from bbfit.evaluation.switching import Candidate, DrawingCost, Switch, cloud_candidate, mesh_cost, switches
+from bbfit.exporting.config import ExportConfig, LodConfig, Outline
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.lod_files import LOD_FILE, level_file, lod_document, program_file_names, program_files
-from bbfit.exporting.model import ShippedModel, shipped_model
+from bbfit.exporting.model import shipped_model
 from bbfit.files import read_json, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_per_meter
+from bbfit.geometry.camera import Camera
 from bbfit.inputs import reading
 from bbfit.outputs import claimed_folder, output_folder, used_folder
 from bbfit.pipeline import RunConfig, RunResult, needs_blender, run
@@ -27,9 +31,10 @@ from bbfit.reporting.plots import lod_picture
 from bbfit.rivals.baking import tree_triangles
 from bbfit.stages.results import export_config
 from bbfit.stages.stage import OnProgress, Record, Stage, silent
-from bbfit.stages.trees import convert_stage, views_stage
+from bbfit.stages.trees import convert_stage, pictures_stage, views_stage
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 
 ORIGINAL = "original.glb"
 """The file of the converted tree."""
@@ -118,17 +123,20 @@ def build_lod(
 def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: RunConfig, on_progress: OnProgress) -> LodResult:
     """The stages of :func:`build_lod` in a claimed folder. The options were checked."""
     record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
-    record.check({"join": _outputs(out, folder, config, stages.export)} | ({"convert": (ORIGINAL,)} if _converts(tree, config) else {}))
+    converted = {"convert": (ORIGINAL,)} if _converts(tree, config) else {}
+    thinned = {f"thin {count}": (_thinned_file(count),) for count in config.thinned}
+    record.check({"join": _outputs(out, folder, config, stages.export)} | converted | thinned)
     output_folder("work", folder / LEVELS)
     record.run(views_stage(folder, tree, stages.views), on_progress)
     views = ViewDataset.load(folder / "views", limits=stages.limits)
     original = _original(record, tree, config, on_progress) if config.original else None
+    meshes = [_thinned(record, tree, count, views, stages, on_progress) for count in config.thinned]
     stages = replace(stages, tree=tree.path if tree.is_mesh else None)
     runs = [_fitted(folder, stages, planes, on_progress) for planes in config.planes]
     export = export_config(views, stages.export)
     if export.textures is None:
         export = replace(export, textures="png" if export.profile in _WITHOUT_KTX2 else "auto")  # distant levels need mip levels
-    record.run(_join_stage(folder, out, original, runs, views, config, export), on_progress)
+    record.run(_join_stage(folder, out, original, [*meshes, *runs], views, config, export), on_progress)
     description = folder / LEVELS / LOD_FILE
     stored = read_json("levels of detail", description)
     with reading("levels of detail", description, "remove it, then start bbfit lod again"):
@@ -138,41 +146,86 @@ def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: R
 
 
 def _join_stage(
-    folder: Path, out: Path, original: Path | None, runs: list[RunResult], views: ViewDataset, config: LodConfig, export: ExportConfig
+    folder: Path,
+    out: Path,
+    original: Path | None,
+    made: list[_Thinned | RunResult],
+    views: ViewDataset,
+    config: LodConfig,
+    export: ExportConfig,
 ) -> Stage:
-    """Join the original (if it is a level) and the models of all runs to one file."""
+    """Join the original (if it is a level) and the other models, finest first, to one file."""
 
     def work(on_progress: OnProgress) -> None:
-        steps = 2 * len(runs) + 1
+        steps = 2 * len(made) + 1
         on_progress("join", 0, steps)
-        clouds, cost = [fitted.cloud for fitted in runs], None
-        if original and config.fragments_per_triangle is not None:
-            cost = mesh_cost(torch.tensor(tree_triangles(original)), views.train)
-        found = switches(views, clouds, config, export, tree=cost, on_level=lambda done: on_progress("join", done, steps))
-        kept = [(fitted, switch) for fitted, switch in zip(runs, found, strict=True) if switch]
-        models, shipped = [original.read_bytes()] if original else [], list[ShippedModel]()
-        for number, (fitted, switch) in enumerate(kept, 1 + len(runs)):
-            own = export if switch.outline is None else replace(export, outline=switch.outline)
-            shipped.append(shipped_model(fitted.cloud, own, switch.halvings))
-            models.append(shipped[-1].glb)
+        candidates = [
+            Candidate(each.draw, partial(_mesh_costs, each.file, views.train))
+            if isinstance(each, _Thinned)
+            else cloud_candidate(each.cloud, views.train, export)
+            for each in made
+        ]
+        tree = mesh_cost(tree_triangles(original), views.train) if original and config.fragments_per_triangle is not None else None
+        found = switches(candidates, views, config, tree=tree, on_level=lambda done: on_progress("join", done, steps))
+        models = [_Model(original.read_bytes(), None, Switch(cost=tree))] if original else []
+        for number, (each, switch) in enumerate(zip(made, found, strict=True), 1 + len(made)):
+            if switch:
+                models.append(_model(each, switch, export, views))
             on_progress("join", number, steps)
-        fits: list[tuple[RunResult | None, Switch]] = [(None, Switch(cost=cost))] if original else []
-        levels = _levels(views, models, [*fits, *kept], config, out.stem)
+        levels = _levels(views, models, config, out.stem)
         document = lod_document(out.stem, levels, config, _bounds(views))
         for file in (folder / LEVELS).glob(level_file(glob.escape(out.stem), "*")):  # of an earlier build with more levels
             file.unlink()
         for level, model in zip(levels, models, strict=True):
-            write_bytes(folder / LEVELS / level.file, model)
+            write_bytes(folder / LEVELS / level.file, model.glb)
         for name, data in program_files(export.profile, document).items():
             write_bytes(folder / LEVELS / name, data)
         write_json(folder / LEVELS / LOD_FILE, document)
-        write_bytes(out, lod_glb(models, levels, export.profile))
-        lod_picture(list(zip(levels[len(levels) - len(shipped) :], shipped, strict=True)), views.test, folder / "lod.png")
+        write_bytes(out, lod_glb([model.glb for model in models], levels, export.profile))
+        drawn = [(level, model.draw) for level, model in zip(levels, models, strict=True) if model.draw]
+        lod_picture(drawn, views.test, folder / "lod.png")
         on_progress("join", steps, steps)
 
-    clouds = [digest_file(fitted.folder / name) for fitted in runs for name in ("cloud.safetensors", "metrics.json")]
-    inputs = (original and digest_file(original), clouds, views.fingerprint, config, export.resolve(), out.stem)
+    files = [each.file if isinstance(each, _Thinned) else each.folder / "cloud.safetensors" for each in made]
+    scores = [each.folder / "metrics.json" for each in made if not isinstance(each, _Thinned)]
+    digests = [digest_file(file) for file in (*files, *scores)]
+    inputs = (original and digest_file(original), digests, views.fingerprint, config, export.resolve(), out.stem)
     return Stage("join", inputs, _outputs(out, folder, config, export), work, algorithm="lod")
+
+
+@dataclass(frozen=True)
+class _Thinned:
+    """A tree that was thinned out, with the pictures that Blender made of it."""
+
+    file: Path
+    train: ViewSet
+    test: ViewSet
+
+    def draw(self, camera: Camera) -> Tensor:
+        return ViewSet.joined([self.train, self.test]).draw(camera)
+
+
+@dataclass(frozen=True)
+class _Model:
+    """The model of a level."""
+
+    glb: bytes
+    planes: int | None
+    switch: Switch
+    psnr: float | None = None
+    draw: Callable[[Camera], Tensor] | None = None
+
+
+def _model(made: _Thinned | RunResult, switch: Switch, export: ExportConfig, views: ViewDataset) -> _Model:
+    if isinstance(made, _Thinned):
+        return _Model(made.file.read_bytes(), None, switch, views_psnr(made.draw, views.test), made.draw)
+    own = export if switch.outline is None else replace(export, outline=switch.outline)
+    shipped = shipped_model(made.cloud, own, switch.halvings)
+    return _Model(shipped.glb, len(made.cloud), switch, made.report.mean.over.mean.psnr, shipped.draw)
+
+
+def _mesh_costs(file: Path, views: ViewSet) -> dict[Outline | None, DrawingCost]:
+    return {None: mesh_cost(tree_triangles(file), views)}
 
 
 def _outputs(out: Path, folder: Path, config: LodConfig, export: ExportConfig) -> tuple[str, ...]:
@@ -197,6 +250,19 @@ def _original(record: Record, tree: TreeFile, config: LodConfig, on_progress: On
     return record.folder / ORIGINAL
 
 
+def _thinned(record: Record, tree: TreeFile, count: int, views: ViewDataset, stages: RunConfig, on_progress: OnProgress) -> _Thinned:
+    """The tree with at most ``count`` triangles, and its pictures."""
+    file = record.folder / _thinned_file(count)
+    record.run(convert_stage(record.folder, tree, file.name, triangles=count, stage=f"thin {count}"), on_progress)
+    stage, train, test = pictures_stage(record.folder, file, views, stages.views, stage=f"render {count}")
+    record.run(stage, on_progress)
+    return _Thinned(file, train, test)
+
+
+def _thinned_file(count: int) -> str:
+    return f"thinned_{count}.glb"
+
+
 def _converts(tree: TreeFile, config: LodConfig) -> bool:
     """Whether the finest level is a converted tree."""
     return config.original and not (config.triangles is None and is_self_contained(tree.path))
@@ -208,30 +274,28 @@ def _bounds(views: ViewDataset) -> tuple[tuple[float, float, float], tuple[float
     return views.request.tree.bounds
 
 
-def _levels(
-    views: ViewDataset, models: list[bytes], fits: list[tuple[RunResult | None, Switch]], config: LodConfig, name: str
-) -> tuple[LodLevel, ...]:
+def _levels(views: ViewDataset, models: list[_Model], config: LodConfig, name: str) -> tuple[LodLevel, ...]:
     """The measurements of the levels."""
     view_scale = float(pixels_per_meter(views.train.cameras))
     low, high = _bounds(views)
     height, radius = high[1] - low[1], math.dist(low, high) / 2
     focal = config.screen_height / 2 / math.tan(math.radians(config.screen_fov_degrees) / 2)
-    next_scales = [*(switch.scale for _, switch in fits[1:]), 0.0]
+    next_scales = [*(model.switch.scale for model in models[1:]), 0.0]
     levels = list[LodLevel]()
-    for model, (fitted, switch), next_scale in zip(models, fits, next_scales, strict=True):
-        vertices, triangles = glb_counts(model)
+    for model, next_scale in zip(models, next_scales, strict=True):
+        (vertices, triangles), switch = glb_counts(model.glb), model.switch
         largest_scale = min(switch.scale, view_scale)
         levels.append(
             LodLevel(
                 name=f"{name}_LOD{len(levels)}",
-                planes=None if fitted is None else len(fitted.cloud),
+                planes=model.planes,
                 vertices=vertices,
                 triangles=triangles,
-                bytes=len(model),
+                bytes=len(model.glb),
                 error_meters=switch.errors[0],
                 error_pixels=switch.errors[0] * largest_scale,
                 held_out_error_pixels=switch.errors[1] * largest_scale,
-                psnr=None if fitted is None else fitted.report.mean.over.mean.psnr,
+                psnr=model.psnr,
                 tree_pixels=None if math.isinf(switch.scale) else height * switch.scale,
                 distance_meters=focal / switch.scale,
                 screen_coverage=min(1.0, math.pi * (radius * next_scale) ** 2 / (config.screen_width * config.screen_height)),
@@ -240,6 +304,7 @@ def _levels(
                 color_distance_meters=focal / switch.color_scale,
                 color_error=switch.color_errors[0],
                 held_out_color_error=switch.color_errors[1],
+                outline=switch.outline,
                 speed_distance_meters=focal / switch.faster_scale,
                 fragments=None if switch.cost is None else switch.cost.fragments * largest_scale**2,
             )

@@ -7,14 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 
 from bbfit.budget.sizes import picture_bytes
-from bbfit.evaluation.backgrounds import mean_psnr
-from bbfit.evaluation.scoring import held_out
+from bbfit.evaluation.scoring import views_psnr
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import ShippedModel, shipped_model
+from bbfit.exporting.model import shipped_model
 from bbfit.fitting.bark import Bark
 from bbfit.fitting.config import FitConfig, Placement, Sides
 from bbfit.fitting.loop import fit
@@ -24,7 +22,6 @@ from bbfit.fitting.search import QUICK, find_placement
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views.dataset import ViewDataset
-from bbfit.views.view_set import ViewSet
 
 # The length of a short fit and of its search, if the configuration asks for no shorter ones. The search is at lower resolutions than the
 # levels, of which an even placement, without a search, has as many as any fit. Shorter fits would favor few billboards.
@@ -112,7 +109,7 @@ class Trials:
         start = None if placement == "even" else self._placement(config)
         cloud = fit(self._views, config, tree=self._tree, placement=start).cloud
         model = shipped_model(cloud, self._export)
-        psnr, seconds = round(validation_psnr(model, self._views.test), 3), round(time.perf_counter() - started, 1)
+        psnr, seconds = round(views_psnr(model.draw, self._views.test), 3), round(time.perf_counter() - started, 1)
         sizes = len(cloud.texels), len(model.glb), picture_bytes(model.glb)
         return Trial(count, config.sides, placement, config.max_texels, cloud.vertex_count, *sizes, psnr, seconds)
 
@@ -136,8 +133,3 @@ def short_config(config: FitConfig, count: int, sides: Sides, placement: Placeme
     short: dict[str, Any] = {name: min(value, getattr(config, name) or value) for name, value in most.items()}
     short["views_per_step"] = config.views_per_step or _VIEWS_PER_STEP
     return replace(config, billboards=count, sides=sides, placement=placement, max_texels=max_texels, **short)
-
-
-def validation_psnr(model: ShippedModel, views: ViewSet) -> float:
-    """Compute the PSNR of a model in dB, averaged over views and :data:`~bbfit.evaluation.backgrounds.BACKGROUNDS`."""
-    return float(np.mean([mean_psnr(*held_out(model.draw, views, index)) for index in range(len(views))]))

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from bbfit.evaluation.backgrounds import mean_flip_map
 from bbfit.evaluation.scoring import held_out
-from bbfit.evaluation.sizes import shrunk
 from bbfit.geometry.camera import Camera
+from bbfit.images import shrunk
 from bbfit.views.view_set import ViewSet
 
 # FLIP's filters reach 10 pixels at 67 pixels a degree; so far, the background around the tree counts.

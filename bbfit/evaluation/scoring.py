@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bbfit.checks import InputError, check_count, check_shape, fail
 from bbfit.evaluation import metrics, thesis_scale
-from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
+from bbfit.evaluation.backgrounds import BACKGROUNDS, mean_psnr, over_background
 from bbfit.evaluation.distances import Distances, viewing_distances
 from bbfit.evaluation.light import LightScore, score_light
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
@@ -202,6 +202,14 @@ def held_out(draw: Callable[[Camera], Tensor], views: ViewSet, index: int) -> tu
     if not image.isfinite().all():
         fail("cloud", f"its render of view {views.names[index]} has values that are not finite", "fit it again")
     return target, image.clamp(0, 1)
+
+
+def views_psnr(draw: Callable[[Camera], Tensor], views: ViewSet) -> float:
+    """The PSNR of a model in dB, the mean over views and :data:`~bbfit.evaluation.backgrounds.BACKGROUNDS`.
+
+    ``draw`` and the errors are those of :func:`held_out`.
+    """
+    return sum(mean_psnr(*held_out(draw, views, index)) for index in range(len(views))) / len(views)
 
 
 def measure(target: Tensor, image: Tensor) -> Measures:

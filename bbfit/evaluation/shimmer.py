@@ -11,8 +11,8 @@ from torch import Tensor
 from bbfit.checks import check_shape, fail
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
 from bbfit.evaluation.report import ShimmerScore
-from bbfit.evaluation.sizes import shrunk
 from bbfit.geometry.camera import Camera
+from bbfit.images import shrunk
 from bbfit.views.dataset import TurnedViews
 
 SIDES = (512, 256, 128, 64, 32)

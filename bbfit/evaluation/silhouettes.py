@@ -1,26 +1,28 @@
-"""The error of a cloud's silhouette, and the scale up to which it stays invisible."""
+"""The error of a model's silhouette, and the scale up to which it stays invisible."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 
+from torch import Tensor
+
 from bbfit.evaluation.metrics import silhouette_distance
 from bbfit.evaluation.scoring import held_out
-from bbfit.exporting.model import shipped_model
-from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.camera import Camera
 from bbfit.views.view_set import ViewSet
 
 # Errors are a little larger between the training views than in them: for four clouds of an acer by up to 11 % in the worst held-out view.
 _MARGIN = 1.15
 
 
-def worst_silhouette(cloud: BillboardCloud, views: ViewSet, *, stop: Callable[[], bool] = lambda: False) -> float:
-    """The largest :func:`~bbfit.evaluation.metrics.silhouette_distance` between a cloud and a view, in pixels; 0 without views.
+def worst_silhouette(draw: Callable[[Camera], Tensor], views: ViewSet, *, stop: Callable[[], bool] = lambda: False) -> float:
+    """The largest :func:`~bbfit.evaluation.metrics.silhouette_distance` between a model and a view, in pixels; 0 without views.
 
-    ``stop`` is called before each view. Once it returns True, the remaining views are left out.
+    ``draw`` is as for :func:`~bbfit.evaluation.scoring.held_out`. ``stop`` is called before each view. Once it returns True, the remaining
+    views are left out.
     """
-    worst, draw = 0.0, shipped_model(cloud).draw
+    worst = 0.0
     for index in range(len(views)):
         if stop():
             break

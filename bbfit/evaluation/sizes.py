@@ -14,6 +14,7 @@ from bbfit.evaluation import metrics
 from bbfit.evaluation.backgrounds import mean_psnr
 from bbfit.evaluation.report import SizeScore
 from bbfit.geometry.camera import Camera
+from bbfit.images import shrunk
 from bbfit.views.view_set import ViewSet
 
 HALVINGS = 4
@@ -50,29 +51,6 @@ def score_sizes(
         if on_size is not None:
             on_size(halving + 1, halvings + 1)
     return tuple(scores)
-
-
-def shrunk(picture: Tensor, width: int, height: int) -> Tensor:
-    """A picture at a smaller size, [H, W, C] -> [h, w, C]; each pixel is the mean, by area, of what it covers.
-
-    Raises InputError if the new size is larger, or not at least 1 x 1.
-    """
-    for name, side, old in (("width", width, picture.shape[1]), ("height", height, picture.shape[0])):
-        check_count(name, side)
-        if side > old:
-            fail(name, f"expected at most the picture's {old}, got {side}")
-    if tuple(picture.shape[:2]) == (height, width):
-        return picture
-    return _means(_means(picture.double(), height).transpose(0, 1), width).transpose(0, 1).to(picture)
-
-
-def _means(values: Tensor, count: int) -> Tensor:
-    """Means of ``count`` equal parts of the first axis, from differences of the running sum, which is linear within a value."""
-    edges = torch.arange(count + 1, dtype=values.dtype) * (len(values) / count)
-    whole = edges.long().clamp(max=len(values) - 1)
-    before = torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)[:-1]])
-    sums = before[whole] + (edges - whole).view(-1, *[1] * (values.ndim - 1)) * values[whole]
-    return sums.diff(dim=0) * (count / len(values))
 
 
 def _score(draw: Callable[[Camera], Tensor], views: ViewSet, halving: int, width: int, height: int) -> SizeScore:

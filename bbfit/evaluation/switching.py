@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bbfit.evaluation.color_error import mean_color_error, share_within
@@ -75,57 +77,78 @@ class Switch:
         return self.cost.at(scale, fragments_per_triangle) if self.cost else 0.0
 
 
+@dataclass(frozen=True)
+class Candidate:
+    """A model that may become a level of detail."""
+
+    draw: Callable[[Camera], Tensor]
+    """Draws what it shows to a camera of the views, as for :func:`~bbfit.evaluation.scoring.held_out`."""
+    costs: Callable[[], Mapping[Outline | None, DrawingCost]]
+    """Computes what it costs to draw, with each outline that it may have; ``None`` is that of a mesh."""
+    texel_density: float | None = None
+    """Texels per meter; ``None`` for a mesh, whose textures stay as they are."""
+
+
+def cloud_candidate(cloud: BillboardCloud, views: ViewSet, export: ExportConfig) -> Candidate:
+    """A billboard cloud with the outlines that the export options allow. Its fragments are counted in ``views``."""
+
+    def cost(outline: Outline) -> DrawingCost:
+        cards = shipped_model(cloud, replace(export, outline=outline, textures="png", mip_files=False, mipmaps=False)).cards
+        triangles = sum(len(card.corners) - 2 for card in cards.cards)
+        return DrawingCost(triangles, fragments_per_square_meter(CardRenderer(cards).fragments, views))
+
+    outlines = get_args(Outline) if export.outline is None else (export.outline,)
+    return Candidate(shipped_model(cloud).draw, lambda: {outline: cost(outline) for outline in outlines}, cloud.texel_density)
+
+
+def mesh_cost(triangles: NDArray[np.floating], views: ViewSet) -> DrawingCost:
+    """What a mesh costs to draw. ``triangles`` are corners in meters, [T, 3, 3]."""
+    corners = torch.tensor(triangles, dtype=torch.float64)
+    return DrawingCost(len(corners), fragments_per_square_meter(lambda camera: triangle_fragments(corners, camera), views))
+
+
 def switches(
+    candidates: Sequence[Candidate],
     views: ViewDataset,
-    clouds: Sequence[BillboardCloud],
     config: LodConfig,
-    export: ExportConfig,
     *,
     tree: DrawingCost | None = None,
     on_level: Callable[[int], None] = lambda done: None,
 ) -> list[Switch | None]:
-    """The switch of each cloud; ``None`` for one that nowhere draws faster than a level whose error is hidden too.
+    """The switch of each candidate, finest first; ``None`` for one that nowhere draws faster than a level whose error is hidden too.
 
     The bounds hold in the training views. Speed counts if ``config.fragments_per_triangle`` is given: then a level takes over only from
-    the distance from which it also draws faster. ``tree`` is the finest level, or ``None`` if the first cloud is. ``on_level`` is called
-    with the number of finished clouds.
+    the distance from which it also draws faster. ``tree`` is the cost of the tree itself, if that is a level. ``on_level`` is called with
+    the number of finished candidates.
     """
     view_scale, found = float(pixels_per_meter(views.train.cameras)), list[Switch]()
-    for cloud in clouds:
-        draw = shipped_model(cloud).draw
-        error, held_out_error = (worst_silhouette(cloud, split) / view_scale for split in (views.train, views.test))
+    for candidate in candidates:
+        error, held_out_error = (worst_silhouette(candidate.draw, split) / view_scale for split in (views.train, views.test))
         silhouette = scale_within(error, config.error_pixels)
-        color = view_scale * share_within(draw, views.train, config.color_error)
+        color = view_scale * share_within(candidate.draw, views.train, config.color_error)
         scale = min([view_scale, silhouette, color, *(switch.scale for switch in found)])
         found.append(Switch(scale, silhouette, color, (error, held_out_error)))
         on_level(len(found))
     chosen = list[Switch | None](found)
     if config.fragments_per_triangle is not None:
-        outlined = [_outlined(switch, cloud, views.train, export) for switch, cloud in zip(found, clouds, strict=True)]
+        outlined = [
+            [replace(switch, outline=outline, cost=cost) for outline, cost in candidate.costs().items()]
+            for switch, candidate in zip(found, candidates, strict=True)
+        ]
         chosen = _fastest(outlined, config.fragments_per_triangle, tree)
     if not config.original and chosen[0]:
         chosen[0] = replace(chosen[0], scale=math.inf)
-    return [switch and _measured(switch, cloud, views) for switch, cloud in zip(chosen, clouds, strict=True)]
+    return [switch and _measured(switch, candidate, views) for switch, candidate in zip(chosen, candidates, strict=True)]
 
 
-def _measured(switch: Switch, cloud: BillboardCloud, views: ViewDataset) -> Switch:
+def _measured(switch: Switch, candidate: Candidate, views: ViewDataset) -> Switch:
     """The switch with its errors of color and its halvings, which depend on the final scale."""
     view_scale = float(pixels_per_meter(views.train.cameras))
-    draw, share = shipped_model(cloud).draw, min(1.0, switch.scale / view_scale)
-    colors, held_out_colors = (mean_color_error(draw, split, share) for split in (views.train, views.test))
-    halvings = 0 if math.isinf(switch.scale) else max(0, math.floor(math.log2(cloud.texel_density / switch.scale)))
+    share = min(1.0, switch.scale / view_scale)
+    colors, held_out_colors = (mean_color_error(candidate.draw, split, share) for split in (views.train, views.test))
+    density = candidate.texel_density
+    halvings = 0 if density is None or math.isinf(switch.scale) else max(0, math.floor(math.log2(density / switch.scale)))
     return replace(switch, color_errors=(colors, held_out_colors), halvings=halvings)
-
-
-def _outlined(switch: Switch, cloud: BillboardCloud, views: ViewSet, export: ExportConfig) -> list[Switch]:
-    """The switch with the cost of each outline that the export options allow."""
-    made = list[Switch]()
-    for outline in get_args(Outline) if export.outline is None else (export.outline,):
-        cards = shipped_model(cloud, replace(export, outline=outline, textures="png", mip_files=False, mipmaps=False)).cards
-        triangles = sum(len(card.corners) - 2 for card in cards.cards)
-        cost = DrawingCost(triangles, fragments_per_square_meter(CardRenderer(cards).fragments, views))
-        made.append(replace(switch, outline=outline, cost=cost))
-    return made
 
 
 def _fastest(found: Sequence[Sequence[Switch]], fragments_per_triangle: float, tree: DrawingCost | None) -> list[Switch | None]:
@@ -160,9 +183,3 @@ def fragments_per_square_meter(fragments: Callable[[Camera], float], views: View
     """
     scale = float(pixels_per_meter(views.cameras))
     return sum(fragments(views.cameras[index]) for index in range(len(views))) / max(1, len(views)) / scale**2
-
-
-def mesh_cost(triangles: Tensor, views: ViewSet) -> DrawingCost:
-    """What a mesh costs to draw. ``triangles`` are corners in meters, [T, 3, 3]."""
-    triangles = triangles.to(torch.float64)
-    return DrawingCost(len(triangles), fragments_per_square_meter(lambda camera: triangle_fragments(triangles, camera), views))

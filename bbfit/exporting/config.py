@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
@@ -171,6 +172,8 @@ class LodConfig:
 
     planes: tuple[Count, ...] = (16, 8, 4, 2)
     """Number of billboards of each level, the finest first."""
+    thinned: tuple[Count, ...] = ()
+    """Triangles of trees that Blender thins out, with enlarged leaves, as levels before the billboards, the finest first."""
     error_pixels: Annotated[float, Range(0, 100, open_low=True)] = 1.0
     """Largest error of a level's silhouette, gaps included, where the level takes over, in pixels of the screen.
     It holds for 95 % of the silhouette's pixels, in every training view."""
@@ -196,8 +199,10 @@ class LodConfig:
         if not isinstance(self.planes, tuple | list) or not self.planes:
             fail("planes", "expected one or more numbers of billboards", "for example 16 8 4 2")
         check_fields(self)
-        if any(coarse >= fine for fine, coarse in zip(self.planes, self.planes[1:], strict=False)):
-            fail("planes", f"expected falling numbers, got {' '.join(map(str, self.planes))}", "list the finest level first")
+        meshes = (*(() if self.triangles is None else (self.triangles,)), *self.thinned)
+        for name, numbers in (("planes", self.planes), ("thinned", meshes)):
+            if any(coarse >= fine for fine, coarse in itertools.pairwise(numbers)):
+                fail(name, f"expected falling numbers, got {' '.join(map(str, numbers))}", "list the finest level first")
 
 
 def ktx2_missing() -> str | None:

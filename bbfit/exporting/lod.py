@@ -21,7 +21,7 @@ class LodLevel:
     name: str
     """Name of its node."""
     planes: int | None
-    """Number of billboards; ``None`` for the tree itself."""
+    """Number of billboards; ``None`` for the tree itself and for a thinned-out tree."""
     vertices: int
     """Number of vertices in the file."""
     triangles: int
@@ -52,10 +52,19 @@ class LodLevel:
     """Mean error of its colors in the training views where the level takes over, in [0, 1]; 0 for the tree itself."""
     held_out_color_error: float
     """The same error in the held-out views."""
+    outline: str | None = None
+    """The outline of its billboards, if speed decided about it."""
     speed_distance_meters: float = 0.0
     """Distance from which it draws faster than the level before it; 0 where that does not count."""
     fragments: float | None = None
     """Fragments of a picture of it where it takes over, hidden and transparent ones included; ``None`` where that does not count."""
+
+    @property
+    def content(self) -> str:
+        """The number of its billboards, ``tree`` for the tree itself, or the number of triangles of a thinned-out tree."""
+        if self.planes is not None:
+            return str(self.planes)
+        return "tree" if self.psnr is None else f"{self.triangles:,} triangles"
 
 
 def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel], profile: str | None = None) -> bytes:
@@ -64,7 +73,7 @@ def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel], profile: str | 
     For the ``profile`` babylon it is the first model alone: Babylon.js takes MSFT_lod for stages of loading, and may show two of them.
 
     The first model may be any file that :func:`is_self_contained` accepts, and keeps its items and their indices. The others are those of
-    :func:`~bbfit.exporting.gltf.glb_bytes`.
+    :func:`~bbfit.exporting.gltf.glb_bytes`, or thinned-out trees that Blender wrote.
 
     The scene holds only the first level, under a new node; programs without MSFT_lod show only this level. As the extension requires, the
     nodes of the other levels are outside the scene. The ``extras`` of the first level's node hold the smallest screen coverage of each
@@ -124,12 +133,12 @@ def _append(tree: dict[str, Any], other: dict[str, Any], name: str) -> int:
 
     tree["bufferViews"] += other["bufferViews"]
     tree["accessors"] += [moved(accessor, bufferView="bufferViews") for accessor in other["accessors"]]
-    tree["images"] += [moved(image, bufferView="bufferViews") for image in other["images"]]
-    tree["samplers"] += other["samplers"]
-    for texture in other["textures"]:
+    tree["images"] += [moved(image, bufferView="bufferViews") for image in other.get("images", [])]
+    tree["samplers"] += other.get("samplers", [])
+    for texture in other.get("textures", []):
         sources = {extension: moved(entry, source="images") for extension, entry in texture.get("extensions", {}).items()}
         tree["textures"].append(moved(texture, sampler="samplers", source="images") | ({"extensions": sources} if sources else {}))
-    tree["materials"] += [with_moved_textures(material) for material in other["materials"]]
+    tree["materials"] += [with_moved_textures(material) for material in other.get("materials", [])]
     for mesh in other["meshes"]:
         primitives = [
             moved(primitive, indices="accessors", material="materials")

@@ -13,12 +13,11 @@ from torch import Tensor
 from bbfit.evaluation import metrics
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
 from bbfit.evaluation.scoring import view_angles
-from bbfit.evaluation.sizes import shrunk
 from bbfit.frames.browser import FieldPage
 from bbfit.frames.models import DrawnModel
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.opengl import camera_to_world_matrix, projection_matrix
-from bbfit.images import over_color, premultiply, read_rgba
+from bbfit.images import over_color, premultiply, read_rgba, shrunk
 from bbfit.reporting.plots import spread_views
 from bbfit.views.view_set import ViewSet
 

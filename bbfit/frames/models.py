@@ -123,7 +123,7 @@ def _levels(folder: Path) -> DrawnModel:
     check_record("levels", levels, tuple[LodLevel, ...])
     # lod.json has distances for its own screen. Over its focal length they hold for any other.
     focal = float(stored["config"]["screen_height"]) / 2 / math.tan(math.radians(float(stored["config"]["screen_fov_degrees"])) / 2)
-    names = " ".join("tree" if level.planes is None else str(level.planes) for level in levels)
+    names = ", ".join(level.content for level in levels)
     files = tuple(check_file("levels of detail", folder / "levels" / level.file) for level in levels)
     distances = tuple(level.distance_meters / focal for level in levels)
     return DrawnModel(f"{folder.resolve().name}-levels", f"levels of detail: {names}", "levels", files, distances)

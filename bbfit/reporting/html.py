@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from bbfit.evaluation.backgrounds import BACKGROUNDS, mean_flip_map
 from bbfit.evaluation.report import Report, ViewScore
 from bbfit.evaluation.scoring import held_out
-from bbfit.evaluation.sizes import shrunk
 from bbfit.exporting.encoders import encode_webp
 from bbfit.exporting.model import ShippedModel
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
-from bbfit.images import to_bytes, unpremultiply
+from bbfit.images import shrunk, to_bytes, unpremultiply
 from bbfit.model_files import generator
 from bbfit.reporting.charts import FEW, MEASURES, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
 from bbfit.reporting.plots import magma, spread_views

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from bbfit.budget.choice import Choice, pareto_front
 from bbfit.checks import check_count, fail
 from bbfit.evaluation import metrics
 from bbfit.evaluation.backgrounds import over_background
 from bbfit.evaluation.scoring import held_out, view_angles
-from bbfit.evaluation.sizes import shrunk
 from bbfit.exporting.lod import LodLevel
 from bbfit.exporting.model import ShippedModel
 from bbfit.files import write_bytes
-from bbfit.images import encode_png, over_color, to_bytes
+from bbfit.geometry.camera import Camera
+from bbfit.images import encode_png, over_color, shrunk, to_bytes
 from bbfit.views.view_set import ViewSet
 
 if TYPE_CHECKING:
@@ -227,10 +228,10 @@ def _draw_front(axes: Any, choice: Choice, cost: Cost) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def lod_picture(levels: Sequence[tuple[LodLevel, ShippedModel]], views: ViewSet, path: str | Path) -> None:
+def lod_picture(levels: Sequence[tuple[LodLevel, Callable[[Camera], Tensor]]], views: ViewSet, path: str | Path) -> None:
     """Write a PNG with one column per level of detail: one held-out view and the level, at the size at which the level takes over.
 
-    Both are enlarged to the width of the column without smoothing.
+    Each level comes with what draws it, premultiplied RGBA [H, W, 4]. Pictures are enlarged to the width of the column without smoothing.
     """
     from PIL import Image, ImageDraw
 
@@ -241,11 +242,11 @@ def lod_picture(levels: Sequence[tuple[LodLevel, ShippedModel]], views: ViewSet,
     side, gap, text = 384, 16, 14
     sheet = Image.new("RGB", (gap + len(levels) * (side + gap), 2 * (side + gap) + gap + 3 * text), PAPER)
     draw, font, bold = ImageDraw.Draw(sheet), picture_font("DejaVuSans.ttf", text), picture_font("DejaVuSans-Bold.ttf", text)
-    for column, (level, model) in enumerate(levels):
+    for column, (level, draw_level) in enumerate(levels):
         share = min(1.0, (level.tree_pixels or tall) / tall)
         size = max(metrics.SSIM_WINDOW, round(width * share)), max(metrics.SSIM_WINDOW, round(height * share))
         target = shrunk(views.targets([index])[0], *size)
-        image = model.draw(views.cameras[index].resized(*size))
+        image = draw_level(views.cameras[index].resized(*size))
         left = gap + column * (side + gap)
         draw.text((left, gap // 2), level.name, INK, bold)
         draw.text((left, gap // 2 + text * 5 // 4), f"the tree is {tall * share:.0f} pixels high", FAINT, font)

@@ -140,9 +140,9 @@ def lod_table(levels: Sequence[LodLevel]) -> Table:
     table.caption = f"{', '.join(asking)}: distances that they ask for, m; px: height of the tree; error: of the outline, px"
     table.caption_justify = "left"
     for level in levels:
-        costs = ["tree" if level.planes is None else str(level.planes), _count(level.vertices), _count(level.bytes)]
+        costs = ["thinned" if level.planes is None and level.psnr else level.content, _count(level.vertices), _count(level.bytes)]
         cells = [f"{level.distance_meters:.1f}", *["-"] * (len(asking) + 3)]
-        if level.planes is not None:
+        if level.content != "tree":
             distances = (level.silhouette_distance_meters, level.color_distance_meters, level.speed_distance_meters)
             asked = [f"{distance:.1f}" for distance in distances[: len(asking)]]
             below = "-" if level.tree_pixels is None else f"{level.tree_pixels:.0f}"

@@ -4,17 +4,26 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.conversion import tree_as_glb
+from bbfit.blender.pictures import PICTURES_FILE, render_pictures
 from bbfit.blender.request import ViewsRequest
 from bbfit.blender.views_folder import render_views
+from bbfit.images import read_rgba
 from bbfit.layout import REQUEST_FILE
+from bbfit.outputs import output_folder
+from bbfit.provenance import digest_file
 from bbfit.stages.stage import OnProgress, Stage
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.growth import grow
 from bbfit.trees.species import Species
 from bbfit.trees.tree_writer import write_tree
+from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 
 GROW_OUTPUTS = ("tree.glb",)
 
@@ -43,7 +52,7 @@ def views_stage(folder: Path, tree: TreeFile, config: ViewsConfig) -> Stage:
     return Stage("views", (tree.digest, ViewsRequest.of(tree, config).config), files, work, claims=False)
 
 
-def convert_stage(folder: Path, tree: TreeFile, name: str, *, triangles: int | None = None) -> Stage:
+def convert_stage(folder: Path, tree: TreeFile, name: str, *, triangles: int | None = None, stage: str = "convert") -> Stage:
     """Convert a tree to the GLB file ``name``, decimated to at most ``triangles`` triangles unless that is ``None``."""
 
     def work(on_progress: OnProgress) -> None:
@@ -51,4 +60,33 @@ def convert_stage(folder: Path, tree: TreeFile, name: str, *, triangles: int | N
         tree_as_glb(tree, folder / name, triangles=triangles)
         on_progress("convert", 1, 1)
 
-    return Stage("convert", (tree.digest, triangles), (name,), work)
+    return Stage(stage, (tree.digest, triangles), (name,), work, algorithm="convert")
+
+
+def pictures_stage(folder: Path, model: Path, views: ViewDataset, config: ViewsConfig, *, stage: str) -> tuple[Stage, ViewSet, ViewSet]:
+    """Render a model with the cameras of views, in their light; with its pictures of the training views and of the held-out ones.
+
+    ``config`` has the options with which the views were rendered.
+    """
+    digest, splits = digest_file(model), (views.train, views.test)
+    folders = [f"{model.stem}_{digest[:8]}/{name}" for name in ("train", "test")]  # so that another model has other folders
+    paths = [tuple(folder / out / f"{index:04}.png" for index in range(len(split))) for out, split in zip(folders, splits, strict=True)]
+
+    def work(on_progress: OnProgress) -> None:
+        done, total = 0, sum(map(len, splits))
+        for out, split in zip(folders, splits, strict=True):
+
+            def report(count: int, _: int, before: int = done) -> None:
+                on_progress(stage, before + count, total)
+
+            render_pictures(model, split.cameras, output_folder("out", folder / out), config, on_progress=report)
+            done += len(split)
+
+    outputs = tuple(f"{out}/{files}" for out in folders for files in ("*.png", PICTURES_FILE))
+    made = Stage(stage, (digest, views.fingerprint, config), outputs, work, algorithm="views", claims=False)
+    train, test = (ViewSet(own, split.cameras, _picture) for own, split in zip(paths, splits, strict=True))
+    return made, train, test
+
+
+def _picture(path: Path) -> Tensor:
+    return torch.from_numpy(read_rgba(path))

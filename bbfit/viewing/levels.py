@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from bbfit.evaluation.silhouettes import scale_within, worst_silhouette
 from bbfit.exporting.config import LodConfig
+from bbfit.exporting.model import shipped_model
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.views.view_set import ViewSet
@@ -59,4 +60,4 @@ def largest_scale(cloud: BillboardCloud, views: ViewSet, is_stopped: Callable[[]
     It is at most the scale of the views: nothing is known of larger sizes. Once ``is_stopped`` returns true, no more views are drawn.
     """
     scale = float(pixels_per_meter(views.cameras))
-    return min(scale, scale_within(worst_silhouette(cloud, views, stop=is_stopped) / scale, LodConfig().error_pixels))
+    return min(scale, scale_within(worst_silhouette(shipped_model(cloud).draw, views, stop=is_stopped) / scale, LodConfig().error_pixels))

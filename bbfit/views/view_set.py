@@ -16,7 +16,7 @@ from torch import Tensor
 from bbfit.checks import InputTypeError, check_shape, fail
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.light import Light
-from bbfit.images import premultiply, to_bytes
+from bbfit.images import premultiply, shrunk, to_bytes
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,16 @@ class ViewSet:
     def targets(self, indices: Sequence[int], dtype: torch.dtype = torch.float32) -> Tensor:
         """Several pictures as the renderer would draw them: premultiplied RGBA in [0, 1], [B, H, W, 4]."""
         return premultiply(self.images(indices).to(dtype) / 255)
+
+    def draw(self, camera: Camera) -> Tensor:
+        """The picture of a single camera with the pose of one of the views, premultiplied RGBA in [0, 1], float64 [H, W, 4].
+
+        A smaller picture than the view's is averaged by area. Raises InputError if no view has this pose or if the picture is larger.
+        """
+        same = (self.cameras.world_to_camera == camera.batch().world_to_camera.to(self.cameras.world_to_camera)).flatten(1).all(1)
+        if not bool(same.any()):
+            fail("camera", "no picture was taken from there", "give the camera of a view")
+        return shrunk(self.targets([int(same.nonzero()[0])], torch.float64)[0], camera.width, camera.height)
 
     @property
     def fingerprint(self) -> str:

@@ -176,6 +176,25 @@ def test_with_costly_triangles_levels_are_rectangles_and_with_cheap_ones_none_is
         assert 4 * level.triangles + level.fragments <= (4 * finer.triangles + finer.fragments * scales[0] ** 2) * (1 + 1e-6)
 
 
+def test_thinned_trees_are_levels_between_the_tree_and_the_billboards(built: LodResult) -> None:
+    """Their errors are those of Blender's pictures, which smaller trees of the same shape have too."""
+    counts = (built.levels[0].triangles // 2, built.levels[0].triangles // 8)
+    out = built.path.with_name("thinned.glb")
+    result = build_lod(TREE, out, replace(LEVELS, thinned=counts), SMALL, work=built.folder)
+    assert [level.planes for level in result.levels] == [None, None, None, 4, 2]
+    fine, coarse = result.levels[1:3]
+    for level, count in zip((fine, coarse), counts, strict=True):
+        assert 0.5 * count < level.triangles <= count and level.psnr
+        assert (level.vertices, level.triangles) == glb_counts((built.folder / "levels" / level.file).read_bytes())
+    assert fine.error_meters <= coarse.error_meters and fine.psnr > coarse.psnr  # type: ignore[operator]
+    assert (fine.psnr or 0) > max(level.psnr or 0 for level in built.levels[1:])
+    distances = [level.distance_meters for level in result.levels]
+    assert distances == sorted(distances) and distances[3:] == [level.distance_meters for level in built.levels[1:]]
+    before = {path: path.stat().st_mtime_ns for path in built.folder.rglob("*.png")}
+    assert build_lod(TREE, out, replace(LEVELS, thinned=counts), SMALL, work=built.folder) == result
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
 def _pixels_of_views(built: LodResult) -> float:
     """Height of the tree in its views, in pixels at the axis."""
     views = ViewDataset.load(built.folder / "views")
@@ -226,6 +245,8 @@ def test_bad_wishes(tmp_path: Path) -> None:
         ({"planes": (4, 0)}, "planes: expected at least 1"),
         ({"error_pixels": 0.0}, "error_pixels"),
         ({"triangles": 0}, "triangles"),
+        ({"thinned": (50, 100)}, "thinned: expected falling numbers, got 50 100"),
+        ({"triangles": 100, "thinned": (100,)}, "thinned: expected falling numbers, got 100 100"),
         ({"screen_width": 0}, "screen_width"),
         ({"fragments_per_triangle": -1.0}, "fragments_per_triangle"),
         ({"screen_fov_degrees": 180.0}, "screen_fov_degrees"),

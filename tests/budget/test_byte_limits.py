@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from bbfit.budget.sizes import fitted_within_bytes, model_bytes, within_bytes
-from bbfit.budget.trials import validation_psnr
 from bbfit.checks import InputError
+from bbfit.evaluation.scoring import views_psnr
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
@@ -43,11 +43,11 @@ def test_too_many_bytes_are_fitted_away(views: ViewDataset, result: FitResult, s
     cloud = fitted_within_bytes(views, result, limit, EXPORT)
     assert 0.8 * limit < model_bytes(cloud, EXPORT) <= limit
     assert torch.equal(cloud.rights, result.cloud.rights) and torch.equal(cloud.ups, result.cloud.ups)
-    psnr = validation_psnr(shipped_model(cloud).antialiased(), views.train)
+    psnr = views_psnr(shipped_model(cloud).antialiased().draw, views.train)
     for palette, less in ((0, 0.5), (result.config.palette, 0.1)):  # measured 0.74 and 0.22, and more
         resized = within_bytes(result.cloud, limit, EXPORT, palette=palette)
         assert model_bytes(resized, EXPORT) <= limit
-        assert psnr > validation_psnr(shipped_model(resized).antialiased(), views.train) + less
+        assert psnr > views_psnr(shipped_model(resized).antialiased().draw, views.train) + less
 
 
 def test_a_limit_below_the_rectangles_is_refused(views: ViewDataset, result: FitResult) -> None:

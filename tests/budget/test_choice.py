@@ -18,9 +18,9 @@ from bbfit.budget import trials as trials_module
 from bbfit.budget.choice import COUNTS, MIN_GAIN_DB, START, Choice, choose, pareto_front
 from bbfit.budget.config import BudgetConfig
 from bbfit.budget.sizes import model_bytes, within_bytes
-from bbfit.budget.trials import Trial, lookup, short_config, validation_psnr
+from bbfit.budget.trials import Trial, lookup, short_config
 from bbfit.checks import InputError
-from bbfit.evaluation.scoring import evaluate
+from bbfit.evaluation.scoring import evaluate, views_psnr
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
 from bbfit.fitting.bark import Bark
@@ -144,9 +144,9 @@ def test_a_texel_for_each_is_the_end_and_not_an_error(noise: BillboardCloud) -> 
 def test_the_mean_psnr_is_that_of_the_report(views: ViewDataset, known_cloud: BillboardCloud) -> None:
     worse = known_cloud.with_texels(known_cloud.texels**2)
     for split in (views.test, views.train.take([3, 7])):
-        found = validation_psnr(shipped_model(worse), split)
+        found = views_psnr(shipped_model(worse).draw, split)
         assert found == pytest.approx(evaluate(worse, split).mean.over.mean.psnr, abs=1e-9) and 10 < found < 40
-    assert validation_psnr(shipped_model(known_cloud), views.test) > found + 5
+    assert views_psnr(shipped_model(known_cloud).draw, views.test) > found + 5
 
 
 # Rules, with qualities that are made up.
@@ -594,7 +594,7 @@ def test_a_trial_is_a_short_fit_measured_on_views_it_has_not_seen(views: ViewDat
         assert trial.max_texels is None
         assert (trial.vertices, trial.texels, trial.bytes) == (cloud.vertex_count, len(cloud.texels), model_bytes(cloud, export))
         assert 0 < trial.texture_bytes < trial.bytes
-        assert trial.psnr == pytest.approx(validation_psnr(shipped_model(cloud, export), held), abs=6e-4) and trial.seconds >= 0
+        assert trial.psnr == pytest.approx(views_psnr(shipped_model(cloud, export).draw, held), abs=6e-4) and trial.seconds >= 0
 
 
 @pytest.mark.slow
@@ -760,7 +760,7 @@ def test_a_choice_on_real_views() -> None:
     )
     cloud = fit(rest, config, placement=start).cloud
     assert (best.vertices, best.texels, best.bytes) == (cloud.vertex_count, len(cloud.texels), model_bytes(cloud, ExportConfig()))
-    assert best.psnr == pytest.approx(validation_psnr(shipped_model(cloud), views.train.take(held)), abs=6e-4)
+    assert best.psnr == pytest.approx(views_psnr(shipped_model(cloud).draw, views.train.take(held)), abs=6e-4)
 
 
 @pytest.mark.slow

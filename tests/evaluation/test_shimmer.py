@@ -16,14 +16,13 @@ from bbfit.checks import InputError
 from bbfit.evaluation.report import Report
 from bbfit.evaluation.scoring import evaluate
 from bbfit.evaluation.shimmer import change, score_shimmer
-from bbfit.evaluation.sizes import shrunk
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.orbit import Orbit
-from bbfit.images import over_color, unpremultiply
+from bbfit.images import over_color, shrunk, unpremultiply
 from bbfit.rendering.dispatch import render
 from bbfit.views.dataset import TurnedViews
 from bbfit.views.view_set import ViewSet

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from bbfit.checks import InputError
 from bbfit.evaluation.backgrounds import BACKGROUNDS
-from bbfit.evaluation.sizes import score_sizes, shrunk
+from bbfit.evaluation.sizes import score_sizes
 from bbfit.geometry.camera import Camera
-from bbfit.images import over_color
+from bbfit.images import over_color, shrunk
 from bbfit.rendering.dispatch import render
 from bbfit.views.dataset import ViewDataset
 from bbfit.views.view_set import ViewSet

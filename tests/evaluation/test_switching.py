@@ -61,5 +61,5 @@ def test_the_cost_of_a_mesh_is_its_triangles_and_their_area_in_square_meters(siz
         orthographic=True,
     )
     views = ViewSet.from_arrays(torch.zeros(1, size, size, 4), camera)
-    cost = mesh_cost(torch.cat([square, square - torch.tensor([0.0, 0.0, 1.0])]), views)
+    cost = mesh_cost(torch.cat([square, square - torch.tensor([0.0, 0.0, 1.0])]).numpy(), views)
     assert cost.triangles == 4 and cost.fragments == pytest.approx(2.0)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from bbfit.evaluation.silhouettes import worst_silhouette
+from bbfit.exporting.model import shipped_model
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.viewing.levels import ViewerLevel, field_levels, largest_scale
@@ -19,7 +20,7 @@ def test_a_cloud_takes_over_where_its_error_is_a_pixel(views_folder: Path, known
     """As levels of detail in a file do; and from the size of the views on if it is smaller there."""
     views = ViewDataset.load(views_folder).train
     moved = BillboardCloud(**{**vars(known_cloud), "centers": known_cloud.centers + torch.tensor([0.4, 0.0, 0.0])})
-    error = worst_silhouette(moved, views)
+    error = worst_silhouette(shipped_model(moved).draw, views)
     assert error > 2
     assert largest_scale(moved, views) == pytest.approx(float(pixels_per_meter(views.cameras)) / (1.15 * error))
     assert largest_scale(known_cloud, views) == float(pixels_per_meter(views.cameras))
