@@ -59,7 +59,7 @@ export class TreeField extends Group {
 
   // Adds copies that stand near each other. A patch outside the picture costs no time.
   addPatch(matrices) {
-    const patch = { start: this.count, count: matrices.length / 16, bounds: new Sphere() };
+    const patch = { start: this.count, count: matrices.length / 16, bounds: new Sphere(), largest: 0 }; // the largest scale
     if (this.count + patch.count > this.chosen.length) this.#makeRoom(Math.ceil(1.5 * (this.count + patch.count)));
     this.matrices.set(matrices, 16 * patch.start);
     this.count += patch.count;
@@ -73,9 +73,8 @@ export class TreeField extends Group {
       box.expandByPoint(center);
     }
     box.getBoundingSphere(patch.bounds);
-    let largest = 0;
-    for (let copy = patch.start; copy < this.count; copy += 1) largest = Math.max(largest, this.spheres[4 * copy + 3]);
-    patch.bounds.radius += this.radius * largest;
+    for (let copy = patch.start; copy < this.count; copy += 1) patch.largest = Math.max(patch.largest, this.spheres[4 * copy + 3]);
+    patch.bounds.radius += this.radius * patch.largest;
     this.patches.push(patch);
     return patch;
   }

@@ -77,9 +77,9 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
       renderOnce();
     }
     before = active ? now : null;
-    if (now - written > 250 && active) {
-      written = now;
+    if (active ? now - written > 250 : written !== null) {
       describe();
+      written = active ? now : null; // all is written when the page comes to rest
     }
   }
 

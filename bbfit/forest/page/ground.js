@@ -60,10 +60,7 @@ void main() {`)
   // What lies around the forest. It is drawn behind everything else.
   const around = new THREE.Mesh(new THREE.PlaneGeometry(1, 1).rotateX(-Math.PI / 2), new THREE.MeshBasicMaterial({ depthWrite: false, depthTest: false }));
   around.material.color.setRGB(...MEADOW.map((value) => value / 255)).convertSRGBToLinear();
-  around.material.onBeforeCompile = (shader) => {
-    grain(shader);
-    shader.fragmentShader = shader.fragmentShader.replace("#include <map_fragment>", "#include <map_fragment>");
-  };
+  around.material.onBeforeCompile = grain;
   around.position.set((low[0] + high[0]) / 2, heights ? heights.reduce((least, height) => Math.min(least, height), Infinity) : bottom, (low[1] + high[1]) / 2);
   Object.assign(around, { frustumCulled: false, renderOrder: -2 });
 

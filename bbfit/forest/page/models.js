@@ -23,33 +23,46 @@ window.bbfitForest = {
     const FILTERS = { 9728: "Nearest", 9729: "Linear", 9984: "NearestMipmapNearest", 9985: "LinearMipmapNearest", 9986: "NearestMipmapLinear", 9987: "LinearMipmapLinear" };
     const WRAPS = { 33071: "ClampToEdge", 33648: "MirroredRepeat", 10497: "Repeat" };
     async function texture(name, { magFilter, minFilter, wrapS, wrapT }) {
-      const picture = new Blob([await packs.load(name)], { type: "image/png" });
+      const picture = new Blob([await packs.load(name)]);
       const image = await createImageBitmap(picture, { premultiplyAlpha: "none", colorSpaceConversion: "none" });
       const made = Object.assign(new THREE.Texture(image), { flipY: false, needsUpdate: true, anisotropy: 4 });
       Object.assign(made, { magFilter: THREE[`${FILTERS[magFilter]}Filter`], minFilter: THREE[`${FILTERS[minFilter]}Filter`] });
       return Object.assign(made, { wrapS: THREE[`${WRAPS[wrapS]}Wrapping`], wrapT: THREE[`${WRAPS[wrapT]}Wrapping`] });
     }
 
-    async function loadLevel({ pack, pictures }) {
-      const loader = new THREE.GLTFLoader().register(sharing(pictures));
-      return bbfit.loadModel(THREE, (await packs.load(pack)).buffer, true, loader);
+    // Mixes a color into a material: red, green and blue in linear light, and its share.
+    function tintable(material) {
+      const tint = (material.userData.tint = new THREE.Vector4());
+      material.onBeforeCompile = (shader) => {
+        shader.uniforms.tint = { value: tint };
+        shader.fragmentShader = shader.fragmentShader
+          .replace("void main() {", "uniform vec4 tint;\nvoid main() {")
+          .replace("#include <map_fragment>", `#include <map_fragment>
+  diffuseColor.rgb = mix( diffuseColor.rgb, tint.rgb * ( 0.3 + 2.0 * dot( diffuseColor.rgb, vec3( 0.3333 ) ) ), tint.a );`);
+      };
     }
 
-    // The levels that are loaded. The coarsest but one that is missing leaves the next coarser one in its place.
+    async function loadLevel({ pack, pictures }) {
+      const loader = new THREE.GLTFLoader().register(sharing(pictures));
+      const model = await bbfit.loadModel(THREE, (await packs.load(pack)).buffer, true, loader);
+      model.traverse(({ material }) => { if (material && !material.userData.tint) tintable(material); });
+      return model;
+    }
+
+    // The levels that are loaded, finest first. One that is missing leaves its place to the next coarser one.
     const usable = (entry) => entry.objects.flatMap((object, level) => (object ? [{ object, level, distance: 0 }] : []));
 
-    function applyDistances(entry) {
-      const before = [...usable(entry)];
-      entry.field.levels.forEach((level, index) => { level.distance = index === 0 ? 0 : factor * trees[entry.tree].levels[before[index].level].distance; });
-      entry.field.farthest = farthest;
+    function applyDistances({ tree, field, objects }) {
+      const loaded = usable({ objects });
+      field.levels.forEach((level, index) => { level.distance = factor * trees[tree].levels[loaded[index].level].distance; });
+      field.farthest = farthest;
     }
 
     function paint(entry) {
-      usable(entry).forEach(({ level }, index) => entry.field.levels[index].parts.forEach(({ material }) => {
-        material.userData.ownColor ??= material.color.clone();
-        if (colored) material.color.set(colors[level % colors.length]).multiplyScalar(2.5);
-        else material.color.copy(material.userData.ownColor);
-      }));
+      usable(entry).forEach(({ level }, index) => {
+        const { r, g, b } = new THREE.Color(colors[level % colors.length]).convertSRGBToLinear();
+        for (const { material } of entry.field.levels[index].parts) material.userData.tint.set(r, g, b, colored ? 0.85 : 0);
+      });
     }
 
     async function request(entry, level) {
