@@ -46,7 +46,14 @@ MARKED = {
         "test_notebooks.py",
         "test_pipeline.py",
     ),
-    "browser": ("frames/test_measurement.py", "reporting/test_html.py", "reporting/test_suns.py", "viewers", "viewing"),
+    "browser": (
+        "forest/test_web_page.py",
+        "frames/test_measurement.py",
+        "reporting/test_html.py",
+        "reporting/test_suns.py",
+        "viewers",
+        "viewing",
+    ),
     "node": ("exporting/test_formats.py", "exporting/test_lod.py", "exporting/test_model.py"),
     "ray": ("sweep/test_cluster.py",),
     "slow": (

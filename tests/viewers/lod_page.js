@@ -21,7 +21,8 @@ const programs = {
     };
   },
 
-  // Copies of the tree: ?matrices= lists their matrices, column after column. By default it is one, where the tree is.
+  // Copies of the tree: ?matrices= lists their matrices, column after column. By default it is one, where the tree is. ?patches= adds them
+  // one after another.
   async field() {
     const THREE = await import("three");
     const { loadField } = await import("/levels/lod_field_three.js");
@@ -29,7 +30,9 @@ const programs = {
     const scene = new THREE.Scene();
     const camera = new THREE.PerspectiveCamera(FOV, 1, 1, 10000);
     const matrices = JSON.parse(query.get("matrices")) ?? new THREE.Matrix4().toArray();
-    const field = await loadField("/levels/lod.json", new Float32Array(matrices), { height: SIZE, fov: FOV });
+    const all = new Float32Array(matrices);
+    const field = await loadField("/levels/lod.json", query.has("patches") ? [] : all, { height: SIZE, fov: FOV });
+    if (query.has("patches")) inPatches(field, all);
     scene.add(field);
     return (distance) => {
       camera.position.set(center[0], center[1], center[2] + distance);
@@ -108,6 +111,18 @@ const programs = {
     };
   },
 };
+
+// Adds each copy as a patch of its own, and two more between them that go again.
+function inPatches(field, matrices) {
+  const others = [];
+  for (let start = 0; start < matrices.length; start += 16) {
+    others.push(field.addPatch(matrices));
+    field.addPatch(matrices.subarray(start, start + 16));
+    others.push(field.addPatch(matrices.subarray(0, 32)));
+  }
+  for (const patch of others) field.removePatch(patch);
+  if (field.count !== matrices.length / 16 || field.patches.length !== field.count) throw new Error("patches are left");
+}
 
 const draw = programs[program]();
 

@@ -124,13 +124,14 @@ def test_levels_fade_into_each_other_in_three(program: str, chromium: tuple[Brow
             assert green / (red + green) == pytest.approx(portion, abs=0.05)
 
 
+@pytest.mark.parametrize("way", ["", "&patches=each"])
 def test_each_copy_of_a_field_has_the_level_for_its_own_distance_and_size(
-    chromium: tuple[Browser, ThreadPoolExecutor], tmp_path: Path
+    way: str, chromium: tuple[Browser, ThreadPoolExecutor], tmp_path: Path
 ) -> None:
     """A copy of half the size shows the level of twice the distance; others are outside the picture and behind the camera."""
     copies = [(0.5, -1.3, 0.5, 0.0), (2.0, 1.2, -1.0, 0.0), (1.0, 10.0, 0.0, 0.0), (1.0, 0.0, 0.0, 400.0)]  # size and place
     matrices = [value for size, *place in copies for value in (size, 0, 0, 0, 0, size, 0, 0, 0, 0, size, 0, *place, 1)]
-    query = f"program=field&matrices={json.dumps(matrices, separators=(',', ':'))}"
+    query = f"program=field&matrices={json.dumps(matrices, separators=(',', ':'))}{way}"
     with closing(Levels(*chromium, levels_folder(tmp_path / "levels", "three", (2.0, 2.0, 2.0)), query)) as page:
         red, green, blue = page.shares(150.0)
     edge = 150.0 * np.tan(np.radians(1))

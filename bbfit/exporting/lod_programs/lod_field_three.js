@@ -4,59 +4,121 @@
 //   renderer.setAnimationLoop(() => { field.update(camera); renderer.render(scene, camera); });
 // matrices are 16 numbers for each copy, column after column: where it stands, its turn, and its size. Levels fade into each other by
 // dithering: each pixel shows one of the two, so masks stay masks. Copies outside the picture are left out.
-import { DynamicDrawUsage, Frustum, Group, InstancedBufferAttribute, InstancedMesh, MathUtils, Matrix4, Sphere, Vector3 } from "three";
+// Copies may come and go in patches, such as the tiles of a map: field.addPatch(matrices) returns a patch for field.removePatch(patch).
+import { Box3, DynamicDrawUsage, Frustum, Group, InstancedBufferAttribute, InstancedMesh, MathUtils, Matrix4, Sphere, Vector3 } from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 
 const BUCKETS = 256; // of distances, by which copies are sorted
+const DITHERED = new WeakSet(); // materials whose shaders fade
 const focal = (height, fov) => height / 2 / Math.tan(MathUtils.degToRad(fov) / 2);
 
-export async function loadField(url, matrices, { height, fov, loader = new GLTFLoader(), fade = 0.1 } = {}) {
+export async function loadField(url, matrices, { height, fov, loader = new GLTFLoader(), fade = 0.1, farthest = Infinity } = {}) {
   const { config, extent, levels } = await (await fetch(url)).json();
   const factor = height && fov ? focal(height, fov) / focal(config.screen_height, config.screen_fov_degrees) : 1;
   const loaded = levels.map(async ({ file, distance_meters }) => {
     const { scene } = await loader.loadAsync(new URL(file, new URL(url, location)).href);
     return { object: scene, distance: factor * distance_meters };
   });
-  return new TreeField(await Promise.all(loaded), extent, matrices, { fade });
+  return new TreeField(await Promise.all(loaded), extent, matrices, { fade, farthest });
 }
 
 // levels: { object, distance } for each, finest first, and from which distance in meters a copy of the tree's own size shows it.
 // extent: the corners low and high of the tree's bounds. A copy of twice the size keeps its level to twice the distance.
+// farthest: the distance in meters beyond which copies are left out.
 export class TreeField extends Group {
-  constructor(levels, extent, matrices, { fade = 0.1 } = {}) {
+  constructor(levels, extent, matrices = [], { fade = 0.1, farthest = Infinity } = {}) {
     super();
     const low = new Vector3(...extent.low);
     const high = new Vector3(...extent.high);
     this.center = low.clone().lerp(high, 0.5);
     this.radius = low.distanceTo(high) / 2;
     this.fade = fade;
-    this.levels = levels.map(({ object, distance }) => ({ distance, parts: partsOf(object), capacity: 0, count: 0 }));
+    this.farthest = farthest;
+    this.levels = [];
+    this.setLevels(levels);
     this.setMatrices(matrices);
   }
 
+  // Other levels, finest first, such as one more that has been loaded. An object that was a level before stays as it is on the card.
+  setLevels(levels) {
+    const before = new Map(this.levels.map((level) => [level.object, level]));
+    this.levels = levels.map(({ object, distance }) => {
+      const level = before.get(object) ?? { object, parts: partsOf(object), capacity: 0, count: 0 };
+      before.delete(object);
+      return Object.assign(level, { distance });
+    });
+    for (const level of before.values()) this.#release(level);
+  }
+
   setMatrices(matrices) {
-    this.matrices = matrices;
-    this.count = matrices.length / 16;
-    this.spheres = new Float32Array(4 * this.count); // center and scale of each copy
+    this.count = 0;
+    this.patches = [];
+    this.#makeRoom(matrices.length / 16);
+    if (matrices.length > 0) this.addPatch(matrices);
+  }
+
+  // Adds copies that stand near each other. A patch outside the picture costs no time.
+  addPatch(matrices) {
+    const patch = { start: this.count, count: matrices.length / 16, bounds: new Sphere(), largest: 0 }; // the largest scale
+    if (this.count + patch.count > this.chosen.length) this.#makeRoom(Math.ceil(1.5 * (this.count + patch.count)));
+    this.matrices.set(matrices, 16 * patch.start);
+    this.count += patch.count;
     const matrix = new Matrix4();
     const center = new Vector3();
-    for (let copy = 0; copy < this.count; copy += 1) {
-      matrix.fromArray(matrices, 16 * copy);
+    const box = new Box3();
+    for (let copy = patch.start; copy < this.count; copy += 1) {
+      matrix.fromArray(this.matrices, 16 * copy);
       center.copy(this.center).applyMatrix4(matrix).toArray(this.spheres, 4 * copy);
       this.spheres[4 * copy + 3] = matrix.getMaxScaleOnAxis();
+      box.expandByPoint(center);
     }
-    this.chosen = new Uint8Array(this.count); // the coarsest level that a copy shows, whole or in part
-    this.progress = new Float32Array(this.count); // how far that level has faded in
-    this.buckets = new Uint8Array(this.count);
-    this.sorted = new Uint32Array(this.count);
+    box.getBoundingSphere(patch.bounds);
+    for (let copy = patch.start; copy < this.count; copy += 1) patch.largest = Math.max(patch.largest, this.spheres[4 * copy + 3]);
+    patch.bounds.radius += this.radius * patch.largest;
+    this.patches.push(patch);
+    return patch;
+  }
+
+  removePatch(patch) {
+    const end = patch.start + patch.count;
+    this.matrices.copyWithin(16 * patch.start, 16 * end, 16 * this.count);
+    this.spheres.copyWithin(4 * patch.start, 4 * end, 4 * this.count);
+    this.patches.splice(this.patches.indexOf(patch), 1);
+    for (const other of this.patches) if (other.start >= end) other.start -= patch.count;
+    this.count -= patch.count;
+  }
+
+  // The copies that the last update found in the picture.
+  get shown() {
+    return this.seen ?? 0;
+  }
+
+  // Frees what the field has on the graphics card; geometries and materials belong to the objects of the levels.
+  dispose() {
+    this.levels.forEach((level) => this.#release(level));
+  }
+
+  #makeRoom(copies) {
+    const { matrices = [], spheres = [] } = this;
+    this.matrices = new Float32Array(16 * copies);
+    this.spheres = new Float32Array(4 * copies); // center and scale of each copy
+    if (this.count > 0) {
+      this.matrices.set(matrices.subarray(0, 16 * this.count));
+      this.spheres.set(spheres.subarray(0, 4 * this.count));
+    }
+    this.chosen = new Uint8Array(copies); // the coarsest level that a copy shows, whole or in part
+    this.progress = new Float32Array(copies); // how far that level has faded in
+    this.buckets = new Uint8Array(copies);
+    this.candidates = new Uint32Array(copies);
+    this.sorted = new Uint32Array(copies);
   }
 
   // Chooses the levels for a camera; call it before each frame.
   update(camera) {
     this.updateWorldMatrix(true, false);
     camera.updateWorldMatrix(true, false);
-    const seen = this.#choose(camera);
-    this.levels.forEach((level, index) => this.#fill(level, index, seen));
+    this.seen = this.#choose(camera);
+    this.levels.forEach((level, index) => this.#fill(level, index, this.seen));
   }
 
   // Chooses level, progress and place in the order for each copy in the picture; returns their number, with their indices in this.sorted.
@@ -70,39 +132,49 @@ export class TreeField extends Group {
     const parallel = camera.isOrthographicCamera ? (camera.top - camera.bottom) / camera.zoom / 2 / Math.tan(MathUtils.degToRad(25)) : 0;
     const sphere = new Sphere();
     const distances = this.levels.map((level) => level.distance);
-    const [nearest, farthest] = this.#reach(eye, ahead);
+    const inside = ({ bounds }) => frustum.intersectsSphere(bounds) && bounds.distanceToPoint(eye) < this.farthest;
+    const patches = this.patches.filter(inside);
+    const [nearest, farthest] = this.#reach(patches, eye, ahead);
     const perBucket = (BUCKETS - 1e-3) / Math.max(farthest - nearest, 1e-6);
     const counts = new Uint32Array(BUCKETS + 1);
-    const shown = new Uint32Array(this.count);
     let seen = 0;
-    for (let copy = 0; copy < this.count; copy += 1) {
-      const at = 4 * copy;
-      sphere.center.fromArray(this.spheres, at);
-      const scale = this.spheres[at + 3];
-      sphere.radius = this.radius * scale;
-      if (!frustum.intersectsSphere(sphere)) continue;
-      const depth = sphere.center.sub(eye).dot(ahead);
-      const distance = (parallel || sphere.center.length() / camera.zoom) / scale;
-      let level = distances.length - 1;
-      while (level > 0 && distance < distances[level]) level -= 1;
-      this.chosen[copy] = level;
-      this.progress[copy] = level === 0 || this.fade === 0 ? 1 : Math.min(1, (distance - distances[level]) / (this.fade * distances[level]));
-      this.buckets[copy] = Math.min(Math.max((depth - nearest) * perBucket, 0), BUCKETS - 1);
-      counts[this.buckets[copy] + 1] += 1;
-      shown[seen] = copy;
-      seen += 1;
+    for (const { start, count } of patches) {
+      for (let copy = start; copy < start + count; copy += 1) {
+        const at = 4 * copy;
+        sphere.center.fromArray(this.spheres, at);
+        const scale = this.spheres[at + 3];
+        sphere.radius = this.radius * scale;
+        if (!frustum.intersectsSphere(sphere)) continue;
+        const depth = sphere.center.sub(eye).dot(ahead);
+        const away = sphere.center.length();
+        if (away > this.farthest) continue;
+        const distance = (parallel || away / camera.zoom) / scale;
+        let level = distances.length - 1;
+        while (level > 0 && distance < distances[level]) level -= 1;
+        const into = (distance - distances[level]) / (this.fade * distances[level]);
+        this.chosen[copy] = level;
+        this.progress[copy] = level === 0 || this.fade === 0 ? 1 : Math.min(1, into);
+        this.buckets[copy] = Math.min(Math.max((depth - nearest) * perBucket, 0), BUCKETS - 1);
+        counts[this.buckets[copy] + 1] += 1;
+        this.candidates[seen] = copy;
+        seen += 1;
+      }
     }
     for (let bucket = 0; bucket < BUCKETS; bucket += 1) counts[bucket + 1] += counts[bucket];
-    for (let index = 0; index < seen; index += 1) this.sorted[counts[this.buckets[shown[index]]]++] = shown[index];
+    for (let index = 0; index < seen; index += 1) {
+      const copy = this.candidates[index];
+      this.sorted[counts[this.buckets[copy]]++] = copy;
+    }
     return seen;
   }
 
-  // The least and the greatest depth of copies.
-  #reach(eye, ahead) {
-    let [nearest, farthest] = [Infinity, -Infinity];
-    for (let at = 0; at < this.spheres.length; at += 4) {
-      const depth = (this.spheres[at] - eye.x) * ahead.x + (this.spheres[at + 1] - eye.y) * ahead.y + (this.spheres[at + 2] - eye.z) * ahead.z;
-      if (depth > 0) [nearest, farthest] = [Math.min(nearest, depth), Math.max(farthest, depth)];
+  // The least and the greatest depth that copies of patches may have.
+  #reach(patches, eye, ahead) {
+    let [nearest, farthest] = [Infinity, 0];
+    for (const { bounds } of patches) {
+      const depth = bounds.center.clone().sub(eye).dot(ahead);
+      nearest = Math.min(nearest, Math.max(0, depth - bounds.radius));
+      farthest = Math.max(farthest, Math.min(this.farthest, depth + bounds.radius));
     }
     return [nearest, farthest];
   }
@@ -129,16 +201,17 @@ export class TreeField extends Group {
     }
     level.count = count;
     for (const attribute of [matrix, fading]) {
-      attribute.clearUpdateRanges();
-      attribute.addUpdateRange(0, count * attribute.itemSize);
+      const length = count * attribute.itemSize;
+      attribute.clearUpdateRanges?.();
+      if (attribute.addUpdateRange) attribute.addUpdateRange(0, length);
+      else Object.assign(attribute.updateRange, { offset: 0, count: length }); // before three.js 0.159
       attribute.needsUpdate = count > 0;
     }
     for (const mesh of level.meshes) Object.assign(mesh, { count, visible: count > 0 });
   }
 
   #reserve(level, capacity) {
-    this.remove(...(level.meshes ?? []));
-    level.meshes?.forEach((mesh) => mesh.dispose());
+    this.#release(level);
     Object.assign(level, { capacity, matrix: attribute(16, capacity), fading: attribute(2, capacity) });
     level.meshes = level.parts.map(({ geometry, material }) => {
       const shared = geometry.clone();
@@ -149,6 +222,13 @@ export class TreeField extends Group {
       return mesh;
     });
     this.add(...level.meshes);
+  }
+
+  // The buffers of copies. Vertices stay on the card, for the geometries of meshes share them.
+  #release(level) {
+    this.remove(...(level.meshes ?? []));
+    level.meshes?.forEach((mesh) => mesh.dispose());
+    Object.assign(level, { capacity: 0, count: 0, meshes: undefined });
   }
 }
 
@@ -171,6 +251,8 @@ function partsOf(object) {
 
 // Interleaved gradient noise (Jimenez 2014, "Next generation post processing in Call of Duty: Advanced Warfare").
 function dithered(material) {
+  if (DITHERED.has(material)) return material; // of several meshes
+  DITHERED.add(material);
   const before = material.onBeforeCompile;
   material.onBeforeCompile = (shader, renderer) => {
     before.call(material, shader, renderer);

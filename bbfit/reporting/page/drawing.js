@@ -24,8 +24,8 @@ window.bbfit = (() => {
   }
 
   // A renderer that writes sRGB and lights surfaces in physical units. Its canvas, which three.js has to make itself, replaces an element.
-  function createRenderer(THREE, element) {
-    const renderer = new THREE.WebGLRenderer({ antialias: true });
+  function createRenderer(THREE, element, { antialias = true } = {}) {
+    const renderer = new THREE.WebGLRenderer({ antialias });
     Object.assign(renderer, { outputEncoding: THREE.sRGBEncoding, physicallyCorrectLights: true });
     for (const { name, value } of element.attributes) renderer.domElement.setAttribute(name, value);
     element.replaceWith(renderer.domElement);
@@ -62,8 +62,8 @@ window.bbfit = (() => {
   // The scene in the bytes of a GLB file. In a layered one, texels that are at least half opaque are drawn first and hide what is behind
   // them. The rest is blended over them in any order. A material for coverage covers samples. Blending only keeps the
   // alpha of the canvas, and the alpha test drops what covers none of four samples, also where a context has one sample alone.
-  async function loadModel(THREE, buffer, layered) {
-    const { scene } = await new THREE.GLTFLoader().parseAsync(buffer, "");
+  async function loadModel(THREE, buffer, layered, loader = new THREE.GLTFLoader()) {
+    const { scene } = await loader.parseAsync(buffer, "");
     const covering = { alphaToCoverage: true, alphaTest: 0.125, blending: THREE.CustomBlending };
     Object.assign(covering, { blendSrc: THREE.OneFactor, blendDst: THREE.ZeroFactor });
     Object.assign(covering, { blendSrcAlpha: THREE.ZeroFactor, blendDstAlpha: THREE.OneFactor });
