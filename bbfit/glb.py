@@ -61,7 +61,19 @@ def joined_glb(tree: dict[str, Any], contents: Sequence[bytes]) -> bytes:
     for view, content in zip(tree["bufferViews"], contents, strict=True):
         views.append(view | {"buffer": 0, "byteOffset": len(binary), "byteLength": len(content)})
         binary += content + bytes(-len(content) % 4)
-    text = json.dumps(tree | {"bufferViews": views, "buffers": [{"byteLength": len(binary)}]}, separators=(",", ":")).encode()
+    return b"".join(glb_pieces(tree | {"bufferViews": views, "buffers": [{"byteLength": len(binary)}]}, [bytes(binary)]))
+
+
+def glb_pieces(tree: dict[str, Any], contents: Sequence[bytes]) -> list[bytes]:
+    """The pieces of a GLB of a JSON and its binary chunk, which is the ``contents`` one after another, each of a multiple of 4 bytes.
+
+    Raises InputError if the file would have 4 GiB or more, the most that a GLB can have.
+    """
+    text = json.dumps(tree, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    chunks = b"".join(struct.pack("<I", len(chunk)) + kind + chunk for kind, chunk in ((b"JSON", text), (b"BIN\0", bytes(binary))))
-    return _GLB_2 + struct.pack("<I", 12 + len(chunks)) + chunks
+    size = sum(map(len, contents))
+    total = 28 + len(text) + size
+    if total >= 1 << 32:
+        fail("model", f"a GLB of {total:,} bytes is larger than 4 GiB", "choose another format, or fewer objects")
+    header = _GLB_2 + struct.pack("<II", total, len(text)) + b"JSON"
+    return [header, text, struct.pack("<I", size) + b"BIN\0", *contents]

@@ -26,7 +26,7 @@ class Placements:
     trees: NDArray[np.int32]
     """Index into ``Library.trees``, [P]."""
     rows: NDArray[np.int64] | None = None
-    """Row of the register, the first tree being 1, [P], or ``None``."""
+    """Row of the register, [P], or ``None``: the line of a table as spreadsheet programs count, or the number of a feature, from 1."""
     species: NDArray[np.int32] | None = None
     """Index into the names of species that the register uses (``Forest.species``), -1 without one, [P], or ``None``."""
 
