@@ -73,7 +73,8 @@ def write_page(folder: Path, library: Library, root: ForestTile, read: Read, con
     check_fields(config)
     page = output_folder("out", folder / PAGE)
     for part in ("models", "pictures", "tiles"):
-        output_folder("out", page / "data" / part)
+        for earlier in output_folder("out", page / "data" / part).glob("*.js"):
+            earlier.unlink()
     margin = max(50.0, 0.05 * max(root.high[0] - root.low[0], root.high[2] - root.low[2]))
     low, high = (root.low[0] - margin, root.low[2] - margin), (root.high[0] + margin, root.high[2] + margin)
     ground = GroundMap(low, high, np.array([_crown_area(tree) for tree in library.trees]))

@@ -147,7 +147,8 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
   }
   const pixels = () => {
     renderOnce();
-    const gl = renderer.getContext(), { drawingBufferWidth: width, drawingBufferHeight: high } = gl, values = new Uint8Array(4 * width * high);
+    const gl = renderer.getContext(), { drawingBufferWidth: width, drawingBufferHeight: high } = gl;
+    const values = new Uint8Array(4 * width * high);
     gl.readPixels(0, 0, width, high, gl.RGBA, gl.UNSIGNED_BYTE, values); // the bottom row first
     return { width, height: high, values };
   };

@@ -20,7 +20,10 @@ window.bbfitForest = {
         return textures.get(key);
       },
     });
-    const FILTERS = { 9728: "Nearest", 9729: "Linear", 9984: "NearestMipmapNearest", 9985: "LinearMipmapNearest", 9986: "NearestMipmapLinear", 9987: "LinearMipmapLinear" };
+    const FILTERS = {
+      9728: "Nearest", 9729: "Linear", 9984: "NearestMipmapNearest", 9985: "LinearMipmapNearest", 9986: "NearestMipmapLinear",
+      9987: "LinearMipmapLinear",
+    };
     const WRAPS = { 33071: "ClampToEdge", 33648: "MirroredRepeat", 10497: "Repeat" };
     async function texture(name, { magFilter, minFilter, wrapS, wrapT }) {
       const picture = new Blob([await packs.load(name)]);
@@ -98,7 +101,8 @@ window.bbfitForest = {
         const nearest = entry.field.patches.reduce((least, patch) => Math.min(least, away(patch)), Infinity);
         const { levels } = trees[entry.tree];
         for (let level = levels.length - 2; level >= 0; level -= 1) {
-          if (!entry.asked.has(level) && nearest < EARLY * factor * levels[level + 1].distance) request(entry, level).catch((error) => console.error(error));
+          if (entry.asked.has(level) || nearest >= EARLY * factor * levels[level + 1].distance) continue;
+          request(entry, level).catch((error) => console.error(error));
         }
       }
     }
