@@ -29,6 +29,7 @@ VERSIONS: Mapping[str, int] = {
     "lod": 7,
     "compare": 6,
     "frames": 1,
+    "library": 1,
     "forest": 1,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""

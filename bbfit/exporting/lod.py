@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bbfit.exporting.config import Outline
 from bbfit.glb import gltf_parts, is_glb, joined_glb, split_glb
 from bbfit.model_files import generator
 
@@ -52,7 +53,9 @@ class LodLevel:
     """Mean error of its colors in the training views where the level takes over, in [0, 1]; 0 for the tree itself."""
     held_out_color_error: float
     """The same error in the held-out views."""
-    outline: str | None = None
+    halvings: int = 0
+    """How many times the sides of its textures were halved, because it is only seen from afar."""
+    outline: Outline | None = None
     """The outline of its billboards, if speed decided about it."""
     speed_distance_meters: float = 0.0
     """Distance from which it draws faster than the level before it; 0 where that does not count."""
