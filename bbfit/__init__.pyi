@@ -16,6 +16,12 @@ from .exporting.model import export as export
 from .fitting.config import FitConfig as FitConfig
 from .fitting.loop import FitResult as FitResult
 from .fitting.loop import fit as fit
+from .forest.building import Forest as Forest
+from .forest.building import build_forest as build_forest
+from .forest.building import read_forest as read_forest
+from .forest.config import ForestConfig as ForestConfig
+from .forest.config import RegisterConfig as RegisterConfig
+from .forest.config import ScatterConfig as ScatterConfig
 from .frames.config import FramesConfig as FramesConfig
 from .frames.measurement import measure_frames as measure_frames
 from .geometry.camera import Camera as Camera

@@ -52,7 +52,9 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["grow"], ["views"], ["fit"], ["evaluate"], ["export"], ["lod"], ["sweep"], ["compare"]])
+@pytest.mark.parametrize(
+    "command", [[], ["run"], ["grow"], ["views"], ["fit"], ["evaluate"], ["export"], ["lod"], ["sweep"], ["compare"], ["forest"]]
+)
 def test_help_shows_defaults_and_needs_no_torch(command: list[str]) -> None:
     script = (
         "import sys; from bbfit.cli import main\n"

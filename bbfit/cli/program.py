@@ -15,7 +15,7 @@ from typing import Any
 import tyro
 
 from bbfit.checks import InputError, in_words
-from bbfit.cli import commands, studies, viewing
+from bbfit.cli import commands, forests, studies, viewing
 from bbfit.cli.console import OutputError, err_console, out_console, printing, take_any_text
 from bbfit.cli.options import deferred, refuse_old
 from bbfit.scratch import remove_abandoned
@@ -32,6 +32,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "sweep": deferred(studies.sweep_command),
     "compare": deferred(studies.compare_command),
     "frames": deferred(studies.frames_command),
+    "forest": deferred(forests.forest_command),
 }
 """The commands by their names."""
 

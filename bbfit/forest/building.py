@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from bbfit.forest.placements import Placements
 from bbfit.forest.prototypes import read_prototype
 from bbfit.forest.tiles import TILES, ForestTile, leaves, read_tile, write_tiles
 from bbfit.forest.tileset import JOURNAL, SCHEMA, SHARED, TILESET, write_tileset
+from bbfit.forest.web_page import PAGE_FILES, PageConfig, write_page
 from bbfit.inputs import InputLimits, reading
 from bbfit.library.manifest import LIBRARY_FILE, Library, read_library
 from bbfit.model_files import generator
@@ -39,7 +40,9 @@ class Forest:
     folder: Path
     """The folder: ``forest.json``, the placements, and a file or a folder for each format."""
     root: ForestTile
+    """The root of the quadtree of placements."""
     origin: Origin
+    """Where the origin of the local frame is."""
     species: tuple[SpeciesUse, ...]
     """The species of the register with the trees that stand for them. ``Placements.species`` are indices into it."""
     skipped: int
@@ -128,8 +131,13 @@ def read_forest(folder: str | Path) -> Forest:
 _OUTPUTS: dict[str, tuple[str, ...]] = {
     "placements": (FOREST_FILE, f"{TILES}/*.npy"),
     "glb": (GLB_FILE,),
+    "page": PAGE_FILES,
     "tiles": (f"tiles/{TILESET}", f"tiles/{SCHEMA}", "tiles/*.glb", f"tiles/{SHARED}/*"),
 }
+
+
+# The options that the placements depend on.
+_PLACING = ("species_table", "origin", "origin_meters", "sizes", "tile_trees", "seed")
 
 
 class _Stages:
@@ -144,8 +152,7 @@ class _Stages:
     def placements(self, source: Path | None, register: RegisterConfig, scatter: ScatterConfig) -> Stage:
         """Read or scatter the trees, and sort them."""
         folder, library, config = self._folder, self._library, self._config
-        only = ForestConfig()
-        relevant = replace(config, formats=only.formats, level=only.level, tile_triangles=only.tile_triangles, far_pixels=only.far_pixels)
+        relevant = {name: getattr(config, name) for name in _PLACING}
 
         def work(on_progress: OnProgress) -> None:
             place = output_folder("out", folder / TILES)
@@ -167,10 +174,15 @@ class _Stages:
 
     def format(self, name: Format, forest: Forest, key: str) -> Stage:
         """Write a format of a forest whose placements have a ``key``."""
-        make: dict[Format, Callable[[Forest, str, OnProgress], None]] = {"glb": self._write_glb, "tiles": self._write_tiles}
+        make: dict[Format, Callable[[Forest, str, OnProgress], None]] = {
+            "glb": self._write_glb,
+            "tiles": self._write_tiles,
+            "page": self._write_page,
+        }
         if name not in make:
             fail("formats", f"{name} is not available")
-        relevant = {"glb": (self._config.level,), "tiles": (self._config.tile_triangles, self._config.far_pixels)}.get(name, ())
+        config = self._config
+        relevant = {"glb": (config.level,), "tiles": (config.tile_triangles, config.far_pixels), "page": (config.title,)}.get(name, ())
         temporary = {"tiles": (f"tiles/{JOURNAL}",)}.get(name, ())
 
         def work(on_progress: OnProgress) -> None:
@@ -209,6 +221,18 @@ class _Stages:
         out = output_folder("out", self._folder / "tiles")
         names = [species.name for species in forest.species]
         write_tileset(out, (self._folder, forest.root, forest.origin, names), self._library, self._config, key, on_progress)
+
+    def _write_page(self, forest: Forest, key: str, on_progress: OnProgress) -> None:
+        done = 0
+
+        def read(name: str) -> Placements:
+            nonlocal done
+            placements = forest.read(name)
+            on_progress("page", done, forest.root.count)
+            done += len(placements)
+            return placements
+
+        write_page(self._folder, self._library, forest.root, read, PageConfig(self._config.title))
 
 
 def _check_trees(library: Library, limits: InputLimits) -> None:

@@ -102,6 +102,8 @@ class ForestConfig:
     """Most triangles of a tile of 3D Tiles with a finer level of detail, unless it has a single tree."""
     far_pixels: Annotated[float, Range(0.5, 100)] = 4.0
     """Height of the tallest tree on the screen in pixels below which 3D Tiles show a part of the trees, which are wider instead."""
+    title: str = "Forest"
+    """Title of the page."""
     seed: Seed = 0
     """Seed of what the register does not say: turns, sizes, and which of several like trees."""
 
