@@ -100,7 +100,7 @@ def write_page(folder: Path, library: Library, root: ForestTile, read: Read, con
     for name in ("forest.css", *_SCRIPTS):
         write_bytes(page / name, (own / name).read_bytes())
     write_bytes(page / "drawing.js", drawing_script().encode())
-    kinds = f"{root.count:,} {'tree' if root.count == 1 else 'trees'}, grown from {len(library.trees)} of a library"
+    kinds = f"{root.count:,} {'tree' if root.count == 1 else 'trees'} of {len(library.trees)} {'kind' if len(library.trees) == 1 else 'kinds'}"
     filled = (own / "index.html").read_text(encoding="utf-8")
     for name, text in {"generator": generator(), "title": config.title, "counts": kinds, "library": _library_frame()}.items():
         filled = filled.replace(f"${name}", html.escape(text))

@@ -28,6 +28,14 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
   const median = (list) => [...list].sort((one, other) => one - other)[list.length >> 1];
   const height = () => camera.position.y - ground.heightAt(camera.position.x, camera.position.z);
 
+  // The distance of the forest's farthest corner, behind which there is nothing but haze.
+  const [low, high] = [Math.min, Math.max].map((pick, corner) => [0, 2].map((axis) =>
+    data.tiles.reduce((end, tile) => pick(end, (corner ? tile.high : tile.low)[axis]), corner ? -Infinity : Infinity)));
+  function farthestTree() {
+    const { x, z } = camera.position, across = (at, axis) => Math.max(Math.abs(at - low[axis]), Math.abs(at - high[axis]));
+    return Math.hypot(across(x, 0), across(z, 1), height());
+  }
+
   function resize() {
     renderer.setPixelRatio(devicePixelRatio);
     renderer.setSize(canvas.clientWidth, canvas.clientHeight, false);
@@ -42,7 +50,7 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
     const reach = Math.hypot(distance, height()); // tiles are chosen along the ground
     Object.assign(camera, { near: Math.max(0.1, 0.02 * height()), far: 1.05 * reach + 50 });
     camera.updateProjectionMatrix();
-    ground.update(camera, reach);
+    ground.update(camera, Math.min(reach, 1.5 * farthestTree() + 100));
     trees.setFarthest(reach);
     const missing = tiles.update(camera.position, distance);
     trees.loadFor(camera.position);
