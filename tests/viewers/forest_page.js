@@ -53,7 +53,9 @@ const programs = {
     scene.clearColor = new Color4(1, 1, 1, 1);
     const camera = new FreeCamera("camera", Vector3.Zero(), scene);
     Object.assign(camera, { minZ: 1, maxZ: 10000 });
-    (await LoadAssetContainerAsync("/forest/forest.glb", scene)).addAllToScene();
+    const container = await LoadAssetContainerAsync("/forest/forest.glb", scene);
+    container.addAllToScene();
+    for (const texture of container.textures) texture.anisotropicFilteringLevel = 1; // as glTF's samplers say
     await scene.whenReadyAsync();
     return ({ eye, target, fov }) => {
       camera.fov = (fov * Math.PI) / 180;
@@ -102,7 +104,11 @@ const programs = {
     const pole = C.Matrix4.fromTranslation(new C.Cartesian3(0, 0, 7e6)); // Cesium shows nothing below the ground of the Earth
     const origin = earth ? C.Cartesian3.fromDegrees(Number(query.get("longitude")), Number(query.get("latitude"))) : null;
     const frame = earth ? C.Transforms.eastNorthUpToFixedFrame(origin) : pole;
-    const tileset = await C.Cesium3DTileset.fromUrl("/forest/tiles/tileset.json", earth ? {} : { modelMatrix: pole });
+    const tileset = await C.Cesium3DTileset.fromUrl("/forest/tiles/tileset.json", {
+      cullRequestsWhileMoving: false, // the camera jumps
+      foveatedScreenSpaceError: false,
+      ...(earth ? {} : { modelMatrix: pole }),
+    });
     const failures = [];
     tileset.tileFailed.addEventListener(({ message }) => failures.push(message));
     scene.primitives.add(tileset);
