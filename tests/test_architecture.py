@@ -75,8 +75,9 @@ ONLY_IN = {
     "fast_simplification": {"rivals/decimation.py", "rivals/learned_mesh.py"},
     "DracoPy": {"rivals/draco.py"},
     "playwright": {"frames/browser.py"},
+    "pxr": {"forest/usd_stage.py"},
 }
-NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "jinja2", "playwright")
+NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "jinja2", "playwright", "pxr")
 
 
 def unit(path: Path) -> str:

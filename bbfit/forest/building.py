@@ -19,6 +19,7 @@ from bbfit.forest.placements import Placements
 from bbfit.forest.prototypes import read_prototype
 from bbfit.forest.tiles import TILES, ForestTile, leaves, read_tile, write_tiles
 from bbfit.forest.tileset import JOURNAL, SCHEMA, SHARED, TILESET, write_tileset
+from bbfit.forest.usd_stage import STAGE, TEXTURES, TREES, USD_JOURNAL, USD_TILES, check_usd, write_usd
 from bbfit.forest.web_page import PAGE_FILES, PageConfig, write_page
 from bbfit.inputs import InputLimits, reading
 from bbfit.library.manifest import LIBRARY_FILE, Library, read_library
@@ -98,6 +99,8 @@ def build_forest(
     source = None if isinstance(placements, ScatterConfig) else Path(placements)
     register = register or RegisterConfig()
     check_placements(source, config, register, scatter)
+    if "usd" in config.formats:
+        check_usd()
     trees = read_library(library, limits)
     _check_trees(trees, limits)
     inputs = [path for path in (source, scatter.scatter_area, config.species_table) if path is not None]
@@ -132,6 +135,7 @@ _OUTPUTS: dict[str, tuple[str, ...]] = {
     "placements": (FOREST_FILE, f"{TILES}/*.npy"),
     "glb": (GLB_FILE,),
     "page": PAGE_FILES,
+    "usd": (f"usd/{STAGE}", *(f"usd/{part}/*" for part in (TREES, TEXTURES, USD_TILES))),
     "tiles": (f"tiles/{TILESET}", f"tiles/{SCHEMA}", "tiles/*.glb", f"tiles/{SHARED}/*"),
 }
 
@@ -178,12 +182,11 @@ class _Stages:
             "glb": self._write_glb,
             "tiles": self._write_tiles,
             "page": self._write_page,
+            "usd": self._write_usd,
         }
-        if name not in make:
-            fail("formats", f"{name} is not available")
         config = self._config
         relevant = {"glb": (config.level,), "tiles": (config.tile_triangles, config.far_pixels), "page": (config.title,)}.get(name, ())
-        temporary = {"tiles": (f"tiles/{JOURNAL}",)}.get(name, ())
+        temporary = {"tiles": (f"tiles/{JOURNAL}",), "usd": (f"usd/{USD_JOURNAL}",)}.get(name, ())
 
         def work(on_progress: OnProgress) -> None:
             make[name](forest, stage.key, on_progress)
@@ -221,6 +224,10 @@ class _Stages:
         out = output_folder("out", self._folder / "tiles")
         names = [species.name for species in forest.species]
         write_tileset(out, (self._folder, forest.root, forest.origin, names), self._library, self._config, key, on_progress)
+
+    def _write_usd(self, forest: Forest, key: str, on_progress: OnProgress) -> None:
+        out = output_folder("out", self._folder / "usd")
+        write_usd(out, (self._folder, forest.root), self._library, self._limits, key, on_progress)
 
     def _write_page(self, forest: Forest, key: str, on_progress: OnProgress) -> None:
         done = 0

@@ -84,8 +84,8 @@ class ForestConfig:
     formats: tuple[Format, ...] = ("glb", "tiles")
     """What to write: glb (a GLB with instances), tiles (3D Tiles 1.1), usd (a USD stage; it needs the extra forest), page (a web page)."""
     species_table: Path | None = None
-    """Table (CSV) whose first column has names of species of the register, and whose second one has species or trees of the library that
-    stand for them. Other names go to a tree of the same species, genus, habit or kind."""
+    """Table (CSV) of species: names of the register in the first column, and species or trees of the library in the second column.
+    Other names go to a tree of the same species, genus, habit or kind."""
     level: Annotated[int, Range(0)] = 0
     """Level of detail of the trees in the GLB, 0 the finest. A tree with fewer levels has its coarsest one. The tiles, the USD stage and
     the page have all levels."""

@@ -53,6 +53,7 @@ class Register:
         self._numbers = dict[str, int]()
         self._comma = True
         self._kinds = dict[str, int]()  # the first rows with coordinates like degrees and like projected meters
+        self._header: Columns | None = None  # of a table
         self._known = dict[tuple[str, ...], Columns]()
 
     def batches(self) -> Iterator[NDArray[np.void]]:
@@ -80,12 +81,13 @@ class Register:
     def _table(self) -> Iterator[tuple[int, Mapping[str, Any], tuple[float, ...] | None]]:
         """The rows of a table: their numbers as spreadsheet programs count, their cells by the columns' names."""
         with self.path.open(encoding=self._config.encoding, newline="") as file:
-            head = file.readline(_PIECE)
-            delimiter = max(_DELIMITERS, key=head.count)
-            self._comma = delimiter != ","
-            file.seek(0)
-            rows = csv.reader(file, delimiter=delimiter)
+            rows = None
             try:
+                head = file.readline(_PIECE)
+                delimiter = max(_DELIMITERS, key=head.count)
+                self._comma = delimiter != ","
+                file.seek(0)
+                rows = csv.reader(file, delimiter=delimiter, strict=True)
                 header = [name.strip() for name in next(rows, [])]
                 found = find_columns(header, self._config.columns)
                 if not found.places:
@@ -94,14 +96,14 @@ class Register:
                         f"{self.path} has no columns of coordinates such as x and y, or longitude and latitude",
                         f"it has {', '.join(header[:40]) or 'none'}; name them as in --columns x={header[0] if header else 'NAME'} y=...",
                     )
-                self._known[()] = found
+                self._header = found
                 for number, cells in enumerate(rows, 2):
                     if any(cells):
                         yield number, dict(zip(header, cells, strict=False)), None
             except UnicodeDecodeError as error:
                 fail("placements", f"{self.path} is no text in {self._config.encoding} ({error.reason})", "try --encoding latin-1")
             except csv.Error as error:
-                fail("placements", f"{self.path}, row {rows.line_num} cannot be read ({error})", _HINT)
+                fail("placements", f"{self.path}, row {rows.line_num if rows else 1} cannot be read ({error})", _HINT)
 
     def _features(self) -> Iterator[tuple[int, Mapping[str, Any], tuple[float, ...] | None]]:
         """The features of a GeoJSON, one at a time: their numbers from 1, their properties and their coordinates."""
@@ -178,8 +180,8 @@ class Register:
 
     def _columns(self, values: Mapping[str, Any]) -> Columns:
         """The columns of a table, or of the properties of a feature, which may differ between features."""
-        if () in self._known:
-            return self._known[()]
+        if self._header is not None:
+            return self._header
         keys = tuple(values)
         if keys not in self._known:
             if len(self._known) > 1000:
@@ -189,7 +191,7 @@ class Register:
 
     def _place(self, row: int, values: Mapping[str, Any], place: tuple[float, ...] | None, found: Columns) -> tuple[float, float, float]:
         z = self._number(row, values, found, "z")
-        if () not in self._known:
+        if self._header is None:
             if place is None:
                 self._refuse(row, "geometry", "is missing")
             try:
@@ -209,7 +211,7 @@ class Register:
 
     def _check_place(self, row: int, x: float, y: float, found: Columns) -> None:
         """Require a place on the Earth, in the reference system of the rows before."""
-        names = [found.names[key] for key in found.places] if () in self._known else ["geometry"]
+        names = [found.names[key] for key in found.places] if self._header is not None else ["geometry"]
         if self.coordinates == "degrees":
             for value, most, name in ((x, 180, names[0]), (y, 90, names[-1])):
                 if abs(value) > most:

@@ -100,12 +100,16 @@ def write_page(folder: Path, library: Library, root: ForestTile, read: Read, con
     for name in ("forest.css", *_SCRIPTS):
         write_bytes(page / name, (own / name).read_bytes())
     write_bytes(page / "drawing.js", drawing_script().encode())
-    kinds = f"{root.count:,} {'tree' if root.count == 1 else 'trees'}, grown from {len(library.trees)} of a library"
+    counts = f"{_number(root.count, 'tree')} of {_number(len(library.trees), 'kind')}"
     filled = (own / "index.html").read_text(encoding="utf-8")
-    for name, text in {"generator": generator(), "title": config.title, "counts": kinds, "library": _library_frame()}.items():
+    for name, text in {"generator": generator(), "title": config.title, "counts": counts, "library": _library_frame()}.items():
         filled = filled.replace(f"${name}", html.escape(text))
     write_bytes(page / "index.html", filled.encode())
     return page / "index.html"
+
+
+def _number(count: int, word: str) -> str:
+    return f"{count:,} {word}{'' if count == 1 else 's'}"
 
 
 def tile_bytes(placements: Placements, corner: tuple[float, float, float]) -> bytes:
@@ -183,9 +187,10 @@ def _pictures(path: Path, glb: bytes, library: Library) -> dict[str, Path]:
     found, limits = dict[str, Path](), InputLimits()
     with reading("library", path, _HINT):
         for texture in content.get("textures", []):
-            if "source" not in texture:
+            source = texture.get("source", texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source"))
+            if source is None:
                 fail("library", f"{path} has KTX2 textures alone, which the page does not read", "build the library with PNG textures")
-            uri = content["images"][texture["source"]].get("uri")
+            uri = content["images"][source].get("uri")
             if uri is not None and not uri.startswith("data:"):
                 found[uri] = limits.referenced("library", path, unquote(uri), library.folder).resolve()
     return found

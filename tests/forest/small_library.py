@@ -19,11 +19,16 @@ SCREEN = Screen(1080, 60.0)
 COLORS = {"oak": (200, 60, 40), "birch": (40, 170, 60), "fir": (50, 80, 210)}
 HEIGHTS = {"oak": 12.0, "birch": 8.0, "fir": 20.0}
 SPECIES = {"oak": "black_oak", "birch": "silver_birch", "fir": "douglas_fir"}
-DISTANCES = (0.0, 60.0, 200.0)
+DISTANCES = (0.0, 120.0, 400.0)
 
 
-def small_library(folder: Path, names: Sequence[str] = ("oak", "birch", "fir"), planes: Sequence[int] = (4, 3, 2)) -> Library:
-    """Write a library. Each tree is an upright ellipse of one color, 0.4 times as wide as high, on planes that cross in its axis."""
+def small_library(
+    folder: Path, names: Sequence[str] = ("oak", "birch", "fir"), planes: Sequence[int] = (4, 3, 2), brightness: Sequence[float] = (1, 1, 1)
+) -> Library:
+    """Write a library. Each tree is an upright ellipse of one color, 0.4 times as wide as high, on planes that cross in its axis.
+
+    The materials of its levels have a ``brightness``.
+    """
     (folder / "trees").mkdir(parents=True)
     write_bytes(folder / "atlas.png", encode_png(_atlas(names)))
     trees = []
@@ -32,7 +37,7 @@ def small_library(folder: Path, names: Sequence[str] = ("oak", "birch", "fir"), 
         levels = []
         for level, count in enumerate(planes):
             file = f"trees/{name}_LOD{level}.glb"
-            data = _glb(height, count, (number / len(names), 1 / len(names)))
+            data = _glb(height, count, (number / len(names), 1 / len(names)), brightness[level])
             write_bytes(folder / file, data)
             distance = DISTANCES[level] * height / 10
             levels.append(_level(f"LOD{level}", count, len(data), distance, file))
@@ -68,13 +73,13 @@ def _level(name: str, planes: int, size: int, distance: float, file: str) -> Lod
 
 def _atlas(names: Sequence[str]) -> NDArray[np.uint8]:
     """A filled ellipse for each tree, side by side."""
-    y, x = np.mgrid[-1:1:32j, -1:1:32j]
-    inside = x * x + y * y < 0.98
-    pictures = [np.concatenate([np.full((32, 32, 3), COLORS[name]), 255 * inside[..., None]], -1) for name in names]
+    y, x = (np.mgrid[:64, :64] + 0.5) / 32 - 1
+    inside = x * x + y * y < 1
+    pictures = [np.concatenate([np.full((64, 64, 3), COLORS[name]), 255 * inside[..., None]], -1) for name in names]
     return np.concatenate(pictures, 1).astype(np.uint8)
 
 
-def _glb(height: float, planes: int, part: tuple[float, float]) -> bytes:
+def _glb(height: float, planes: int, part: tuple[float, float], brightness: float) -> bytes:
     """Planes that cross in the vertical axis, unlit, with a part of the atlas: its left edge and its width."""
     half, (left, width) = 0.2 * height, part
     points, uvs, triangles = [], [], []
@@ -97,7 +102,7 @@ def _glb(height: float, planes: int, part: tuple[float, float]) -> bytes:
         {"componentType": 5123, "type": "SCALAR", "count": 3 * len(triangles)},
     ]
     material = {
-        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0},
+        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [*3 * [brightness], 1], "metallicFactor": 0.0},
         "alphaMode": "MASK",
         "doubleSided": True,
         "extensions": {"KHR_materials_unlit": {}},
