@@ -28,6 +28,10 @@ from .geometry.camera import Camera as Camera
 from .geometry.cloud import BillboardCloud as BillboardCloud
 from .geometry.orbit import Orbit as Orbit
 from .inputs import InputLimits as InputLimits
+from .library.building import build_library as build_library
+from .library.config import LibraryConfig as LibraryConfig
+from .library.manifest import Library as Library
+from .library.manifest import read_library as read_library
 from .lod import build_lod as build_lod
 from .pipeline import RunConfig as RunConfig
 from .pipeline import run as run

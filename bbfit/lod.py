@@ -98,18 +98,28 @@ def build_lod(
     if out.suffix.lower() != ".glb":
         fail("out", f"{out} ends in {out.suffix or 'nothing'}", "give a name that ends in .glb")
     check_output_file("out", out)
-    if stages.fit.billboards is not None or stages.budget.given:
-        fail("billboards", "planes sets the number of billboards of each level", "omit billboards and budgets")
-    if config.triangles is not None and not config.original:
-        fail("triangles", f"{config.triangles} are requested of a tree that is no level", "leave out one of triangles and no-original")
+    check_unset(config, stages)
     tree, work = TreeFile.open(tree, stages.limits), Path(work or out.with_suffix(""))
-    for planes in config.planes:
-        fit = replace(stages.fit, billboards=planes)
-        replace(stages, fit=fit).check(mesh=tree.is_mesh, rendered=True, blender=False)
+    check_levels(config, stages, mesh=tree.is_mesh)
     if needs_blender(work):
         check_blender(stages.views)
     with used_folder("out's folder", out.parent), claimed_folder("work", work) as folder:
         return _built(tree, out, folder, config, stages, on_progress)
+
+
+def check_unset(config: LodConfig, stages: RunConfig) -> None:
+    """Require that options which the levels decide are left out. Raises ``InputError``."""
+    if stages.fit.billboards is not None or stages.budget.given:
+        fail("billboards", "planes sets the number of billboards of each level", "omit billboards and budgets")
+    if config.triangles is not None and not config.original:
+        fail("triangles", f"{config.triangles} are requested of a tree that is no level", "leave out one of triangles and no-original")
+
+
+def check_levels(config: LodConfig, stages: RunConfig, *, mesh: bool) -> None:
+    """Require options that each level's run can use (:meth:`~bbfit.pipeline.RunConfig.check`); ``mesh`` says if the tree is a mesh."""
+    for planes in config.planes:
+        fit = replace(stages.fit, billboards=planes)
+        replace(stages, fit=fit).check(mesh=mesh, rendered=True, blender=False)
 
 
 def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: RunConfig, on_progress: OnProgress) -> LodResult:
@@ -123,8 +133,7 @@ def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: R
     stages = replace(stages, tree=tree.path if tree.is_mesh else None)
     runs = [_fitted(folder, stages, planes, on_progress) for planes in config.planes]
     export = export_config(views, stages.export)
-    if export.textures is None:
-        export = replace(export, textures="png" if export.profile in _WITHOUT_KTX2 else "auto")  # distant levels need mip levels
+    export = with_textures(export)
     record.run(_join_stage(folder, out, original, runs, views, config, export), on_progress)
     description = folder / LEVELS / LOD_FILE
     stored = read_json("levels of detail", description)
@@ -132,6 +141,13 @@ def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: R
         levels = tuple(LodLevel(**level) for level in stored["levels"])
         check_record("levels", levels, tuple[LodLevel, ...])
     return LodResult(out, folder, levels)
+
+
+def with_textures(export: ExportConfig) -> ExportConfig:
+    """The options with the textures of levels of detail, unless they say otherwise: with mip levels, because distant levels need them."""
+    if export.textures is not None:
+        return export
+    return replace(export, textures="png" if export.profile in _WITHOUT_KTX2 else "auto")
 
 
 def _join_stage(
@@ -269,6 +285,7 @@ def _levels(
                 color_distance_meters=focal / switch.color_scale,
                 color_error=switch.color_errors[0],
                 held_out_color_error=switch.color_errors[1],
+                halvings=switch.halvings,
             )
         )
     return tuple(levels)

@@ -26,9 +26,10 @@ VERSIONS: Mapping[str, int] = {
     "export": 14,
     "evaluate": 16,
     "report": 8,
-    "lod": 6,
+    "lod": 7,
     "compare": 6,
     "frames": 1,
+    "library": 1,
     "forest": 1,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""

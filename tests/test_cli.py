@@ -53,7 +53,8 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["run"], ["grow"], ["views"], ["fit"], ["evaluate"], ["export"], ["lod"], ["sweep"], ["compare"], ["forest"]]
+    "command",
+    [[], ["run"], ["grow"], ["views"], ["fit"], ["evaluate"], ["export"], ["lod"], ["sweep"], ["compare"], ["library"], ["forest"]],
 )
 def test_help_shows_defaults_and_needs_no_torch(command: list[str]) -> None:
     script = (

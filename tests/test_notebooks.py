@@ -28,6 +28,7 @@ NAMES = [
     "04_thesis_experiments",
     "05_placement_and_budgets",
     "06_into_an_engine",
+    "07_forest",
 ]
 # The most bytes of a notebook. How alike are the pictures that it makes here and the committed ones, which longer fits made? That is the
 # median of a notebook; measured 0.79 (01, whose planes differ) and 0.94 or more (the others). Each picture and the next of one notebook are

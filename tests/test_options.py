@@ -12,7 +12,7 @@ import pytest
 import bbfit
 from bbfit.cli import main
 
-COMMANDS = ("run", "grow", "views", "fit", "evaluate", "export", "lod", "view", "sweep", "compare", "frames", "forest")
+COMMANDS = ("run", "grow", "views", "fit", "evaluate", "export", "lod", "view", "sweep", "compare", "frames", "library", "forest")
 STAGES = {"views": bbfit.ViewsConfig, "fit": bbfit.FitConfig, "export": bbfit.ExportConfig, "grow": bbfit.GrowConfig}
 QUICK = ["--billboards", "1", "--placement", "even", "--steps", "2"]
 
@@ -30,7 +30,7 @@ def offered(capsys: pytest.CaptureFixture[str]) -> dict[str, set[str]]:
 
 def test_an_option_has_one_name_in_every_command(offered: dict[str, set[str]]) -> None:
     """Only the seeds of single stages have a prefix, where a command has several stages and a seed for all of them."""
-    several = {"run", "lod", "sweep", "compare"}
+    several = {"run", "lod", "sweep", "compare", "library"}
     for command, options in offered.items():
         dotted = {option for option in options if "." in option}
         assert all(option.endswith(".seed") for option in dotted)

@@ -122,6 +122,9 @@ def small(words: list[str]) -> list[str]:
         some = [] if "--systems" in given else ["--systems", "bbfit", "crossed", "draco"]
         grown = [*grown, "--species", "acer", "--seeds", "0"] if "--species" in given else []
         return [*stages, *some, *grown, *(machine if several else []), "--billboards", "2", "--many", "3", "--mesh-steps", "2"]
+    if command == "library":
+        grown = [*grown, "--species", "acer", "--seeds", "0"] if "--species" in given else []
+        return [*stages, *grown, *machine, "--planes", "2", "1"]
     assert command in ("evaluate", "export"), f"how is bbfit {command} made small?"
     return []
 

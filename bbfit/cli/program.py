@@ -32,6 +32,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "sweep": deferred(studies.sweep_command),
     "compare": deferred(studies.compare_command),
     "frames": deferred(studies.frames_command),
+    "library": deferred(studies.library_command),
     "forest": deferred(forests.forest_command),
 }
 """The commands by their names."""

@@ -1,7 +1,8 @@
-"""The commands that compare: many configurations on many trees, many systems, and frame times."""
+"""The commands for many trees, configurations or systems: sweeps, comparisons, frame times, and libraries."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -9,12 +10,13 @@ import tyro
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import fail
-from bbfit.cli.console import out_console, progress
+from bbfit.cli.console import out_console, progress, show_missing_encoder
 from bbfit.comparison.config import CompareConfig
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.frames.config import FramesConfig
 from bbfit.inputs import InputLimits
+from bbfit.library.config import LibraryConfig
 from bbfit.sweep.config import SweepConfig
 from bbfit.trees.config import GrowConfig
 
@@ -157,3 +159,57 @@ def frames_command(
     for table in frames_table(result.rows):
         out_console.print(table)
     out_console.print(f"in {result.folder}: frames.md, frames.csv, frames.json, frames.png", soft_wrap=True)
+
+
+def library_command(
+    trees: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[TREES]")] = (),
+    /,
+    out: Path = Path("runs/library"),
+    species: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (0,),
+    seed: int = 0,
+    library: LibraryConfig = LibraryConfig(),  # noqa: B008
+    grow: GrowConfig = GrowConfig(detail=0.5),  # noqa: B008
+    views: ViewsConfig = ViewsConfig(),  # noqa: B008
+    fit: FitConfig = FitConfig(),  # noqa: B008
+    export: ExportConfig = ExportConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
+) -> None:
+    """Make levels of detail of many trees that share one atlas, with a list of all of them and a picture of each.
+
+    It works on this machine or on a Ray cluster. Interrupted and started again, it resumes where it stopped.
+
+    For example: bbfit library --species acer apple --seeds 0 1 2 --out library
+
+    Args:
+        trees: Trees (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
+        out: Folder for the library.
+        species: Species to grow; `bbfit grow --list` lists them.
+        seeds: Seeds of the trees of each species.
+        seed: Seed of all other stages; --views.seed and --fit.seed override it for one of them.
+        library: The levels of each tree, their atlas, and where trees are made.
+        grow: How trees are grown.
+        views: How trees are rendered.
+        fit: How the billboards are fitted. The levels set --billboards.
+        export: How the models are written.
+        limits: What the tree and the views may refer to, and how large they may be.
+    """
+    from bbfit.library.building import build_library
+    from bbfit.lod import with_textures
+    from bbfit.pipeline import RunConfig
+    from bbfit.reporting.library_tables import library_table, times_table
+
+    stages, started = RunConfig(grow=grow, views=views, fit=fit, export=export, limits=limits), time.perf_counter()
+    with progress() as on_progress:
+        built = build_library(trees, out, library, stages, species=species, seeds=seeds, on_progress=on_progress)
+    elapsed = time.perf_counter() - started
+    out_console.print(library_table({tree.name: (tree.height, tree.levels) for tree in built.trees}))
+    out_console.print(times_table({tree.name: tree.seconds for tree in built.trees}, built.seconds))
+    out_console.print(f"this start took {elapsed:,.0f} s", style="dim")
+    for page in built.pages:
+        files = ", ".join(page.files)
+        out_console.print(f"{page.width:,} x {page.height:,} texels, {page.used:.0%} used, {page.bytes:,} bytes: {files}", soft_wrap=True)
+    for name, reason in built.failures.items():
+        out_console.print(f"{name} failed and is not in the library: {reason}", style="yellow", soft_wrap=True)
+    show_missing_encoder(with_textures(export))
+    out_console.print(f"in {built.folder}: library.json, contact.png, times.md, and the models in trees", soft_wrap=True)

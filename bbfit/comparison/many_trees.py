@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bbfit.checks import check_count, fail
 from bbfit.comparison.config import CompareConfig
 from bbfit.comparison.one_tree import checked_systems, compare
 from bbfit.files import write_bytes
@@ -21,7 +20,7 @@ from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.species import load_species
 from bbfit.workers.choice import workers_of
 from bbfit.workers.results import Results
-from bbfit.workers.sources import Source, sources
+from bbfit.workers.sources import Source, seeded_sources
 from bbfit.workers.tasks import Facts, Outcome, Task
 
 _TABLES = ("summary.csv", "summary.md", "pareto.png")
@@ -74,7 +73,7 @@ def compare_trees(
         If there are no trees, an option or a file is unusable, or the folder cannot be written to. Finished results are kept.
     """
     config, stages, on_progress = config or CompareConfig(), stages or RunConfig(), on_progress or silent
-    chosen = _chosen(species, seeds, trees, stages)
+    chosen = seeded_sources(species, seeds, trees, stages.grow.species_file)
     checked_systems(config, stages)
     with claimed_folder("out", out) as folder:
         written = Written(folder)
@@ -87,21 +86,6 @@ def compare_trees(
         compare_plot(summaries(rows), folder / "pareto.png")
         written.finish("tables", written.digests(_TABLES))
         return CompareTreesResult(folder, rows, failures)
-
-
-def _chosen(species: Sequence[str], seeds: Sequence[int], trees: Sequence[str | Path], stages: RunConfig) -> list[tuple[Source, int]]:
-    """All trees with their seeds. The name of a grown tree ends with the seed if there are several."""
-    for seed in seeds:
-        check_count("seeds", seed, 0)
-    if not seeds or len(set(seeds)) < len(seeds):
-        fail("seeds", f"expected different ones, got {list(seeds)}")
-    found = sources(species, trees, (), stages.grow.species_file)
-    grown = [source for source in found if source.species is not None]
-    named = [(replace(source, name=f"{source.name}_{seed}") if len(seeds) > 1 else source, seed) for source in grown for seed in seeds]
-    made = named + [(source, 0) for source in found if source.species is None]
-    if len({source.name for source, _ in made}) < len(made):
-        fail("trees", "two trees have the same name", "rename one, or omit one")
-    return made
 
 
 def _compared(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ _SAMPLER = {"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071
 _WITH_MIPS = _SAMPLER | {"minFilter": 9987}  # trilinear
 # Component types of glTF, and the largest index of 16 bits (65,535 would restart a primitive; glTF 2.0, section 3.7.2.1).
 _UNSIGNED_SHORT, _UNSIGNED_INT, _LARGEST_SHORT = 5123, 5125, 65_534
+# Pictures of cards with maps beside the atlas.
+_MAPS = ("normals", "occlusion")
 # Pictures by name.
 _Pictures = dict[str, tuple[list[NDArray[np.uint8]], bool]]
 _TRANSMISSION = "KHR_materials_diffuse_transmission"
@@ -31,7 +33,13 @@ _TANGENT = "_TANGENT"
 _EXTENSIONS = {"webp": ("EXT_texture_webp", "image/webp"), "ktx2": ("KHR_texture_basisu", "image/ktx2")}
 
 
-def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int], None] = lambda done, total: None) -> bytes:
+def glb_bytes(
+    cards: Cards,
+    config: ExportConfig,
+    on_picture: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    files: Mapping[str, str] | None = None,
+) -> bytes:
     """A GLB file with one mesh for the cards that show both sides, one for those with back-face culling, and one per node of split cards.
 
     Cards with maps have a matte material (``KHR_materials_specular`` with the factor 0) with textures of base color, normals and occlusion,
@@ -43,6 +51,8 @@ def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int
     their vertices. For programs that do not cull what is blended, they are the fronts alone, double-sided. The sampler uses mip levels if
     the file includes them (``ktx2``) or if the options let programs compute them
     (:meth:`~bbfit.exporting.config.ExportConfig.mipmapped`). ``on_picture`` is called with the number of encoded pictures and their total.
+
+    With ``files``, the GLB contains no pictures and refers to those files instead: to the addresses by the names of :func:`texture_files`.
     """
     import trimesh
     from PIL import Image
@@ -83,7 +93,49 @@ def glb_bytes(cards: Cards, config: ExportConfig, on_picture: Callable[[int, int
     pictures = _pictures(cards)
     glb = glb_of_scene(scene, lambda tree: _complete(tree, cards, list(pictures), resolved), normals=lit)
     tree, views = split_glb(glb)
-    return joined_glb(tree, _with_pictures(tree, _with_short_indices(tree, views), pictures, resolved, on_picture))
+    views = _with_short_indices(tree, views)
+    images = _with_images(tree, list(pictures), resolved)
+    if files is not None:
+        tree["images"] = [{"uri": files[name], "mimeType": kind, "name": picture} for name, picture, kind in images]
+        return joined_glb(tree, _without_placeholder(tree, views))
+    contents = texture_files(cards, resolved, on_picture)
+    at = tree["images"][0]["bufferView"]
+    places = [at, *range(len(views), len(views) + len(images) - 1)]
+    tree["bufferViews"] += [{} for _ in places[1:]]
+    views += [b""] * (len(places) - 1)
+    for place, (name, _, _) in zip(places, images, strict=True):
+        views[place] = contents[name]
+    tree["images"] = [{"bufferView": place, "mimeType": kind, "name": name} for place, (_, name, kind) in zip(places, images, strict=True)]
+    return joined_glb(tree, views)
+
+
+def texture_names(config: ResolvedExport, *, maps: bool) -> list[str]:
+    """The names of the pictures of a GLB as files, in their order; ``maps``: with normals and occlusion."""
+    return [f"{picture}.{ending}" for picture in ("atlas", *(_MAPS if maps else ())) for ending in _endings(config)]
+
+
+def texture_files(
+    cards: Cards, config: ResolvedExport, on_picture: Callable[[int, int], None] = lambda done, total: None
+) -> dict[str, bytes]:
+    """The encoded pictures of a GLB by their names as files (:func:`texture_names`). ``on_picture`` is as for :func:`glb_bytes`."""
+    pictures, contents = _pictures(cards), dict[str, bytes]()
+    for number, (name, (levels, is_color)) in enumerate(pictures.items()):
+        on_picture(number, len(pictures))
+        for ending in _endings(config):
+            if ending == "png":
+                data = encode_png(levels[0])
+            else:
+                data = encode_webp(levels[0]) if ending == "webp" else encode_ktx2(levels, srgb=is_color)
+            contents[f"{name}.{ending}"] = data
+    on_picture(len(pictures), len(pictures))
+    return contents
+
+
+def _endings(config: ResolvedExport) -> list[str]:
+    """The endings of a picture's files: PNG, unless it is left out, and that of the requested format."""
+    if config.textures == "png":
+        return ["png"]
+    return ["png", config.textures] if config.fallback else [config.textures]
 
 
 def _vertices(
@@ -189,32 +241,28 @@ def _pictures(cards: Cards) -> _Pictures:
     return pictures
 
 
-def _with_pictures(
-    tree: dict[str, Any], views: list[bytes], pictures: _Pictures, config: ResolvedExport, on_picture: Callable[[int, int], None]
-) -> list[bytes]:
-    """The contents of the buffer views, with the pictures added; the JSON gets the references to them."""
+def _with_images(tree: dict[str, Any], pictures: list[str], config: ResolvedExport) -> list[tuple[str, str, str]]:
+    """Let the textures of a glTF refer to its images, by their numbers; of each image the name as a file, its picture, and its type."""
     extension, kind = _EXTENSIONS.get(config.textures, ("", ""))
-    images, encoded = list[tuple[str, str]](), list[bytes]()
-    for number, (texture, (name, (levels, is_color))) in enumerate(zip(tree["textures"], pictures.items(), strict=True)):
-        on_picture(number, len(pictures))
-        if not extension or config.fallback:
-            texture["source"] = len(images)
-            images.append((name, "image/png"))
-            encoded.append(encode_png(levels[0]))
-        if extension:
-            texture["extensions"] = {extension: {"source": len(images)}}
-            images.append((name, kind))
-            encoded.append(encode_webp(levels[0]) if config.textures == "webp" else encode_ktx2(levels, srgb=is_color))
-    on_picture(len(pictures), len(pictures))
+    images = list[tuple[str, str, str]]()
+    for texture, name in zip(tree["textures"], pictures, strict=True):
+        for ending in _endings(config):
+            if ending == "png":
+                texture["source"] = len(images)
+            else:
+                texture["extensions"] = {extension: {"source": len(images)}}
+            images.append((f"{name}.{ending}", name, "image/png" if ending == "png" else kind))
     if extension:
         tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), extension})
         if not config.fallback:
             tree["extensionsRequired"] = [extension]
-    at, views = tree["images"][0]["bufferView"], list(views)
-    places = [at, *range(len(views), len(views) + len(images) - 1)]
-    tree["bufferViews"] += [{} for _ in places[1:]]
-    views += [b""] * (len(places) - 1)
-    for place, content in zip(places, encoded, strict=True):
-        views[place] = content
-    tree["images"] = [{"bufferView": place, "mimeType": mime, "name": name} for place, (name, mime) in zip(places, images, strict=True)]
-    return views
+    return images
+
+
+def _without_placeholder(tree: dict[str, Any], views: list[bytes]) -> list[bytes]:
+    """The contents of the buffer views without that of trimesh's picture; the JSON gets the new numbers of the others."""
+    used = sorted({accessor["bufferView"] for accessor in tree["accessors"]})
+    for accessor in tree["accessors"]:
+        accessor["bufferView"] = used.index(accessor["bufferView"])
+    tree["bufferViews"] = [tree["bufferViews"][number] for number in used]
+    return [views[number] for number in used]

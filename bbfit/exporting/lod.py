@@ -52,6 +52,8 @@ class LodLevel:
     """Mean error of its colors in the training views where the level takes over, in [0, 1]; 0 for the tree itself."""
     held_out_color_error: float
     """The same error in the held-out views."""
+    halvings: int = 0
+    """How many times the sides of its textures were halved, because it is only seen from afar."""
 
 
 def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel], profile: str | None = None) -> bytes:

@@ -73,7 +73,8 @@ def write_page(folder: Path, library: Library, root: ForestTile, read: Read, con
     check_fields(config)
     page = output_folder("out", folder / PAGE)
     for part in ("models", "pictures", "tiles"):
-        output_folder("out", page / "data" / part)
+        for earlier in output_folder("out", page / "data" / part).glob("*.js"):
+            earlier.unlink()
     margin = max(50.0, 0.05 * max(root.high[0] - root.low[0], root.high[2] - root.low[2]))
     low, high = (root.low[0] - margin, root.low[2] - margin), (root.high[0] + margin, root.high[2] + margin)
     ground = GroundMap(low, high, np.array([_crown_area(tree) for tree in library.trees]))
@@ -99,12 +100,16 @@ def write_page(folder: Path, library: Library, root: ForestTile, read: Read, con
     for name in ("forest.css", *_SCRIPTS):
         write_bytes(page / name, (own / name).read_bytes())
     write_bytes(page / "drawing.js", drawing_script().encode())
-    kinds = f"{root.count:,} {'tree' if root.count == 1 else 'trees'}, grown from {len(library.trees)} of a library"
+    counts = f"{_number(root.count, 'tree')} of {_number(len(library.trees), 'kind')}"
     filled = (own / "index.html").read_text(encoding="utf-8")
-    for name, text in {"generator": generator(), "title": config.title, "counts": kinds, "library": _library_frame()}.items():
+    for name, text in {"generator": generator(), "title": config.title, "counts": counts, "library": _library_frame()}.items():
         filled = filled.replace(f"${name}", html.escape(text))
     write_bytes(page / "index.html", filled.encode())
     return page / "index.html"
+
+
+def _number(count: int, word: str) -> str:
+    return f"{count:,} {word}{'' if count == 1 else 's'}"
 
 
 def tile_bytes(placements: Placements, corner: tuple[float, float, float]) -> bytes:
@@ -182,9 +187,10 @@ def _pictures(path: Path, glb: bytes, library: Library) -> dict[str, Path]:
     found, limits = dict[str, Path](), InputLimits()
     with reading("library", path, _HINT):
         for texture in content.get("textures", []):
-            if "source" not in texture:
+            source = texture.get("source", texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source"))
+            if source is None:
                 fail("library", f"{path} has KTX2 textures alone, which the page does not read", "build the library with PNG textures")
-            uri = content["images"][texture["source"]].get("uri")
+            uri = content["images"][source].get("uri")
             if uri is not None and not uri.startswith("data:"):
                 found[uri] = limits.referenced("library", path, unquote(uri), library.folder).resolve()
     return found

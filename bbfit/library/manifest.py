@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,38 @@ class Screen:
 
 
 @dataclass(frozen=True)
+class LevelScore:
+    """How a level looks in held-out views, at the size on the screen at which it takes over."""
+
+    tree_pixels: float
+    """Height of the tree in those pictures in pixels, at most that in the views."""
+    psnr: float
+    """PSNR in dB, the mean over four backgrounds."""
+    color_error: float
+    """Perceived difference (:func:`bbfit.evaluation.color_error.color_error`), in [0, 1]."""
+    texels: int
+    """Texels of the atlas that it takes up, with the padding of its textures."""
+
+
+@dataclass(frozen=True)
+class AtlasPage:
+    """One picture of the atlas."""
+
+    files: tuple[str, ...]
+    """Its files, relative to the library's folder."""
+    width: int
+    """Texels."""
+    height: int
+    """Texels."""
+    used: float
+    """Share that textures cover, without their padding."""
+    safe_mip_level: int
+    """The highest mip level that mixes no two textures."""
+    bytes: int
+    """Size of its files."""
+
+
+@dataclass(frozen=True)
 class LibraryTree:
     """A tree of a library."""
 
@@ -41,11 +73,16 @@ class LibraryTree:
     seed: int | None
     """The seed that it was grown with; ``None`` for a tree from a file."""
     low: tuple[float, float, float]
-    """The lowest corner of its bounds in meters, Y up. Its trunk stands on the ground at the origin."""
+    """The lowest corner of its bounds in meters, Y up. Its trunk stands on the ground at the origin, if its file has it there."""
     high: tuple[float, float, float]
     """The highest corner of its bounds in meters."""
     levels: tuple[LodLevel, ...]
-    """Its levels of detail, finest first. ``file`` is relative to the library's folder. The GLBs refer to the library's atlas."""
+    """Its levels of detail, finest first. ``file`` is relative to the library's folder. The GLBs refer to the library's atlas.
+    ``psnr`` and ``bytes`` are those of these files."""
+    scores: tuple[LevelScore | None, ...] = ()
+    """The score of each level from afar; ``None`` for the tree itself."""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Seconds of each stage."""
 
     @property
     def height(self) -> float:
@@ -60,10 +97,17 @@ class Library:
     folder: Path
     """The folder."""
     screen: Screen
+    """The screen that the distances of levels hold for."""
     atlas: tuple[str, ...]
     """The files that all GLBs share, relative to the folder: pictures of the atlas as PNG and KTX2."""
     trees: tuple[LibraryTree, ...]
     """Its trees."""
+    pages: tuple[AtlasPage, ...] = ()
+    """The pictures of the atlas: more than one only if one would be too large."""
+    failures: Mapping[str, str] = field(default_factory=dict)
+    """Trees that are not in the library although they were asked for, by name, with the reason."""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Seconds of the work after the trees: packing and encoding the atlas, the contact sheet."""
 
     def document(self) -> dict[str, Any]:
         """What ``library.json`` contains."""
@@ -91,7 +135,9 @@ def read_library(folder: str | Path, limits: InputLimits | None = None) -> Libra
         if stored["version"] != LIBRARY_VERSION:
             fail("library", f"{path} has version {stored['version']}, expected {LIBRARY_VERSION}", _HINT)
         trees = tuple(_tree(entry) for entry in stored["trees"])
-        library = Library(folder, Screen(**stored["screen"]), tuple(stored["atlas"]), trees)
+        pages = tuple(AtlasPage(**{**page, "files": tuple(page["files"])}) for page in stored.get("pages", ()))
+        more = {name: stored[name] for name in ("failures", "seconds") if name in stored}
+        library = Library(folder, Screen(**stored["screen"]), tuple(stored["atlas"]), trees, pages, **more)
         check_record("library", library, Library)
     names = [tree.name for tree in trees]
     if not names or len(set(names)) < len(names):
@@ -104,6 +150,7 @@ def read_library(folder: str | Path, limits: InputLimits | None = None) -> Libra
 
 
 def _tree(entry: dict[str, Any]) -> LibraryTree:
-    levels: Sequence[LodLevel] = [LodLevel(**level) for level in entry["levels"]]
+    levels = tuple(LodLevel(**level) for level in entry["levels"])
+    scores = tuple(None if score is None else LevelScore(**score) for score in entry.get("scores", ()))
     corners = {name: tuple(map(float, entry[name])) for name in ("low", "high")}
-    return LibraryTree(**{**entry, **corners, "levels": tuple(levels)})
+    return LibraryTree(**{**entry, **corners, "levels": levels, "scores": scores})

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bbfit.checks import check_file, check_folder, fail
+from bbfit.checks import check_count, check_file, check_folder, fail
 from bbfit.trees.species import load_species
 
 
@@ -50,6 +50,26 @@ def sources(
         if sum(other.name == source.name for other in result) > 1:
             fail("sweep", f"two trees are called {source.name}", "rename one, or omit one")
     return result
+
+
+def seeded_sources(
+    species: Sequence[str], seeds: Sequence[int], trees: Sequence[str | Path], species_file: Path | None = None
+) -> list[tuple[Source, int]]:
+    """Each species with every seed, then the files ``trees``, with seed 0. With several seeds a grown tree's name ends with its seed.
+
+    Raises the errors of :func:`sources`, and ``InputError`` if there are no seeds, or a seed is negative or given twice.
+    """
+    for seed in seeds:
+        check_count("seeds", seed, 0)
+    if not seeds or len(set(seeds)) < len(seeds):
+        fail("seeds", f"expected different ones, got {list(seeds)}")
+    found = sources(species, trees, (), species_file)
+    grown = [source for source in found if source.species is not None]
+    named = [(replace(source, name=f"{source.name}_{seed}") if len(seeds) > 1 else source, seed) for source in grown for seed in seeds]
+    made = named + [(source, 0) for source in found if source.species is None]
+    if len({source.name for source, _ in made}) < len(made):
+        fail("trees", "two trees have the same name", "rename one, or omit one")
+    return made
 
 
 def _plain(name: str) -> str:

@@ -13,12 +13,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pytest
-from forest_scene import placed, square_glb, tiled, write_library
+from forest_scene import ATLAS, placed, square_glb, tiled, write_library
 from numpy.typing import NDArray
+from PIL import Image
 from playwright.sync_api import Browser, Page
 
+from bbfit.exporting.encoders import encode_webp
 from bbfit.forest.placements import Placements, matrices
 from bbfit.forest.web_page import PAGE, PageConfig, write_page
+from bbfit.glb import joined_glb, split_glb
 from bbfit.library.manifest import Library
 
 WIDTH, HEIGHT, FOV = 360, 240, 55.0
@@ -155,6 +158,22 @@ def test_it_needs_no_server_and_no_network_and_shows_names_as_they_are(open_fore
     assert tab.evaluate("[document.title, document.querySelector('h1').textContent]") == ["<b>Park & 'wood'"] * 2
     assert "2 trees" in tab.evaluate("document.getElementById('counts').textContent")
     assert tab.evaluate("forest.renderer.info.memory.textures") == 2, "the atlas, which all models share, and the ground's"
+
+
+def test_an_atlas_may_be_webp_alone(open_forest: Open, tmp_path: Path) -> None:
+    library = write_library(tmp_path / "library", {"oak": [square_glb(RED)]}, [0.0], shared=True)
+    path = tmp_path / "library" / "oak_LOD0.glb"
+    content, views = split_glb(path.read_bytes())
+    image = np.asarray(Image.open(tmp_path / "library" / ATLAS).convert("RGBA"))
+    (tmp_path / "library" / "atlas.webp").write_bytes(encode_webp(image, lossless=True))
+    content.update(images=[{"uri": "atlas.webp"}], extensionsUsed=["KHR_materials_unlit", "EXT_texture_webp"])
+    content["textures"] = [{"sampler": 0, "extensions": {"EXT_texture_webp": {"source": 0}}}]
+    path.write_bytes(joined_glb(content, views))
+    tab = open_forest(library, [placed([[0, 0, -4]])])
+    tab.open((0, 1.7, 0, 0, 0))
+    across, down = projected(np.array([[0.0, 1, -4]]), (0, 1.7, 0, 0, 0))[0]
+    assert is_color(tab.picture()[int(down), int(across)], RED)
+    assert all(url.startswith(("file:", "data:", "blob:")) and not url.endswith(".webp") for url in tab.requests)
 
 
 @pytest.mark.parametrize("alpha", ["mask", "blend", "coverage"])

@@ -543,7 +543,7 @@ def _read_record(folder: Path) -> None:
 
 _KINDS: dict[str, Any] = {"fit": FitConfig, "views": ViewsConfig, "export": ExportConfig, "grow": GrowConfig, "sweep": SweepConfig}
 _KINDS |= {"budget": BudgetConfig, "limits": InputLimits}
-_COMMANDS = ("run", "fit", "views", "evaluate", "export", "lod", "sweep", "compare")
+_COMMANDS = ("run", "fit", "views", "evaluate", "export", "lod", "sweep", "compare", "library")
 
 
 def _options(draw: st.DrawFn) -> Files:

@@ -12,7 +12,7 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
   if (!frame.contentWindow.TreeField) await new Promise((resolve) => frame.addEventListener("load", resolve));
   const renderer = bbfit.createRenderer(THREE, $("canvas"), { antialias: query.get("antialias") !== "0" }), canvas = renderer.domElement;
   const scene = new THREE.Scene(), light = bbfit.createLight(THREE, scene);
-  light.aim(225, 45); // for levels whose materials are lit, such as the tree itself
+  light.aim(315, 45); // from the southwest, for levels whose materials are lit, such as the tree itself
   light.shine({ sun: 0.9 * Math.PI, sky: 0.45 * Math.PI, color: [1, 0.97, 0.92] });
 
   let changed = performance.now(), paused = false, drawn = null, waiting = [], distance = data.drawDistance;
@@ -28,6 +28,14 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
   const median = (list) => [...list].sort((one, other) => one - other)[list.length >> 1];
   const height = () => camera.position.y - ground.heightAt(camera.position.x, camera.position.z);
 
+  // The distance of the forest's farthest corner, behind which there is nothing but haze.
+  const [low, high] = [Math.min, Math.max].map((pick, corner) => [0, 2].map((axis) =>
+    data.tiles.reduce((end, tile) => pick(end, (corner ? tile.high : tile.low)[axis]), corner ? -Infinity : Infinity)));
+  function farthestTree() {
+    const { x, z } = camera.position, across = (at, axis) => Math.max(Math.abs(at - low[axis]), Math.abs(at - high[axis]));
+    return Math.hypot(across(x, 0), across(z, 1), height());
+  }
+
   function resize() {
     renderer.setPixelRatio(devicePixelRatio);
     renderer.setSize(canvas.clientWidth, canvas.clientHeight, false);
@@ -42,7 +50,7 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
     const reach = Math.hypot(distance, height()); // tiles are chosen along the ground
     Object.assign(camera, { near: Math.max(0.1, 0.02 * height()), far: 1.05 * reach + 50 });
     camera.updateProjectionMatrix();
-    ground.update(camera, reach);
+    ground.update(camera, Math.min(reach, 1.5 * farthestTree() + 100));
     trees.setFarthest(reach);
     const missing = tiles.update(camera.position, distance);
     trees.loadFor(camera.position);
@@ -147,7 +155,8 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
   }
   const pixels = () => {
     renderOnce();
-    const gl = renderer.getContext(), { drawingBufferWidth: width, drawingBufferHeight: high } = gl, values = new Uint8Array(4 * width * high);
+    const gl = renderer.getContext(), { drawingBufferWidth: width, drawingBufferHeight: high } = gl;
+    const values = new Uint8Array(4 * width * high);
     gl.readPixels(0, 0, width, high, gl.RGBA, gl.UNSIGNED_BYTE, values); // the bottom row first
     return { width, height: high, values };
   };

@@ -8,8 +8,9 @@ bbfitForest.createGround = (THREE, scene, { low, high, cells, heights, cover }) 
 
   // The height of the ground in meters, bilinear between the middles of cells.
   function heightAt(x, z) {
-    if (!heights) return bottom;
-    const column = clamp((x - low[0]) / step[0] - 0.5, 0, cells - 1), row = clamp((z - low[1]) / step[1] - 0.5, 0, cells - 1);
+    if (!heights) return 0;
+    const column = clamp((x - low[0]) / step[0] - 0.5, 0, cells - 1);
+    const row = clamp((z - low[1]) / step[1] - 0.5, 0, cells - 1);
     const [left, back] = [Math.min(Math.floor(column), cells - 2), Math.min(Math.floor(row), cells - 2)];
     const across = column - left, along = row - back, at = (rows, columns) => heights[(back + rows) * cells + left + columns];
     const mix = (one, other, share) => one + (other - one) * share;
@@ -17,11 +18,12 @@ bbfitForest.createGround = (THREE, scene, { low, high, cells, heights, cover }) 
   }
 
   const fog = (scene.fog = new THREE.Fog(HAZE, 1, 2));
-  let bottom = 0;
   const colors = new Uint8Array(4 * cells * cells);
   for (let cell = 0; cell < cells * cells; cell += 1) {
     const share = cover[cell] / 255;
-    for (let channel = 0; channel < 3; channel += 1) colors[4 * cell + channel] = MEADOW[channel] + (FLOOR[channel] - MEADOW[channel]) * share;
+    for (let channel = 0; channel < 3; channel += 1) {
+      colors[4 * cell + channel] = MEADOW[channel] + (FLOOR[channel] - MEADOW[channel]) * share;
+    }
     colors[4 * cell + 3] = 255;
   }
   const map = Object.assign(new THREE.DataTexture(colors, cells, cells), { encoding: THREE.sRGBEncoding, needsUpdate: true });
@@ -37,7 +39,9 @@ bbfitForest.createGround = (THREE, scene, { low, high, cells, heights, cover }) 
 float speck( vec2 cell ) { return fract( sin( dot( mod( cell, 512.0 ), vec2( 12.9898, 78.233 ) ) ) * 43758.5453 ); }
 float smoothed( vec2 at ) {
   vec2 cell = floor( at ), share = smoothstep( 0.0, 1.0, at - cell );
-  return mix( mix( speck( cell ), speck( cell + vec2( 1, 0 ) ), share.x ), mix( speck( cell + vec2( 0, 1 ) ), speck( cell + 1.0 ), share.x ), share.y ) - 0.5;
+  float above = mix( speck( cell ), speck( cell + vec2( 1, 0 ) ), share.x );
+  float below = mix( speck( cell + vec2( 0, 1 ) ), speck( cell + 1.0 ), share.x );
+  return mix( above, below, share.y ) - 0.5;
 }
 void main() {`)
       .replace("#include <map_fragment>", `#include <map_fragment>
@@ -47,7 +51,8 @@ void main() {`)
 
   const material = new THREE.MeshBasicMaterial({ map });
   material.onBeforeCompile = grain;
-  const geometry = new THREE.PlaneGeometry(size[0] - step[0], size[1] - step[1], heights ? cells - 1 : 1, heights ? cells - 1 : 1).rotateX(-Math.PI / 2);
+  const parts = heights ? cells - 1 : 1, flat = (...sizes) => new THREE.PlaneGeometry(...sizes).rotateX(-Math.PI / 2);
+  const geometry = flat(size[0] - step[0], size[1] - step[1], parts, parts);
   geometry.translate((low[0] + high[0]) / 2, 0, (low[1] + high[1]) / 2);
   const { position, uv } = geometry.attributes;
   for (let corner = 0; corner < position.count; corner += 1) {
@@ -58,15 +63,16 @@ void main() {`)
   Object.assign(surface, { frustumCulled: false, renderOrder: -1 });
 
   // What lies around the forest. It is drawn behind everything else.
-  const around = new THREE.Mesh(new THREE.PlaneGeometry(1, 1).rotateX(-Math.PI / 2), new THREE.MeshBasicMaterial({ depthWrite: false, depthTest: false }));
+  const around = new THREE.Mesh(flat(1, 1), new THREE.MeshBasicMaterial({ depthWrite: false, depthTest: false }));
   around.material.color.setRGB(...MEADOW.map((value) => value / 255)).convertSRGBToLinear();
   around.material.onBeforeCompile = grain;
-  around.position.set((low[0] + high[0]) / 2, heights ? heights.reduce((least, height) => Math.min(least, height), Infinity) : bottom, (low[1] + high[1]) / 2);
+  around.position.set((low[0] + high[0]) / 2, heights ? heights.reduce((one, other) => Math.min(one, other)) : 0, (low[1] + high[1]) / 2);
   Object.assign(around, { frustumCulled: false, renderOrder: -2 });
 
   const sky = new THREE.Mesh(new THREE.SphereGeometry(1, 32, 16), new THREE.ShaderMaterial({
     uniforms: { haze: { value: new THREE.Color(HAZE) }, zenith: { value: new THREE.Color(ZENITH) } },
-    vertexShader: "varying vec3 ahead; void main() { ahead = position; gl_Position = projectionMatrix * modelViewMatrix * vec4( position, 1.0 ); }",
+    vertexShader: `varying vec3 ahead;
+void main() { ahead = position; gl_Position = projectionMatrix * modelViewMatrix * vec4( position, 1.0 ); }`,
     fragmentShader: `uniform vec3 haze, zenith; varying vec3 ahead;
 void main() { gl_FragColor = vec4( mix( haze, zenith, pow( clamp( normalize( ahead ).y, 0.0, 1.0 ), 0.65 ) ), 1.0 ); }`,
     side: THREE.BackSide, depthWrite: false, depthTest: false,

@@ -8,19 +8,30 @@ window.bbfitForest = {
     const textures = new Map(), entries = new Map(), colors = [0xe4572e, 0xf2b134, 0x76b041, 0x17a398, 0x3b6fb6, 0x7d53a6];
     let pending = 0, factor = 1, farthest = Infinity, colored = false;
 
-    // All models share the textures of the atlas.
-    const sharing = (pictures) => (parser) => ({
-      name: "bbfit_shared_textures",
-      loadTexture(index) {
-        const { source, sampler } = parser.json.textures[index], { uri } = parser.json.images[source] ?? {};
-        if (uri === undefined || pictures[uri] === undefined) return null;
-        const { magFilter = 9729, minFilter = 9987, wrapS = 10497, wrapT = 10497 } = parser.json.samplers?.[sampler] ?? {};
-        const key = JSON.stringify([pictures[uri], magFilter, minFilter, wrapS, wrapT]);
-        if (!textures.has(key)) textures.set(key, texture(pictures[uri], { magFilter, minFilter, wrapS, wrapT }));
-        return textures.get(key);
-      },
-    });
-    const FILTERS = { 9728: "Nearest", 9729: "Linear", 9984: "NearestMipmapNearest", 9985: "LinearMipmapNearest", 9986: "NearestMipmapLinear", 9987: "LinearMipmapLinear" };
+    // All models share the textures of the atlas. A texture may be WebP alone; the loader's own extension would look for it on a server.
+    const sharing = (pictures) => (parser) => {
+      const addresses = (parser.json.textures ?? []).map(({ source, extensions }) =>
+        parser.json.images[source ?? extensions?.EXT_texture_webp?.source]?.uri);
+      const shared = (index) => pictures[addresses[index]];
+      return {
+        name: "bbfit_shared_textures",
+        beforeRoot() {
+          addresses.forEach((_, index) => { if (shared(index)) delete parser.json.textures[index].extensions; });
+        },
+        loadTexture(index) {
+          if (!shared(index)) return null;
+          const { samplers, textures: listed } = parser.json, sampler = samplers?.[listed[index].sampler] ?? {};
+          const { magFilter = 9729, minFilter = 9987, wrapS = 10497, wrapT = 10497 } = sampler;
+          const key = JSON.stringify([shared(index), magFilter, minFilter, wrapS, wrapT]);
+          if (!textures.has(key)) textures.set(key, texture(shared(index), { magFilter, minFilter, wrapS, wrapT }));
+          return textures.get(key);
+        },
+      };
+    };
+    const FILTERS = {
+      9728: "Nearest", 9729: "Linear", 9984: "NearestMipmapNearest", 9985: "LinearMipmapNearest", 9986: "NearestMipmapLinear",
+      9987: "LinearMipmapLinear",
+    };
     const WRAPS = { 33071: "ClampToEdge", 33648: "MirroredRepeat", 10497: "Repeat" };
     async function texture(name, { magFilter, minFilter, wrapS, wrapT }) {
       const picture = new Blob([await packs.load(name)]);
@@ -98,7 +109,8 @@ window.bbfitForest = {
         const nearest = entry.field.patches.reduce((least, patch) => Math.min(least, away(patch)), Infinity);
         const { levels } = trees[entry.tree];
         for (let level = levels.length - 2; level >= 0; level -= 1) {
-          if (!entry.asked.has(level) && nearest < EARLY * factor * levels[level + 1].distance) request(entry, level).catch((error) => console.error(error));
+          if (entry.asked.has(level) || nearest >= EARLY * factor * levels[level + 1].distance) continue;
+          request(entry, level).catch((error) => console.error(error));
         }
       }
     }

@@ -19,7 +19,8 @@ bbfitForest.createTiles = (descriptions, trees, addField, wake) => {
     for (const index of indices) counts.set(index, (counts.get(index) ?? 0) + 1);
     for (const [index, copies] of counts) found.set(index, { matrices: new Float32Array(16 * copies), at: 0 });
     for (let copy = 0; copy < count; copy += 1) {
-      const entry = found.get(indices[copy]), { matrices, at } = entry, turn = (rows[3 * count + copy] * Math.PI) / 180, scale = rows[4 * count + copy];
+      const entry = found.get(indices[copy]), { matrices, at } = entry;
+      const turn = (rows[3 * count + copy] * Math.PI) / 180, scale = rows[4 * count + copy];
       matrices[at] = matrices[at + 10] = scale * Math.cos(turn);
       matrices[at + 8] = scale * Math.sin(turn);
       matrices[at + 2] = -matrices[at + 8];

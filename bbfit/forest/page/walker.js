@@ -44,7 +44,8 @@ bbfitForest.createWalker = (THREE, canvas, heightAt, onChange) => {
   }
 
   // From high above one moves faster.
-  const speed = () => (walker.flying ? Math.max(FLYING, 0.5 * (camera.position.y - heightAt(camera.position.x, camera.position.z))) : WALKING);
+  const above = () => camera.position.y - heightAt(camera.position.x, camera.position.z);
+  const speed = () => (walker.flying ? Math.max(FLYING, 0.5 * above()) : WALKING);
 
   // Moves by the keys that are pressed, for some seconds. Returns whether it moved.
   function step(seconds) {
