@@ -29,8 +29,18 @@ from bbfit.checks import InputError
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeScore, ViewScore
 from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.lod import LodLevel
+from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step, fit
+from bbfit.forest.building import read_forest
+from bbfit.forest.config import ForestConfig, RegisterConfig, ScatterConfig
+from bbfit.forest.placements import RECORD
+from bbfit.forest.prototypes import read_prototype
+from bbfit.forest.registers import Register
+from bbfit.forest.scattering import scatter_area
+from bbfit.forest.species import read_species_table
+from bbfit.forest.tiles import read_tile
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.light import Light
@@ -51,6 +61,7 @@ from bbfit.layout import (
     write_transforms,
     write_turned,
 )
+from bbfit.library.manifest import Library, LibraryTree, Screen
 from bbfit.operators.drawing.reference import render_reference
 from bbfit.stages.billboards import read_choice
 from bbfit.stages.stage import Record
@@ -539,11 +550,83 @@ def _read_record(folder: Path) -> None:
             open_results(folder)
 
 
+# Forests.
+
+_REGISTER = b"""species;hoehe;lon;lat;turn
+Tilia cordata;12,5;13.4;52.5;90
+"Acer, rot";6-10 m;13.401;52.501;
+;;13.402;52.502;-5
+"""
+_FEATURES = {
+    "type": "FeatureCollection",
+    "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}},
+    "features": [
+        {"type": "Feature", "geometry": {"type": "Point", "coordinates": [13.4, 52.5, 30]}, "properties": {"art": "Eiche", "height": 7}},
+        {"type": "Feature", "geometry": {"type": "MultiPoint", "coordinates": [[13.4, 52.51]]}, "properties": {"height": "3 m"}},
+    ],
+}
+_AREA = {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [[[13.4, 52.5], [13.401, 52.5], [13.4, 52.501]]]}}
+_FOREST = {
+    "version": 1,
+    "generator": "bbfit",
+    "library": {"trees": ["oak"]},
+    "origin": {"longitude": 13.4, "latitude": 52.5, "east": 0.0, "north": 0.0},
+    "skipped": 0,
+    "species": [{"name": "Tilia", "count": 3, "likeness": "any", "trees": ["oak"]}],
+    "root": {"name": "0/0/0", "low": [0, 0, 0], "high": [1, 2, 3], "count": 3, "children": []},
+}
+
+
+@functools.cache
+def _tile_file() -> bytes:
+    content = io.BytesIO()
+    np.save(content, np.zeros(3, RECORD), allow_pickle=False)
+    return content.getvalue()
+
+
+@functools.cache
+def _tree_glb() -> bytes:
+    return shipped_model(small_cloud(), ExportConfig()).glb
+
+
+def _forest(draw: st.DrawFn) -> Files:
+    kinds = ["trees.csv", "trees.geojson", "area.geojson", "species.csv", "forest.json", "placements/0-0-0.npy", "tree.glb"]
+    kind = draw(st.sampled_from(kinds))
+    documented = {"trees.geojson": _FEATURES, "area.geojson": _AREA, "forest.json": _FOREST}
+    if kind in documented:
+        data = dumped(draw(documents(documented[kind])))
+        return {kind: draw(changed_bytes(data)) if draw(st.integers(0, 4)) == 0 else data}
+    if kind.endswith(".csv"):
+        valid = _REGISTER if kind == "trees.csv" else b"Linde;oak\nAhorn;oak\n"
+        return {kind: draw(changed_words(valid) if draw(st.booleans()) else changed_bytes(valid))}
+    return {kind: draw(changed_bytes(_tree_glb() if kind == "tree.glb" else _tile_file()))}
+
+
+def _read_forest(folder: Path) -> None:
+    level = LodLevel("a", 2, 8, 4, 1, 0.0, 0.0, 0.0, None, None, 0.0, 0.0, "tree.glb", 0.0, 0.0, 0.0, 0.0)
+    oak = LibraryTree("oak", None, None, (-1.0, 0.0, -1.0), (1.0, 2.0, 1.0), (level,))
+    library = Library(folder, Screen(100, 50.0), (), (oak,))
+    for name in ("trees.csv", "trees.geojson"):
+        if (folder / name).is_file():
+            for rows in Register(folder / name, RegisterConfig()).batches():
+                assert np.isfinite(rows["x"]).all() and np.isfinite(rows["y"]).all()
+    if (folder / "area.geojson").is_file():
+        scatter_area(ScatterConfig(scatter_area=folder / "area.geojson"), ForestConfig())
+    if (folder / "species.csv").is_file():
+        read_species_table(folder / "species.csv", library)
+    if (folder / "forest.json").is_file():
+        read_forest(folder)
+    if (folder / "placements").is_dir():
+        assert read_tile(folder, "0/0/0").positions.shape[1] == 3
+    if (folder / "tree.glb").is_file():
+        assert read_prototype(library, 0, 0, InputLimits()).parts
+
+
 # Options.
 
 _KINDS: dict[str, Any] = {"fit": FitConfig, "views": ViewsConfig, "export": ExportConfig, "grow": GrowConfig, "sweep": SweepConfig}
 _KINDS |= {"budget": BudgetConfig, "limits": InputLimits}
-_COMMANDS = ("run", "fit", "views", "evaluate", "export", "lod", "sweep", "compare", "library")
+_COMMANDS = ("run", "fit", "views", "evaluate", "export", "lod", "sweep", "compare", "library", "forest")
 
 
 def _options(draw: st.DrawFn) -> Files:
@@ -595,6 +678,7 @@ TARGETS: Mapping[str, Target] = {
     "grids": Target(_strategy(_grid), _read_grid),
     "species": Target(_strategy(_species), _read_species),
     "records": Target(_strategy(_record), _read_record, 2.0),
+    "forests": Target(_strategy(_forest), _read_forest, 3.0),
     "options": Target(_strategy(_options), _run_command, 0.5),
 }
 """All readers by name."""
