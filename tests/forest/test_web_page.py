@@ -158,6 +158,11 @@ def test_it_needs_no_server_and_no_network_and_shows_names_as_they_are(open_fore
     assert tab.evaluate("[document.title, document.querySelector('h1').textContent]") == ["<b>Park & 'wood'"] * 2
     assert "2 trees" in tab.evaluate("document.getElementById('counts').textContent")
     assert tab.evaluate("forest.renderer.info.memory.textures") == 2, "the atlas, which all models share, and the ground's"
+    refused = """new Promise((resolve) => {
+      addEventListener("securitypolicyviolation", ({ effectiveDirective }) => resolve(effectiveDirective));
+      fetch("https://elsewhere.invalid/").catch(() => {});
+    })"""
+    assert tab.do(lambda page: page.evaluate(refused)) == "connect-src"
 
 
 def test_an_atlas_may_be_webp_alone(open_forest: Open, tmp_path: Path) -> None:
