@@ -357,6 +357,16 @@ def test_a_bad_register_leaves_an_earlier_forest_as_it_was(library: Path, tmp_pa
     }
 
 
+@pytest.mark.parametrize("name", ["forest.glb", "tiles/tileset.json", "tiles/0-0-0_0.glb", "usd/trees/tree_0.usdc", "placements/a.npy"])
+def test_no_file_of_the_user_is_replaced(name: str, library: Path, tmp_path: Path) -> None:
+    place = tmp_path / "out" / name
+    place.parent.mkdir(parents=True)
+    place.write_text("mine")
+    with pytest.raises(InputError, match="is a file that bbfit did not write"):
+        build_forest(register(tmp_path), library, tmp_path / "out", CONFIG)
+    assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == [place] and place.read_text() == "mine"
+
+
 def test_projected_coordinates_are_moved_to_the_origin(library: Path, tmp_path: Path) -> None:
     path = register(tmp_path, "x,y\n391000,5820000\n391100,5820040\n")
     forest = build_forest(path, library, tmp_path / "out", ForestConfig(formats=("tiles",), origin=(13.4, 52.5)))
