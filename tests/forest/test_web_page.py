@@ -272,7 +272,7 @@ def test_trees_beyond_the_draw_distance_are_not_drawn(open_forest: Open, tmp_pat
     tab = open_forest(library, [placed([[0, 0, -z] for z in (50, 90, 110, 150)])], PageConfig(draw_distance=100))
     assert tab.open((0, 1.7, 0, 0, 0))["loaded"] == 4
     assert tab.evaluate("forest.renderOnce().shown") == 2
-    assert tab.move((0, 60, 0, 0, -20))["shown"] == 2
+    assert tab.move((0, 60, 0, 0, -40))["shown"] == 2
     assert tab.evaluate("() => { forest.setDistance(120); return forest.renderOnce().shown; }") == 3
 
 
