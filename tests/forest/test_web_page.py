@@ -306,6 +306,12 @@ def test_keys_and_pointer_move_the_camera_as_the_help_says(open_forest: Open, tm
     assert step("e")[1] == pytest.approx(27.5) and step("q")[1] == pytest.approx(12.5)
     assert step("f")[1] == pytest.approx(1.7)
 
+    tab.evaluate("forest.walker.setPose(0, 1.7, 0, 0, 0)")
+    tab.do(lambda page: page.focus("[name=distance]"))
+    assert step("w") == pytest.approx([0, 1.7, -4, 0, 0]), "letters move the camera wherever the focus is"
+    assert step("ArrowUp") == pytest.approx([0, 1.7, -4, 0, 0]) and tab.evaluate("forest.data.drawDistance") == 300
+    assert tab.evaluate("document.forms[0].elements.distance.value") == "350", "arrows move the slider"
+
     def drag(page: Page) -> None:
         page.mouse.move(180, 150)
         page.mouse.down()
