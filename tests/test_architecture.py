@@ -75,7 +75,7 @@ ONLY_IN = {
     "fast_simplification": {"rivals/decimation.py", "rivals/learned_mesh.py"},
     "DracoPy": {"rivals/draco.py"},
     "playwright": {"frames/browser.py"},
-    "pxr": {"forest/usd_stage.py"},
+    "pxr": {"forest/usd_stage.py", "tree_files/usd_layers.py"},
 }
 NOT_AT_IMPORT = ("bpy", "warp", "xatlas", "ray", "matplotlib", "mitsuba", "DracoPy", "fast_simplification", "jinja2", "playwright", "pxr")
 
