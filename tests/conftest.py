@@ -38,6 +38,7 @@ SHARED = TESTS.parent / "../shared"
 MARKED = {
     "blender": (
         "blender",
+        "library/test_building.py",
         "rivals/test_baking.py",
         "rivals/test_crossed_and_sliced.py",
         "rivals/test_octahedral.py",
@@ -54,7 +55,7 @@ MARKED = {
         "viewers",
         "viewing",
     ),
-    "node": ("exporting/test_formats.py", "exporting/test_lod.py", "exporting/test_model.py"),
+    "node": ("exporting/test_formats.py", "exporting/test_lod.py", "exporting/test_model.py", "library/test_shared_atlas.py"),
     "ray": ("sweep/test_cluster.py",),
     "slow": (
         "budget/test_choice.py",

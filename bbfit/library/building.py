@@ -8,6 +8,7 @@ from pathlib import Path
 
 from bbfit.blender.requirements import check_blender
 from bbfit.checks import InputError, fail
+from bbfit.layout import TEST_FILE
 from bbfit.library.config import LibraryConfig
 from bbfit.library.files import STAGE, WORK, FinishedTree, library_outputs, library_stage
 from bbfit.library.manifest import Library, read_library
@@ -65,6 +66,8 @@ def build_library(
         Finished trees are kept.
     """
     config, stages, on_progress = config or LibraryConfig(), stages or RunConfig(), on_progress or silent
+    if not trees and not species:
+        fail("library", "there are no trees", "give files, or species to grow, as in --species acer")
     chosen = seeded_sources(species, seeds, trees, stages.grow.species_file)
     _check(Path(out), chosen, config, stages)
     with claimed_folder("out", out) as folder:
@@ -140,6 +143,6 @@ def _submitted(
 def _is_current(facts: Facts | None, place: Path) -> bool:
     """Whether a tree's task succeeded, and the files that it wrote for the library are as they were."""
     files = (facts or {}).get("files")
-    if not isinstance(files, Mapping) or not files:
+    if not isinstance(files, Mapping) or not files or not (place / "views" / TEST_FILE).is_file():
         return False
     return all((file := place / name).is_file() and digest_file(file) == digest for name, digest in files.items())

@@ -16,9 +16,10 @@ from bbfit.geometry.cards import Cards
 from bbfit.images import over_color, to_bytes
 from bbfit.library.config import LibraryConfig
 from bbfit.library.manifest import LIBRARY_FILE, AtlasPage, LevelScore, Library, LibraryTree, Screen
+from bbfit.library.scores import drawing, scored
 from bbfit.library.shared_atlas import SharedPage, cell_texels, safe_level, shared_pages
 from bbfit.library.stored_cards import read_cards
-from bbfit.library.trees import CARDS, card_file, drawing
+from bbfit.library.trees import CARDS, card_file
 from bbfit.lod import LEVELS, with_textures
 from bbfit.outputs import check_room
 from bbfit.provenance import VERSIONS, digest_file
@@ -34,7 +35,7 @@ WORK = "work"
 """The folder with the views and fits of each tree, from which a build continues."""
 STAGE = "library"
 """The name of the stage that writes these files."""
-_PARTS = ("packing", "encoding", "models", "contact sheet")
+_PARTS = ("packing", "encoding", "models", "scores", "contact sheet")
 
 
 @dataclass(frozen=True)
@@ -54,14 +55,16 @@ class _Level:
     """A level of a tree on its way to the library."""
 
     level: LodLevel
-    score: Mapping[str, float] | None
-    """``None`` for the tree itself."""
     source: Path
     """Its cards, or the GLB of the tree itself."""
 
     @property
     def file(self) -> str:
         return f"{TREES}/{self.level.file}"
+
+    @property
+    def is_cards(self) -> bool:
+        return self.level.planes is not None
 
 
 def library_outputs(names: Sequence[str], config: LibraryConfig) -> tuple[str, ...]:
@@ -92,25 +95,28 @@ def library_stage(
 
         on_progress("atlas", 0, len(_PARTS))
         every = [level for own in levels.values() for level in own]
-        cards = {level.file: read_cards(level.source) for level in every if level.score is not None}
+        cards = {level.file: read_cards(level.source) for level in every if level.is_cards}
         pages = shared_pages(list(cards.values()), export.padding, config.page_size, own_levels=export.has_mips)
         passed()
         pictures = [texture_files(page.cards[0], export) for page in pages]
         textures = {_place(name, number): data for number, page in enumerate(pictures) for name, data in page.items()}
         passed()
-        models = {level.file: level.source.read_bytes() for level in every if level.score is None}
+        files, shared = list(cards), dict[str, Cards]()
+        models = {level.file: level.source.read_bytes() for level in every if not level.is_cards}
         for number, page in enumerate(pages):
             addresses = {name: Path(_place(name, number)).name for name in pictures[number]}
-            names = [list(cards)[model] for model in page.models]
+            names = [files[model] for model in page.models]
             models |= {name: glb_bytes(own, export, files=addresses) for name, own in zip(names, page.cards, strict=True)}
+            shared |= dict(zip(names, page.cards, strict=True))
+        passed()
+        entries = [_entry(folder, tree, levels[tree.source.name], models, shared, export) for tree in trees]
         passed()
         check_room("out", folder, sum(map(len, (*textures.values(), *models.values()))))
         (folder / LIBRARY_FILE).unlink(missing_ok=True)  # until all files are there, the folder is no library
         (folder / TREES).mkdir(exist_ok=True)
         for file, data in {**textures, **models}.items():
             write_bytes(folder / file, data)
-        entries = [_entry(tree, levels[tree.source.name], models, cards, export) for tree in trees]
-        contact_sheet([_sheet_tree(folder, entry, cards) for entry in entries], folder / CONTACT_FILE)
+        contact_sheet([_sheet_tree(folder, entry, shared) for entry in entries], folder / CONTACT_FILE)
         passed()
         described = tuple(_page(page, number, pictures[number], export) for number, page in enumerate(pages))
         screen = Screen(config.screen_height, config.screen_fov_degrees)
@@ -127,10 +133,9 @@ def library_stage(
 
 def _levels(folder: Path, tree: FinishedTree) -> list[_Level]:
     place, found = folder / WORK / tree.source.name, list[_Level]()
-    for entry, score in zip(tree.facts["levels"], tree.facts["scores"], strict=True):
+    for entry in tree.facts["levels"]:
         level = LodLevel(**entry)
-        source = place / LEVELS / level.file if level.planes is None else place / CARDS / card_file(level)
-        found.append(_Level(level, score, source))
+        found.append(_Level(level, place / LEVELS / level.file if level.planes is None else place / CARDS / card_file(level)))
     return found
 
 
@@ -148,16 +153,23 @@ def _page(page: SharedPage, number: int, pictures: Mapping[str, bytes], export: 
 
 
 def _entry(
-    tree: FinishedTree, levels: Sequence[_Level], models: Mapping[str, bytes], cards: Mapping[str, Cards], export: ResolvedExport
+    folder: Path,
+    tree: FinishedTree,
+    levels: Sequence[_Level],
+    models: Mapping[str, bytes],
+    shared: Mapping[str, Cards],
+    export: ResolvedExport,
 ) -> LibraryTree:
-    shipped, scores = list[LodLevel](), list[LevelScore | None]()
+    """A tree of the manifest, with the counts and the scores of its files."""
+    views, shipped, scores = ViewDataset.load(folder / WORK / tree.source.name / "views"), list[LodLevel](), list[LevelScore | None]()
     for own in levels:
-        vertices, triangles = glb_counts(models[own.file])
-        score = None if own.score is None else dict(own.score)
-        near = None if score is None else score.pop("near")
-        size = len(models[own.file])
+        (vertices, triangles), size = glb_counts(models[own.file]), len(models[own.file])
+        near, score = None, None
+        if own.is_cards:
+            cards = shared[own.file]
+            near, score = scored(cards, own.level, views, cell_texels(cards, export.padding))
         shipped.append(replace(own.level, vertices=vertices, triangles=triangles, bytes=size, psnr=near, file=own.file))
-        scores.append(None if score is None else LevelScore(**score, texels=cell_texels(cards[own.file], export.padding)))
+        scores.append(score)
     low, high = (tuple(map(float, tree.facts[corner])) for corner in ("low", "high"))
     source, seed = tree.source, None if tree.source.species is None else tree.seed
     return LibraryTree(source.name, source.species, seed, low, high, tuple(shipped), tuple(scores), tree.facts["seconds"])  # type: ignore[arg-type]

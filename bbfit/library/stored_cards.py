@@ -15,7 +15,7 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cards import Atlas, Card, Cards
 from bbfit.inputs import reading
 
-_FORMAT = "bbfit.cards"
+_ENTRY = "bbfit.cards"
 
 
 def write_cards(path: Path, cards: Cards, last_level: int) -> None:
@@ -33,8 +33,9 @@ def write_cards(path: Path, cards: Cards, last_level: int) -> None:
         if getattr(first, name) is not None:
             arrays[name] = np.array([getattr(card, name) for card in cards.cards])
     tensors = {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
-    alpha = asdict(cards.alpha) | {"hardness": None}
-    write_tensors(path, tensors, {"format": _FORMAT, "alpha": json.dumps(alpha), "traced": json.dumps(cards.traced)})
+    alpha = {name: value for name, value in asdict(cards.alpha).items() if name != "hardness"}  # which may be infinite
+    # One entry: the order of several would be random, and so would be the bytes of the file.
+    write_tensors(path, tensors, {_ENTRY: json.dumps({"alpha": alpha, "traced": cards.traced})})
 
 
 def read_cards(path: Path) -> Cards:
@@ -43,9 +44,7 @@ def read_cards(path: Path) -> Cards:
 
     with reading("library", path, "remove it, and build the library again"), safe_open(path, "np") as file:
         arrays = {name: file.get_tensor(name) for name in file.keys()}
-        metadata = file.metadata()
-        alpha = json.loads(metadata["alpha"])
-        del alpha["hardness"]
+        facts = json.loads(file.metadata()[_ENTRY])
         ends = np.cumsum(arrays["counts"])[:-1]
         points, uvs = np.split(arrays["points"], ends), np.split(arrays["uvs"], ends)
         made = [
@@ -63,7 +62,7 @@ def read_cards(path: Path) -> Cards:
         ]
         atlas = Atlas(arrays["image"], arrays["corners"], arrays["sizes"], arrays.get("surface"))
         chain, surface = _levels(arrays, "level", atlas.image), _levels(arrays, "surface", atlas.surface)
-        return Cards(tuple(made), atlas, AlphaMode(**alpha), chain, surface, traced=json.loads(metadata["traced"]))
+        return Cards(tuple(made), atlas, AlphaMode(**facts["alpha"]), chain, surface, traced=facts["traced"])
 
 
 def _levels(arrays: dict[str, NDArray], name: str, first: NDArray[np.uint8] | None) -> tuple[NDArray[np.uint8], ...] | None:

@@ -1,25 +1,14 @@
-"""One tree of a library: its stages, the cards of its levels, and their scores. It is a task, which any process on any machine can run."""
+"""One tree of a library: its stages, and the cards of its levels. It is a task, which any process on any machine can run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 
-from torch import Tensor
-
-from bbfit.evaluation.backgrounds import mean_psnr
-from bbfit.evaluation.color_error import color_error
-from bbfit.evaluation.scoring import held_out
-from bbfit.evaluation.sizes import shrunk
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import LodLevel
 from bbfit.exporting.model import shipped_model
-from bbfit.files import read_json, write_json
-from bbfit.fitting.initialize import pixels_per_meter
-from bbfit.geometry.camera import Camera
-from bbfit.geometry.cards import Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.library.config import LibraryConfig
 from bbfit.library.shared_atlas import safe_level
@@ -28,19 +17,15 @@ from bbfit.lod import LEVELS, LodResult, build_lod, with_textures
 from bbfit.outputs import claimed_folder
 from bbfit.pipeline import RunConfig
 from bbfit.provenance import VERSIONS, digest_file
-from bbfit.rendering.cards import CardRenderer
 from bbfit.stages.results import export_config
 from bbfit.stages.stage import OnProgress, Record, Stage
 from bbfit.stages.trees import grow_stage
 from bbfit.trees.species import load_species
 from bbfit.views.dataset import ViewDataset
-from bbfit.views.view_set import ViewSet
 from bbfit.workers.tasks import Facts
 
 CARDS = "cards"
 """The folder with the cards of a tree's levels, in the folder of the tree."""
-_SCORES = "scores.json"
-_LEAST_SIDE = 11  # pixels of the smallest pictures that are compared
 
 
 def library_tree(
@@ -49,7 +34,7 @@ def library_tree(
     """Grow a tree, or take the input ``tree``, make its levels of detail, and write the cards of each level to the folder ``cards``.
 
     The inputs also contain ``species_file`` and ``hdri``, if the options of the stages name such files. Returns as JSON the tree's
-    corners, its levels, the scores of their cards, the digests of the files, and the seconds of each stage. The errors of ``build_lod`` are
+    corners, its levels, the digests of the files, and the seconds of each stage. The errors of ``build_lod`` are
     raised.
     """
     tree, records = inputs.get("tree"), [folder]
@@ -66,8 +51,7 @@ def library_tree(
     dataset = ViewDataset.load(folder / "views", limits=stages.limits)
     export = with_textures(export_config(dataset, stages.export))
     with claimed_folder("out", folder / CARDS) as place:
-        Record(place).run(_cards_stage(place, built, dataset, export))
-        scores = read_json("scores", place / _SCORES)
+        Record(place).run(_cards_stage(place, built, export))
     assert dataset.request and dataset.request.tree.bounds
     low, high = dataset.request.tree.bounds
     fitted = [folder / str(level.planes) for level in built.levels if level.planes is not None]
@@ -79,7 +63,6 @@ def library_tree(
         "low": low,
         "high": high,
         "levels": [asdict(level) for level in built.levels],
-        "scores": scores,
         "files": {file: digest_file(folder / file) for file in files},
         "seconds": _seconds([*records, *fitted, folder / CARDS]),
     }
@@ -94,50 +77,25 @@ def _card_files(built: LodResult) -> list[str]:
     return [card_file(level) for level in built.levels if level.planes is not None]
 
 
-def _cards_stage(folder: Path, built: LodResult, dataset: ViewDataset, export: ExportConfig) -> Stage:
-    """Write the cards of each level, with mip levels of their own if the encoder of KTX2 is installed, and their scores."""
+def _cards_stage(folder: Path, built: LodResult, export: ExportConfig) -> Stage:
+    """Write the cards of each level, with mip levels of their own if the encoder of KTX2 is installed."""
     clouds = [built.folder / str(level.planes) / "cloud.safetensors" for level in built.levels if level.planes is not None]
     levels = [level for level in built.levels if level.planes is not None]
-    export = export.resolve()
 
     def work(on_progress: OnProgress) -> None:
-        scores = list[dict[str, float] | None]([None] * (len(built.levels) - len(levels)))
         for number, (level, path) in enumerate(zip(levels, clouds, strict=True)):
             on_progress(CARDS, number, len(levels))
             cards = shipped_model(BillboardCloud.load(path), export, level.halvings).cards
             write_cards(folder / card_file(level), cards, safe_level(export.padding))
-            scores.append(_score(cards, level, dataset))
-        write_json(folder / _SCORES, scores)
         on_progress(CARDS, len(levels), len(levels))
 
-    inputs = ([digest_file(path) for path in clouds], [asdict(level) for level in levels], dataset.fingerprint, export, VERSIONS["export"])
-    outputs = (*(card_file(level) for level in levels), _SCORES)
-    return Stage(CARDS, inputs, outputs, work, algorithm="library")
-
-
-def drawing(cards: Cards, views: ViewSet) -> Callable[[Camera], Tensor]:
-    """A function that draws what the files of cards show to one camera, cards with maps in the light of the views."""
-    light = None if cards.atlas.surface is None or views.light is None else views.light[[0]]
-    return partial(CardRenderer(cards).draw, light=light)
-
-
-def _score(cards: Cards, level: LodLevel, dataset: ViewDataset) -> dict[str, float]:
-    """The PSNR at the size of the views, as ``near``, and the fields of :class:`~bbfit.library.manifest.LevelScore` but ``texels``."""
-    views, scale = dataset.test, float(pixels_per_meter(dataset.train.cameras))
-    assert dataset.request and dataset.request.tree.bounds
-    low, high = dataset.request.tree.bounds
-    height = (high[1] - low[1]) * scale
-    share = min(1.0, (level.tree_pixels or height) / height)
-    width, tall = (max(_LEAST_SIDE, round(side * share)) for side in (views.cameras.width, views.cameras.height))
-    near, far, colors, draw = list[float](), list[float](), list[float](), drawing(cards, views)
-    for index in range(len(views)):
-        near.append(mean_psnr(*held_out(draw, views, index)))
-        target = shrunk(views.targets([index])[0].double(), width, tall)
-        image = draw(views.cameras[index].resized(width, tall)).double().clamp(0, 1)
-        far.append(mean_psnr(target, image))
-        colors.append(color_error(target, image))
-    near_mean, far_mean, color_mean = (sum(values) / len(views) for values in (near, far, colors))
-    return {"near": near_mean, "tree_pixels": height * share, "psnr": far_mean, "color_error": color_mean}
+    inputs = (
+        [digest_file(path) for path in clouds],
+        [asdict(level) for level in levels],
+        export.resolve(),
+        VERSIONS["export"],
+    )
+    return Stage(CARDS, inputs, tuple(card_file(level) for level in levels), work, algorithm="library")
 
 
 def _seconds(folders: list[Path]) -> dict[str, float]:

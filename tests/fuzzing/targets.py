@@ -61,7 +61,8 @@ from bbfit.layout import (
     write_transforms,
     write_turned,
 )
-from bbfit.library.manifest import Library, LibraryTree, Screen
+from bbfit.library.config import LibraryConfig
+from bbfit.library.manifest import Library, LibraryTree, Screen, read_library
 from bbfit.operators.drawing.reference import render_reference
 from bbfit.stages.billboards import read_choice
 from bbfit.stages.stage import Record
@@ -622,10 +623,42 @@ def _read_forest(folder: Path) -> None:
         assert read_prototype(library, 0, 0, InputLimits()).parts
 
 
+# Libraries.
+
+_LEVEL = {"name": "oak_LOD0", "planes": 8, "vertices": 40, "triangles": 20, "bytes": 100, "error_meters": 0.1, "error_pixels": 0.9}
+_LEVEL |= {"held_out_error_pixels": 1.0, "psnr": 25.0, "tree_pixels": None, "distance_meters": 0.0, "screen_coverage": 0.0}
+_LEVEL |= {"file": "trees/oak_LOD0.glb", "silhouette_distance_meters": 10.0, "color_distance_meters": 20.0, "color_error": 0.1}
+_LEVEL |= {"held_out_color_error": 0.1, "halvings": 0}
+_SCORE = {"tree_pixels": 40.0, "psnr": 25.0, "color_error": 0.2, "texels": 640}
+_LIBRARY: dict[str, Any] = {
+    "version": 1,
+    "generator": "bbfit",
+    "screen": {"height": 1080, "fov_degrees": 50.0},
+    "atlas": ["trees/atlas.png"],
+}
+_LIBRARY |= {"failures": {"elm": "it is damaged"}, "seconds": {"packing": 1.0}}
+_LIBRARY["pages"] = [{"files": ["trees/atlas.png"], "width": 64, "height": 64, "used": 0.5, "safe_mip_level": 3, "bytes": 1}]
+_LIBRARY["trees"] = [
+    {"name": "oak", "species": None, "seed": None, "low": [-1.0, 0.0, -1.0], "high": [1.0, 4.0, 1.0], "levels": [_LEVEL]}
+    | {"scores": [_SCORE], "seconds": {"fit": 1.0}}
+]
+
+
+def _library(draw: st.DrawFn) -> Files:
+    data = dumped(draw(documents(json.loads(json.dumps(_LIBRARY)), 3)))
+    changed = draw(changed_bytes(data)) if draw(st.integers(0, 9)) == 0 else data
+    return {"library.json": changed, "trees/atlas.png": b".", "trees/oak_LOD0.glb": b"."}
+
+
+def _read_library(folder: Path) -> None:
+    library = read_library(folder)
+    assert json.dumps(library.document(), allow_nan=False)
+
+
 # Options.
 
 _KINDS: dict[str, Any] = {"fit": FitConfig, "views": ViewsConfig, "export": ExportConfig, "grow": GrowConfig, "sweep": SweepConfig}
-_KINDS |= {"budget": BudgetConfig, "limits": InputLimits}
+_KINDS |= {"budget": BudgetConfig, "limits": InputLimits, "library": LibraryConfig, "forest": ForestConfig}
 _COMMANDS = ("run", "fit", "views", "evaluate", "export", "lod", "sweep", "compare", "library", "forest")
 
 
@@ -679,6 +712,7 @@ TARGETS: Mapping[str, Target] = {
     "species": Target(_strategy(_species), _read_species),
     "records": Target(_strategy(_record), _read_record, 2.0),
     "forests": Target(_strategy(_forest), _read_forest, 3.0),
+    "libraries": Target(_strategy(_library), _read_library),
     "options": Target(_strategy(_options), _run_command, 0.5),
 }
 """All readers by name."""

@@ -238,9 +238,9 @@ def _material(found: dict[str, Any]) -> BrowserMaterial:
 
 
 def _answer(route: Route, glb: Path) -> None:
-    """Serve the page, the program and the model under the page's own origin; refuse everything else."""
+    """Serve the page, the program, the model and the pictures beside it under the page's own origin; refuse everything else."""
     name = route.request.url.removeprefix(f"{ORIGIN}/").partition("?")[0]
-    places = [glb] if name == "model.glb" else [HERE / name, PROGRAMS / name, NODE / "node_modules" / name]
+    places = [glb] if name == "model.glb" else [HERE / name, PROGRAMS / name, NODE / "node_modules" / name, glb.parent / name]
     file = next(filter(Path.is_file, places), None)
     if file is None:
         route.abort()
