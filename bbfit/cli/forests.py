@@ -52,7 +52,8 @@ def forest_command(
     for species in result.species:
         counts[species.likeness] = counts.get(species.likeness, 0) + species.count
     how = ", ".join(f"{count:,} by {likeness}" for likeness, count in counts.items() if count)
-    out_console.print(f"{len(result):,} trees ({how}); forest.json says which trees stand for each species", soft_wrap=True)
+    found = "" if placements is None else f" ({how}); forest.json says which trees stand for each species"
+    out_console.print(f"{len(result):,} trees{found}", soft_wrap=True)
     if result.skipped:
         out_console.print(f"{result.skipped:,} rows without usable coordinates were left out", style="yellow")
     shown = {"glb": "forest.glb", "tiles": "tiles/tileset.json", "usd": "usd/forest.usda", "page": "page/index.html"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -81,9 +82,24 @@ def test_the_same_register_gives_the_same_files(forest: Forest, library: Path, t
             assert (forest.folder / name).read_bytes() == (again.folder / name).read_bytes(), name
 
 
+@pytest.mark.node
 def test_khronos_validator_finds_no_errors(forest: Forest) -> None:
     found = messages(forest.folder / "forest.glb", *sorted((forest.folder / "tiles").glob("*.glb")))
     assert not [message for message in found if message["code"] not in REMARKS]
+
+
+@pytest.mark.node
+def test_the_validator_of_3d_tiles_finds_no_errors(forest: Forest, tmp_path: Path) -> None:
+    """Where it is installed. The registry of npm did not have the package 3d-tiles-validator in November 2026; its source is on GitHub."""
+    package = Path(__file__).parents[1] / "node" / "node_modules" / "3d-tiles-validator"
+    if not (package / "package.json").is_file():
+        pytest.skip("3d-tiles-validator is not installed: npm answers 404 for it")
+    program = package / json.loads((package / "package.json").read_text())["bin"]["3d-tiles-validator"]
+    report = tmp_path / "report.json"
+    command = ["node", str(program), "--tilesetFile", str(forest.folder / "tiles" / "tileset.json"), "--reportFile", str(report)]
+    subprocess.run(command, check=True, capture_output=True)
+    found = json.loads(report.read_text())
+    assert found["numErrors"] == 0 and found["numWarnings"] == 0, found
 
 
 def accessor(tree: dict[str, Any], binary: bytes, index: int) -> NDArray[np.float32]:
@@ -339,6 +355,16 @@ def test_a_bad_register_leaves_an_earlier_forest_as_it_was(library: Path, tmp_pa
     assert {path: data for path, data in after.items() if path.name != ".bbfit.json"} == {
         path: data for path, data in before.items() if path.name != ".bbfit.json"
     }
+
+
+@pytest.mark.parametrize("name", ["forest.glb", "tiles/tileset.json", "tiles/0-0-0_0.glb", "usd/trees/tree_0.usdc", "placements/a.npy"])
+def test_no_file_of_the_user_is_replaced(name: str, library: Path, tmp_path: Path) -> None:
+    place = tmp_path / "out" / name
+    place.parent.mkdir(parents=True)
+    place.write_text("mine")
+    with pytest.raises(InputError, match="is a file that bbfit did not write"):
+        build_forest(register(tmp_path), library, tmp_path / "out", CONFIG)
+    assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == [place] and place.read_text() == "mine"
 
 
 def test_projected_coordinates_are_moved_to_the_origin(library: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import itertools
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -60,6 +61,13 @@ class ForestTab:
     def move(self, pose: Sequence[float]) -> dict[str, Any]:
         """Move the camera, and wait until all is loaded that it shows."""
         return self.evaluate("pose => { forest.walker.setPose(...pose); return forest.settled(); }", list(pose))
+
+    def wait_until(self, condition: str) -> None:
+        """Wait until a JavaScript expression is true. The page's policy forbids playwright's own way, which evaluates text in the page."""
+        until = time.monotonic() + 400
+        while not self.evaluate(f"Boolean({condition})"):
+            assert time.monotonic() < until, condition
+            time.sleep(0.05)
 
     def picture(self) -> NDArray[np.int64]:
         """What the camera sees, [H, W, 3]."""
@@ -158,6 +166,11 @@ def test_it_needs_no_server_and_no_network_and_shows_names_as_they_are(open_fore
     assert tab.evaluate("[document.title, document.querySelector('h1').textContent]") == ["<b>Park & 'wood'"] * 2
     assert "2 trees" in tab.evaluate("document.getElementById('counts').textContent")
     assert tab.evaluate("forest.renderer.info.memory.textures") == 2, "the atlas, which all models share, and the ground's"
+    refused = """new Promise((resolve) => {
+      addEventListener("securitypolicyviolation", ({ effectiveDirective }) => resolve(effectiveDirective));
+      fetch("https://elsewhere.invalid/").catch(() => {});
+    })"""
+    assert tab.do(lambda page: page.evaluate(refused)) == "connect-src"
 
 
 def test_an_atlas_may_be_webp_alone(open_forest: Open, tmp_path: Path) -> None:
@@ -261,6 +274,16 @@ def test_tiles_are_loaded_near_the_camera_and_freed_when_they_are_far(open_fores
     np.testing.assert_array_equal(tab.picture(), before)
 
 
+def test_trees_beyond_the_draw_distance_are_not_drawn(open_forest: Open, tmp_path: Path) -> None:
+    """Of one tile, which is loaded as a whole. The distance counts along the ground."""
+    library = write_library(tmp_path / "library", {"oak": [square_glb(RED)]}, [0.0])
+    tab = open_forest(library, [placed([[0, 0, -z] for z in (50, 90, 110, 150)])], PageConfig(draw_distance=100))
+    assert tab.open((0, 1.7, 0, 0, 0))["loaded"] == 4
+    assert tab.evaluate("forest.renderOnce().shown") == 2
+    assert tab.move((0, 60, 0, 0, -40))["shown"] == 2
+    assert tab.evaluate("() => { forest.setDistance(120); return forest.renderOnce().shown; }") == 3
+
+
 def test_keys_and_pointer_move_the_camera_as_the_help_says(open_forest: Open, tmp_path: Path) -> None:
     library = write_library(tmp_path / "library", {"oak": [square_glb(RED)]}, [0.0])
     tab = open_forest(library, [placed([[0, 0, -50]])], PageConfig(draw_distance=300))
@@ -291,6 +314,12 @@ def test_keys_and_pointer_move_the_camera_as_the_help_says(open_forest: Open, tm
     assert step("e")[1] == pytest.approx(27.5) and step("q")[1] == pytest.approx(12.5)
     assert step("f")[1] == pytest.approx(1.7)
 
+    tab.evaluate("forest.walker.setPose(0, 1.7, 0, 0, 0)")
+    tab.do(lambda page: page.focus("[name=distance]"))
+    assert step("w") == pytest.approx([0, 1.7, -4, 0, 0]), "letters move the camera wherever the focus is"
+    assert step("ArrowUp") == pytest.approx([0, 1.7, -4, 0, 0]) and tab.evaluate("forest.data.drawDistance") == 300
+    assert tab.evaluate("document.forms[0].elements.distance.value") == "350", "arrows move the slider"
+
     def drag(page: Page) -> None:
         page.mouse.move(180, 150)
         page.mouse.down()
@@ -314,8 +343,8 @@ def test_the_page_draws_by_itself_and_shows_the_time_of_a_frame(open_forest: Ope
     tab = open_forest(library, [placed([[0, 0, -9], [3, 0, -9]])])
     tab.open((0, 2, 0, 0, 0))
     tab.evaluate("forest.resume()")
-    tab.do(lambda page: page.wait_for_function("document.getElementById('status').textContent === '' && forest.walker.camera.position.y"))
-    tab.do(lambda page: page.wait_for_function("Number(document.getElementById('time').textContent) > 0"))
+    tab.wait_until("document.getElementById('status').textContent === ''")
+    tab.wait_until("Number(document.getElementById('time').textContent) > 0")
     assert tab.evaluate("['shown', 'loaded'].map((name) => document.getElementById(name).textContent)") == ["2", "2"]
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import LEVELS, SMALL, TREE
 from khronos import WARNING, messages
+from library_of_two import LEVELS, SMALL, TREE
 from PIL import Image
 
 from bbfit.checks import InputError

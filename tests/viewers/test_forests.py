@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -161,3 +164,22 @@ def test_far_tiles_show_a_part_of_the_trees_that_covers_as_much(wood: Forest, li
             side = 2 * distance * np.tan(np.radians(fov / 2))
             areas.append((found["picture"].min(-1) < 250).mean() * side**2)
     assert areas[1] == pytest.approx(areas[0], rel=0.4)
+
+
+def test_blender_reads_the_usd_stage(library: Path, tmp_path: Path) -> None:
+    """Each tree is an instance of a mesh where it stands, upright in Blender's axes, turned and scaled."""
+    if importlib.util.find_spec("bpy") is None:
+        pytest.fail("Blender is not installed: pip install bpy, or bbfit with its extra blender, on Python 3.11")
+    scatter = ScatterConfig(scatter=(60, 50), spacing=8)
+    forest = build_forest(scatter, library, tmp_path / "forest", ForestConfig(formats=("usd",), tile_trees=20))
+    script, stage = Path(__file__).with_name("forest_blender_script.py"), forest.folder / "usd" / "forest.usda"
+    environment = os.environ | dict.fromkeys(("TMPDIR", "BLENDER_USER_RESOURCES"), str(tmp_path))
+    done = subprocess.run([sys.executable, "-P", str(script), str(stage)], capture_output=True, text=True, check=True, env=environment)
+    found = np.array(json.loads(done.stdout.splitlines()[-1]))
+    placed = np.concatenate([matrices(forest.read(tile.name)) for tile in leaves(forest.root)])
+    to_blender = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    expected = to_blender @ placed.reshape(-1, 4, 4).transpose(0, 2, 1)
+    assert len(found) == len(forest) == len(expected)
+    for values in (found, expected):
+        values[:] = values[np.lexsort(np.round(values[:, :2, 3], 1).T)]
+    np.testing.assert_allclose(found, expected, atol=3e-3)

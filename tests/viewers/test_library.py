@@ -34,5 +34,5 @@ def test_three_shows_the_same_out_of_the_shared_atlas(textures: str, three: Brow
         assert material.size == page.image.shape[1::-1] and material.compressed == (textures == "ktx2")
         off = np.abs(shows[0].images - shows[1].images).max(-1)
         assert (shows[0].images < 1).any()
-        # Graphics cards round coordinates to parts of a texel, so that single pixels at the cutoff fall to the other side.
-        assert (off > 0.05).mean() < (0.002 if textures == "png" else 0.05), (off > 0.05).mean()
+        # Measured: 1 of 17,920 pixels with PNG, where a coordinate is rounded at the cutoff, and 59 with KTX2.
+        assert (off > 0.05).mean() < (0.0005 if textures == "png" else 0.008)

@@ -12,8 +12,9 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
   if (!frame.contentWindow.TreeField) await new Promise((resolve) => frame.addEventListener("load", resolve));
   const renderer = bbfit.createRenderer(THREE, $("canvas"), { antialias: query.get("antialias") !== "0" }), canvas = renderer.domElement;
   const scene = new THREE.Scene(), light = bbfit.createLight(THREE, scene);
-  light.aim(315, 45); // from the southwest, for levels whose materials are lit, such as the tree itself
-  light.shine({ sun: 0.9 * Math.PI, sky: 0.45 * Math.PI, color: [1, 0.97, 0.92] });
+  // For levels whose materials are lit, such as the tree itself: the default light of views, less what a crown keeps off.
+  light.aim(30, 45);
+  light.shine({ sun: 0.9 * 2.5, sky: 0.3 * Math.PI, color: [1, 1, 1] });
 
   let changed = performance.now(), paused = false, drawn = null, waiting = [], distance = data.drawDistance;
   const wake = () => { changed = performance.now(); };
@@ -131,8 +132,8 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
   controls.mode.addEventListener("click", () => walker.setFlying(!walker.flying));
   controls.distance.addEventListener("input", () => setDistance(Number(controls.distance.value)));
   controls.levels.addEventListener("change", () => colorLevels(controls.levels.checked));
-  addEventListener("keydown", ({ code, repeat, target, ctrlKey, metaKey, altKey }) => {
-    if (repeat || ctrlKey || metaKey || altKey || target.matches?.("input[type=text]")) return;
+  addEventListener("keydown", ({ code, repeat, ctrlKey, metaKey, altKey }) => {
+    if (repeat || ctrlKey || metaKey || altKey) return;
     if (code === "KeyL") colorLevels(!controls.levels.checked);
     if (code === "KeyH") $("help").open = !$("help").open;
   });
