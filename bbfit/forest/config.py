@@ -20,11 +20,11 @@ class RegisterConfig:
     """How a register of trees is read."""
 
     coordinates: Coordinates | None = None
-    """Unit of the coordinates. Default: degrees for GeoJSON and for columns such as longitude and latitude, meters for others. Projected
-    coordinates, such as those of UTM, are meters."""
+    """Unit of the coordinates. Default: degrees for GeoJSON and for columns such as longitude and latitude, meters for others.
+    Projected coordinates, such as those of UTM, are meters."""
     columns: tuple[str, ...] = ()
-    """Columns with unusual names, as KEY=NAME, for example height=H_BAUM. KEY is longitude, latitude, x, y, point, z, height, crown, turn,
-    scale, species or genus. Names that are common in registers of cities need none."""
+    """Columns with unusual names, as KEY=NAME, for example height=H_BAUM. Names that are common in registers of cities need none.
+    KEY is longitude, latitude, x, y, point, z, height, crown, turn, scale, species or genus."""
     encoding: str = "utf-8-sig"
     """Encoding of a table's text."""
     incomplete: Literal["refuse", "skip"] = "refuse"
@@ -52,8 +52,8 @@ class ScatterConfig:
     spacing: Annotated[float, Range(0.1, 1e5)] = 6.0
     """Least distance between two scattered trees in meters. An area has about 0.7 trees for each square of this side."""
     mix: tuple[str, ...] = ()
-    """Species or trees of the library that are scattered, with their shares as NAME=SHARE, for example oak=3 birch=1. Default: all trees of
-    the library in equal shares."""
+    """Species or trees of the library that are scattered, with their shares as NAME=SHARE, for example oak=3 birch=1.
+    Default: all trees of the library in equal shares."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -87,11 +87,11 @@ class ForestConfig:
     """Table (CSV) of species: names of the register in the first column, and species or trees of the library in the second column.
     Other names go to a tree of the same species, genus, habit or kind."""
     level: Annotated[int, Range(0)] = 0
-    """Level of detail of the trees in the GLB, 0 the finest. A tree with fewer levels has its coarsest one. The tiles, the USD stage and
-    the page have all levels."""
+    """Level of detail of the trees in the GLB, 0 the finest. A tree with fewer levels has its coarsest one.
+    The tiles, the USD stage and the page have all levels."""
     origin: tuple[float, ...] = ()
-    """Longitude and latitude of the local frame's origin. Default: the middle of the trees. For coordinates in meters it places the forest
-    on the Earth; it has no place there by default."""
+    """Longitude and latitude of the local frame's origin. Default: the middle of the trees.
+    For coordinates in meters it places the forest on the Earth. Such a forest has no place there by default."""
     origin_meters: tuple[float, ...] = ()
     """Coordinates in meters that lie at the origin. Default: 0 0, and the middle of the trees for coordinates beyond 100,000 meters."""
     sizes: tuple[float, ...] = (0.85, 1.15)
