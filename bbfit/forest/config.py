@@ -23,8 +23,9 @@ class RegisterConfig:
     """Unit of the coordinates. Default: degrees for GeoJSON and for columns such as longitude and latitude, meters for others.
     Projected coordinates, such as those of UTM, are meters."""
     columns: tuple[str, ...] = ()
-    """Columns with unusual names, as KEY=NAME, for example height=H_BAUM. Names that are common in registers of cities need none.
-    KEY is longitude, latitude, x, y, point, z, height, crown, turn, scale, species or genus."""
+    """Columns with unusual names, as KEY=NAME, for example height=H_BAUM.
+    KEY is longitude, latitude, x, y, point, z, height, crown, turn, scale, species or genus.
+    Names that are common in registers of cities need none."""
     encoding: str = "utf-8-sig"
     """Encoding of a table's text."""
     incomplete: Literal["refuse", "skip"] = "refuse"
@@ -91,7 +92,7 @@ class ForestConfig:
     The tiles, the USD stage and the page have all levels."""
     origin: tuple[float, ...] = ()
     """Longitude and latitude of the local frame's origin. Default: the middle of the trees.
-    For coordinates in meters it places the forest on the Earth. Such a forest has no place there by default."""
+    For coordinates in meters it places the forest on the Earth; it has no place there by default."""
     origin_meters: tuple[float, ...] = ()
     """Coordinates in meters that lie at the origin. Default: 0 0, and the middle of the trees for coordinates beyond 100,000 meters."""
     sizes: tuple[float, ...] = (0.85, 1.15)

@@ -266,6 +266,16 @@ def test_tiles_are_loaded_near_the_camera_and_freed_when_they_are_far(open_fores
     np.testing.assert_array_equal(tab.picture(), before)
 
 
+def test_trees_beyond_the_draw_distance_are_not_drawn(open_forest: Open, tmp_path: Path) -> None:
+    """Of one tile, which is loaded as a whole. The distance counts along the ground."""
+    library = write_library(tmp_path / "library", {"oak": [square_glb(RED)]}, [0.0])
+    tab = open_forest(library, [placed([[0, 0, -z] for z in (50, 90, 110, 150)])], PageConfig(draw_distance=100))
+    assert tab.open((0, 1.7, 0, 0, 0))["loaded"] == 4
+    assert tab.evaluate("forest.renderOnce().shown") == 2
+    assert tab.move((0, 60, 0, 0, -40))["shown"] == 2
+    assert tab.evaluate("() => { forest.setDistance(120); return forest.renderOnce().shown; }") == 3
+
+
 def test_keys_and_pointer_move_the_camera_as_the_help_says(open_forest: Open, tmp_path: Path) -> None:
     library = write_library(tmp_path / "library", {"oak": [square_glb(RED)]}, [0.0])
     tab = open_forest(library, [placed([[0, 0, -50]])], PageConfig(draw_distance=300))
@@ -295,6 +305,12 @@ def test_keys_and_pointer_move_the_camera_as_the_help_says(open_forest: Open, tm
     assert step("w") == pytest.approx([0, 20 - 7.5, -15 * 3**0.5 / 2, 0, -30])
     assert step("e")[1] == pytest.approx(27.5) and step("q")[1] == pytest.approx(12.5)
     assert step("f")[1] == pytest.approx(1.7)
+
+    tab.evaluate("forest.walker.setPose(0, 1.7, 0, 0, 0)")
+    tab.do(lambda page: page.focus("[name=distance]"))
+    assert step("w") == pytest.approx([0, 1.7, -4, 0, 0]), "letters move the camera wherever the focus is"
+    assert step("ArrowUp") == pytest.approx([0, 1.7, -4, 0, 0]) and tab.evaluate("forest.data.drawDistance") == 300
+    assert tab.evaluate("document.forms[0].elements.distance.value") == "350", "arrows move the slider"
 
     def drag(page: Page) -> None:
         page.mouse.move(180, 150)

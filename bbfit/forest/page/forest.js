@@ -132,8 +132,8 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
   controls.mode.addEventListener("click", () => walker.setFlying(!walker.flying));
   controls.distance.addEventListener("input", () => setDistance(Number(controls.distance.value)));
   controls.levels.addEventListener("change", () => colorLevels(controls.levels.checked));
-  addEventListener("keydown", ({ code, repeat, target, ctrlKey, metaKey, altKey }) => {
-    if (repeat || ctrlKey || metaKey || altKey || target.matches?.("input[type=text]")) return;
+  addEventListener("keydown", ({ code, repeat, ctrlKey, metaKey, altKey }) => {
+    if (repeat || ctrlKey || metaKey || altKey) return;
     if (code === "KeyL") colorLevels(!controls.levels.checked);
     if (code === "KeyH") $("help").open = !$("help").open;
   });

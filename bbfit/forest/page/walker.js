@@ -59,9 +59,11 @@ bbfitForest.createWalker = (THREE, canvas, heightAt, onChange) => {
     return true;
   }
 
-  const typing = ({ target, ctrlKey, metaKey, altKey }) => target.matches?.("input, select, textarea") || ctrlKey || metaKey || altKey;
+  // Arrows belong to a slider that has the focus.
+  const taken = ({ target, code, ctrlKey, metaKey, altKey }) =>
+    ctrlKey || metaKey || altKey || (code.startsWith("Arrow") && target.matches?.("input"));
   addEventListener("keydown", (event) => {
-    if (typing(event)) return;
+    if (taken(event)) return;
     if (KEYS[event.code]) event.preventDefault();
     pressed.add(event.code);
     if (event.code === "KeyF" && !event.repeat) setFlying(!walker.flying);
@@ -73,6 +75,7 @@ bbfitForest.createWalker = (THREE, canvas, heightAt, onChange) => {
   const pointers = new Map(), release = ({ pointerId }) => pointers.delete(pointerId);
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
+    canvas.focus({ preventScroll: true });
     pointers.set(event.pointerId, event);
   });
   canvas.addEventListener("pointerup", release);
