@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from dataclasses import replace
@@ -19,7 +20,9 @@ from bbfit.evaluation.backgrounds import mean_psnr
 from bbfit.evaluation.scoring import held_out
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
+from bbfit.files import write_bytes
 from bbfit.glb import split_glb
+from bbfit.library import files
 from bbfit.library.building import build_library
 from bbfit.library.config import LibraryConfig
 from bbfit.library.manifest import Library, read_library
@@ -164,6 +167,28 @@ def test_files_of_trees_that_are_gone_are_removed(built: Library, tmp_path: Path
     one = build_library([TREE], folder, LEVELS, SMALL)
     assert [tree.name for tree in one.trees] == ["tree"]
     assert {path.name for path in (folder / "trees").glob("*.glb")} == {"tree_LOD0.glb", "tree_LOD1.glb", "mine.glb"}
+
+
+def test_a_library_that_was_not_finished_is_none(built: Library, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is full after two files; the next start writes the same library."""
+    folder, written = copied(built, tmp_path), list[Path]()
+    config = replace(LEVELS, page_size=4096)
+
+    def write(path: Path, data: bytes) -> None:
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        written.append(path)
+        write_bytes(path, data)
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+        patch.setattr(files, "write_bytes", write)
+        again(folder, config)
+    with pytest.raises(InputError, match=r"library\.json"):
+        read_library(folder)
+    finished = again(folder, config)
+    assert [tree.levels for tree in finished.trees] == [tree.levels for tree in built.trees]
+    for path in (built.folder / "trees").iterdir():
+        assert (folder / "trees" / path.name).read_bytes() == path.read_bytes()
 
 
 def test_a_file_of_the_user_stays(tmp_path: Path) -> None:
