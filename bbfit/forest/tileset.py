@@ -153,7 +153,7 @@ class _Writer:
         """The tile of a square with everything below it, after its contents were written."""
         children = [self.tile(child, report) for child in forest_tile.children]
         tile = self._journal.known.get(forest_tile.name)
-        if tile is None:
+        if tile is None or not all((self._out / uri).is_file() for uri in _uris(tile)):
             placements = read_tile(self._folder, forest_tile.name)
             name = forest_tile.name.replace("/", "-")
             tile = self._part(name, placements, forest_tile) if children else self._leaf(name, placements)
@@ -265,6 +265,13 @@ def _corners(tile: _Tile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     box = np.array(tile["boundingVolume"]["box"])
     half = box[[3, 7, 11]]
     return box[:3] - half, box[:3] + half
+
+
+def _uris(tile: _Tile) -> Iterator[str]:
+    """The contents of a tile and of those below it."""
+    yield tile["content"]["uri"]
+    for child in tile.get("children", []):
+        yield from _uris(child)
 
 
 def _size(tile: ForestTile) -> int:

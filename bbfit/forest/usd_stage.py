@@ -6,6 +6,7 @@ https://openusd.org/release/api/class_usd_geom_point_instancer.html
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -51,14 +52,14 @@ def write_usd(out: Path, forest: tuple[Path, ForestTile], library: Library, limi
         for part in () if journal.known else (TREES, TEXTURES, USD_TILES):
             for path in (out / part).iterdir():
                 path.unlink()  # of an earlier forest
-        textures = dict[Any, str]()
+        textures = set[str]()
         for tree in range(len(library.trees)):
-            if f"tree {tree}" not in journal.known:
+            if f"tree {tree}" not in journal.known or not (out / TREES / f"tree_{tree}.usdc").is_file():
                 _write_tree(out, library, tree, limits, textures)
                 journal.add(f"tree {tree}", None)
         tiles, done = list(leaves(root)), 0
         for tile in tiles:
-            if tile.name not in journal.known:
+            if tile.name not in journal.known or not (out / USD_TILES / f"{tile.name.replace('/', '_')}.usdc").is_file():
                 _write_tile(out, tile, read_tile(folder, tile.name), library)
                 journal.add(tile.name, None)
             done += tile.count
@@ -109,7 +110,7 @@ def _write_tile(out: Path, tile: ForestTile, placements: Placements, library: Li
     _save(layer, out / USD_TILES / f"{tile.name.replace('/', '_')}.usdc", references=references)
 
 
-def _write_tree(out: Path, library: Library, tree: int, limits: InputLimits, textures: dict[Any, str]) -> None:
+def _write_tree(out: Path, library: Library, tree: int, limits: InputLimits, textures: set[str]) -> None:
     """Write a tree with a variant for each level of detail."""
     from pxr import UsdGeom
 
@@ -160,7 +161,7 @@ def _write_part(stage: Any, prototype: Prototype, part: Part, number: int, mater
             UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(materials[primitive["material"]])
 
 
-def _write_material(stage: Any, out: Path, prototype: Prototype, number: int, textures: dict[Any, str]) -> Any:
+def _write_material(stage: Any, out: Path, prototype: Prototype, number: int, textures: set[str]) -> Any:
     """A UsdPreviewSurface. The colors of an unlit material are emitted."""
     from pxr import Gf, Sdf, UsdShade
 
@@ -204,7 +205,7 @@ def _write_material(stage: Any, out: Path, prototype: Prototype, number: int, te
     return material
 
 
-def _texture(out: Path, prototype: Prototype, index: int, textures: dict[Any, str]) -> str:
+def _texture(out: Path, prototype: Prototype, index: int, textures: set[str]) -> str:
     """The address of a texture, relative to the trees, after it was copied. USD knows PNG and JPEG."""
     texture = prototype.document["textures"][index]
     source = texture.get("source")
@@ -217,10 +218,11 @@ def _texture(out: Path, prototype: Prototype, index: int, textures: dict[Any, st
         suffix = {"image/png": ".png", "image/jpeg": ".jpg"}[image["mimeType"]]
     else:
         data, suffix = file.read_bytes(), file.suffix.lower()
-    if data not in textures:
-        textures[data] = f"{len(textures)}_{prototype.name}{suffix}"
-        write_bytes(out / TEXTURES / textures[data], data)
-    return f"../{TEXTURES}/{textures[data]}"
+    name = f"{sha256(data).hexdigest()[:16]}{suffix}"  # the same in whatever order trees are written
+    if name not in textures:
+        textures.add(name)
+        write_bytes(out / TEXTURES / name, data)
+    return f"../{TEXTURES}/{name}"
 
 
 def _materials(prototype: Prototype) -> list[dict[str, Any]]:

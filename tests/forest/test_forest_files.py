@@ -263,7 +263,7 @@ def test_an_interrupted_build_continues(library: Path, tmp_path: Path, monkeypat
 
         monkeypatch.setattr(module, name, write)
 
-    for module, name, after in ((tileset, "write_pieces", 20), (usd_stage, "write_bytes", 5)):
+    for module, name, after in ((tileset, "write_pieces", 20), (usd_stage, "write_bytes", 2), (usd_stage, "write_bytes", 5)):
         with monkeypatch.context():
             stopping(module, name, after)
             with pytest.raises(KeyboardInterrupt):
