@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Annotated
 
-from bbfit.checks import Range
+from bbfit.checks import Count, Range
 from bbfit.exporting.config import LodConfig
 from bbfit.workers.config import WorkersConfig
 
@@ -14,6 +14,8 @@ from bbfit.workers.config import WorkersConfig
 class LibraryConfig(WorkersConfig, LodConfig):
     """The levels of detail of each tree, their atlas, and the processes or machines that make them."""
 
+    planes: tuple[Count, ...] = (256, 64, 16, 4)
+    """Number of billboards of each level, the finest first. The finest is what a visitor sees near by, unless the trees are kept."""
     original: bool = False
     """Keep the trees themselves as their finest levels. Their files contain their own textures."""
     page_size: Annotated[int, Range(64, 32768)] = 8192
