@@ -164,7 +164,7 @@ def _entry(
     views, shipped, scores = ViewDataset.load(folder / WORK / tree.source.name / "views"), list[LodLevel](), list[LevelScore | None]()
     for own in levels:
         (vertices, triangles), size = glb_counts(models[own.file]), len(models[own.file])
-        near, score = None, None
+        near, score = own.level.psnr, None
         if own.is_cards:
             cards = shared[own.file]
             near, score = scored(cards, own.level, views, cell_texels(cards, export.padding))

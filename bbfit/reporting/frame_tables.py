@@ -69,7 +69,7 @@ class Machine:
     picture: str
     """Size and samples of the picture."""
     load: float
-    """Mean number of other processes that wanted a core when the measurement began."""
+    """Mean number of processes that wanted a core in the minute before the measurement."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def frames_markdown(rows: Sequence[FrameRow], costs: Sequence[FrameCosts], machi
     parts = [
         "# Frame times",
         f"Medians in milliseconds of frames that were drawn to their end, on {machine.processor}, by {machine.renderer} in "
-        f"{machine.browser}; {machine.picture}. {machine.load:.1f} other processes wanted a core when the measurement began. A dash is a "
+        f"{machine.browser}; {machine.picture}. In the minute before, {machine.load:.1f} processes wanted a core. A dash is a "
         "number of trees that was left out because fewer took too long. *Fragments* are those of a tree's triangles, hidden and "
         "transparent ones included, in thousands. FLIP and PSNR are means over four backgrounds and held-out views, drawn by three.js at "
         "this height, or at that of the views if they are smaller. A star marks the models that no other one beats in both time and FLIP.",
@@ -172,6 +172,7 @@ def _cost_line(cost: FrameCosts) -> list[str]:
 def _line(rows: Sequence[FrameRow], counts: Sequence[int], *, star: bool) -> list[str]:
     """A line of a table: the rows of one model by their numbers of trees."""
     times, last = {row.count: row.ms for row in rows}, rows[-1]
+    counted = next((row for row in reversed(rows) if row.fragments is not None), last)
     return [
         f"{last.title} *" if star else last.title,
         *(f"{times[count]:,.1f}" if count in times else "-" for count in counts),
@@ -179,7 +180,7 @@ def _line(rows: Sequence[FrameRow], counts: Sequence[int], *, star: bool) -> lis
         "" if last.psnr is None else f"{last.psnr:.2f}",
         f"{last.calls:,}",
         f"{last.triangles / last.count:,.0f}",
-        "" if last.fragments is None else f"{last.fragments / last.count / 1000:,.1f}",
+        "" if counted.fragments is None else f"{counted.fragments / counted.count / 1000:,.1f}",
         "" if last.card_bytes is None else f"{last.card_bytes / 1e6:,.1f}",
     ]
 

@@ -52,7 +52,7 @@ def library_table(trees: Mapping[str, tuple[float, Sequence[LodLevel]]]) -> Tabl
             table.add_row(
                 Text(tree if number == 0 else ""),
                 f"{height:.1f}" if number == 0 else "",
-                "the tree" if level.planes is None else str(level.planes),
+                level.content,
                 f"{level.vertices:,}",
                 f"{level.bytes:,}",
                 f"{level.distance_meters:,.0f}",

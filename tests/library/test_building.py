@@ -202,9 +202,11 @@ def test_a_file_of_the_user_stays(tmp_path: Path) -> None:
 
 def test_the_trees_themselves_can_be_the_finest_levels(built: Library, tmp_path: Path) -> None:
     folder = copied(built, tmp_path)
-    found = build_library([TREE], folder, replace(LEVELS, original=True), replace(SMALL, export=ExportConfig(textures="png")))
+    config = replace(LEVELS, original=True, thinned=(800,))
+    found = build_library([TREE], folder, config, replace(SMALL, export=ExportConfig(textures="png")))
     (tree,) = found.trees
-    assert [level.planes for level in tree.levels] == [None, 3, 2] and tree.scores[0] is None and tree.levels[0].psnr is None
+    assert [level.planes for level in tree.levels] == [None, None, 3, 2] and tree.scores[:2] == (None, None)
+    assert tree.levels[0].psnr is None and tree.levels[1].psnr and tree.levels[1].triangles <= 800
     assert (folder / tree.levels[0].file).read_bytes() == TREE.read_bytes()
     assert found.atlas == ("trees/atlas.png",) and json.loads((folder / "library.json").read_text())["trees"][0]["scores"][0] is None
 
