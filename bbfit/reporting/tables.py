@@ -132,10 +132,10 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
 def lod_table(levels: Sequence[LodLevel]) -> Table:
     """A ``rich`` table of levels of detail: costs, the distance of each and those that silhouette and colors ask for, and errors.
 
-    Where speed counts, it has a column too.
+    Where speed counts, one column has the larger of these two distances, and the next one that of speed.
     """
     timed = any(level.fragments is not None for level in levels)
-    asking = ["outline", "colors", *(["speed"] if timed else [])]
+    asking = ["errors", "speed"] if timed else ["outline", "colors"]
     table = _table(["level"], ["planes", "vertices", "bytes", "from, m", *asking, "px", "error", "FLIP"], no_wrap=True)
     table.caption = f"{', '.join(asking)}: distances that they ask for, m; px: height of the tree; error: of the outline, px"
     table.caption_justify = "left"
@@ -143,8 +143,9 @@ def lod_table(levels: Sequence[LodLevel]) -> Table:
         costs = ["thinned" if level.planes is None and level.psnr else level.content, _count(level.vertices), _count(level.bytes)]
         cells = [f"{level.distance_meters:.1f}", *["-"] * (len(asking) + 3)]
         if level.content != "tree":
-            distances = (level.silhouette_distance_meters, level.color_distance_meters, level.speed_distance_meters)
-            asked = [f"{distance:.1f}" for distance in distances[: len(asking)]]
+            distances = [level.silhouette_distance_meters, level.color_distance_meters]
+            distances = [max(distances), level.speed_distance_meters] if timed else distances
+            asked = [f"{distance:.1f}" for distance in distances]
             below = "-" if level.tree_pixels is None else f"{level.tree_pixels:.0f}"
             cells[1:] = [*asked, below, f"{level.error_pixels:.2f}", f"{level.color_error:.2f}"]
         table.add_row(level.name.rsplit("_", 1)[-1], *costs, *cells)
