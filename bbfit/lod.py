@@ -230,6 +230,7 @@ class _Model:
     switch: Switch
     psnr: float | None = None
     draw: Callable[[Camera], Tensor] | None = None
+    requested: int | None = None
 
 
 def _model(made: _Thinned | RunResult, switch: Switch, export: ExportConfig, views: ViewDataset) -> _Model:
@@ -237,7 +238,7 @@ def _model(made: _Thinned | RunResult, switch: Switch, export: ExportConfig, vie
         return _Model(made.file.read_bytes(), None, switch, views_psnr(made.draw, views.test), made.draw)
     own = export if switch.outline is None else replace(export, outline=switch.outline)
     shipped = shipped_model(made.cloud, own, switch.halvings)
-    return _Model(shipped.glb, len(made.cloud), switch, made.report.mean.over.mean.psnr, shipped.draw)
+    return _Model(shipped.glb, len(made.cloud), switch, made.report.mean.over.mean.psnr, shipped.draw, int(made.folder.name))
 
 
 def _mesh_costs(file: Path, views: ViewSet) -> dict[Outline | None, DrawingCost]:
@@ -320,6 +321,7 @@ def _levels(views: ViewDataset, models: list[_Model], config: LodConfig, name: s
                 color_distance_meters=focal / switch.color_scale,
                 color_error=switch.color_errors[0],
                 held_out_color_error=switch.color_errors[1],
+                requested=model.requested,
                 halvings=switch.halvings,
                 outline=switch.outline,
                 speed_distance_meters=focal / switch.faster_scale,

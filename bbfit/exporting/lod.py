@@ -53,6 +53,8 @@ class LodLevel:
     """Mean error of its colors in the training views where the level takes over, in [0, 1]; 0 for the tree itself."""
     held_out_color_error: float
     """The same error in the held-out views."""
+    requested: int | None = None
+    """Number of billboards that were requested, which is the name of its run's folder. The fit may have removed some of them."""
     halvings: int = 0
     """How many times the sides of its textures were halved, because it is only seen from afar."""
     outline: Outline | None = None

@@ -54,7 +54,7 @@ def library_tree(
         Record(place).run(_cards_stage(place, built, export))
     assert dataset.request and dataset.request.tree.bounds
     low, high = dataset.request.tree.bounds
-    fitted = [folder / str(level.planes) for level in built.levels if level.planes is not None]
+    fitted = [folder / str(level.requested) for level in built.levels if level.planes is not None]
     files = [
         *(f"{CARDS}/{file}" for file in _card_files(built)),
         *(f"{LEVELS}/{level.file}" for level in built.levels if level.planes is None),
@@ -70,7 +70,7 @@ def library_tree(
 
 def card_file(level: LodLevel) -> str:
     """The name of the file with the cards of a level."""
-    return f"{level.planes}.safetensors"
+    return f"{level.requested}.safetensors"
 
 
 def _card_files(built: LodResult) -> list[str]:
@@ -79,7 +79,7 @@ def _card_files(built: LodResult) -> list[str]:
 
 def _cards_stage(folder: Path, built: LodResult, export: ExportConfig) -> Stage:
     """Write the cards of each level, with mip levels of their own if the encoder of KTX2 is installed."""
-    clouds = [built.folder / str(level.planes) / "cloud.safetensors" for level in built.levels if level.planes is not None]
+    clouds = [built.folder / str(level.requested) / "cloud.safetensors" for level in built.levels if level.planes is not None]
     levels = [level for level in built.levels if level.planes is not None]
 
     def work(on_progress: OnProgress) -> None:

@@ -12,6 +12,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+import bbfit.lod
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import InputError
 from bbfit.evaluation.color_error import mean_color_error
@@ -25,7 +26,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.glb import split_glb
 from bbfit.lod import LodLevel, LodResult, build_lod
-from bbfit.pipeline import RunConfig
+from bbfit.pipeline import RunConfig, RunResult
 from bbfit.views.dataset import ViewDataset
 
 TREE = Path(__file__).resolve().parents[2] / "data" / "tree.glb"
@@ -201,6 +202,20 @@ def _pixels_of_views(built: LodResult) -> float:
     assert views.request and views.request.tree.bounds and views.request.camera
     low, high = views.request.tree.bounds
     return (high[1] - low[1]) * float(views.train.cameras.intrinsics[0, 0, 0]) / views.request.camera["distance"]
+
+
+def test_a_level_names_its_run_although_the_fit_removed_billboards(built: LodResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted = bbfit.lod.run
+    monkeypatch.setattr(bbfit.lod, "run", lambda *args, **kwargs: fewer(fitted(*args, **kwargs)))
+
+    def fewer(result: RunResult) -> RunResult:
+        return replace(result, cloud=result.cloud.take(range(1, len(result.cloud))))
+
+    strict = replace(LEVELS, color_error=0.15)
+    result = build_lod(TREE, built.path.with_name("fewer.glb"), strict, SMALL, work=built.folder)
+    assert [(level.planes, level.requested) for level in result.levels] == [(None, None), (3, 4), (1, 2)]
+    for level in result.levels[1:]:
+        assert (built.folder / str(level.requested) / "cloud.safetensors").is_file()
 
 
 def test_a_profile_adds_what_its_program_needs(built: LodResult, tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def test_the_library_lists_what_is_there(built: Library) -> None:
 def test_scores_are_those_of_the_shared_atlas(built: Library) -> None:
     """The atlas on the disk is that of the cards, and from it each level is drawn and scored again."""
     own = [(tree, level) for tree in built.trees for level in tree.levels]
-    cards = [read_cards(built.folder / "work" / tree.name / "cards" / f"{level.planes}.safetensors") for tree, level in own]
+    cards = [read_cards(built.folder / "work" / tree.name / "cards" / f"{level.requested}.safetensors") for tree, level in own]
     (page,) = shared_pages(cards, 8, 8192, own_levels=cards[0].chain is not None)
     np.testing.assert_array_equal(np.asarray(Image.open(built.folder / "trees" / "atlas.png").convert("RGBA")), page.image)
     for (tree, level), shared in zip(own, page.cards, strict=True):
