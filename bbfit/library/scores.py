@@ -11,11 +11,11 @@ from torch import Tensor
 from bbfit.evaluation.backgrounds import mean_psnr
 from bbfit.evaluation.color_error import color_error
 from bbfit.evaluation.scoring import held_out
-from bbfit.evaluation.sizes import shrunk
 from bbfit.exporting.lod import LodLevel
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
+from bbfit.images import shrunk
 from bbfit.library.manifest import LevelScore
 from bbfit.rendering.cards import CardRenderer
 from bbfit.views.dataset import ViewDataset

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from bbfit.exporting.lod import LodLevel
+from bbfit.reporting.sweep_tables import markdown
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -23,18 +24,12 @@ def stage_sums(times: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
 def times_markdown(times: Mapping[str, Mapping[str, float]], after: Mapping[str, float]) -> str:
     """Seconds of each tree's stages as a table, and those of the work ``after`` all trees."""
     sums = stage_sums(times)
-    rows = [[name, *(seconds.get(stage, 0.0) for stage in sums), sum(seconds.values())] for name, seconds in times.items()]
-    rows.append(["all trees", *sums.values(), sum(sums.values())])
-    lines = ["# Seconds of each stage", "", "Trees that are made at the same time share the cores of the machine.", ""]
-    lines += [_line(["tree", *sums, "together"]), _line(["---", *["---:"] * (len(sums) + 1)])]
-    lines += [_line([row[0], *(f"{value:.1f}" for value in row[1:])]) for row in rows]
-    lines += ["", _line(["after the trees", "seconds"]), _line(["---", "---:"])]
-    lines += [_line([name, f"{seconds:.1f}"]) for name, seconds in after.items()]
-    return "\n".join(lines) + "\n"
-
-
-def _line(cells: Sequence[object]) -> str:
-    return "| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |"
+    rows = {name: [seconds.get(stage, 0.0) for stage in sums] for name, seconds in times.items()} | {"all trees": list(sums.values())}
+    table = [[name, *(f"{value:.1f}" for value in (*seconds, sum(seconds)))] for name, seconds in rows.items()]
+    trees = markdown(["tree", *sums, "together"], table)
+    others = markdown(["after the trees", "seconds"], [[name, f"{seconds:.1f}"] for name, seconds in after.items()])
+    note = "Trees that are made at the same time share the cores of the machine."
+    return f"# Seconds of each stage\n\n{note}\n\n{trees}\n{others}"
 
 
 def library_table(trees: Mapping[str, tuple[float, Sequence[LodLevel]]]) -> Table:
