@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import glob
+import logging
 import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from torch import Tensor
 
 from bbfit.blender.requirements import check_blender
-from bbfit.checks import check_output_file, check_record, fail
+from bbfit.checks import check_folder, check_output_file, check_record, fail
 from bbfit.evaluation.scoring import views_psnr
 from bbfit.evaluation.switching import Candidate, DrawingCost, Switch, cloud_candidate, mesh_cost, switches
-from bbfit.exporting.config import ExportConfig, LodConfig, Outline
+from bbfit.exporting.config import ExportConfig, LodConfig, Outline, Profile
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
 from bbfit.exporting.lod_files import LOD_FILE, level_file, lod_document, program_file_names, program_files
 from bbfit.exporting.model import shipped_model
@@ -27,6 +29,7 @@ from bbfit.inputs import reading
 from bbfit.outputs import claimed_folder, output_folder, used_folder
 from bbfit.pipeline import RunConfig, RunResult, needs_blender, run
 from bbfit.provenance import digest_file
+from bbfit.reporting.frame_tables import FRAMES_FILE, read_costs
 from bbfit.reporting.plots import lod_picture
 from bbfit.rivals.baking import tree_triangles
 from bbfit.stages.results import export_config
@@ -36,12 +39,17 @@ from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views.dataset import ViewDataset
 from bbfit.views.view_set import ViewSet
 
+Levels = TypeVar("Levels", bound=LodConfig)
+
 ORIGINAL = "original.glb"
 """The file of the converted tree."""
 LEVELS = "levels"
 """The folder of the levels' files and their description."""
 # Profiles whose program loads no model with KTX2 textures, although there is a PNG beside them, unless it is given a decoder.
 _WITHOUT_KTX2: frozenset[str | None] = frozenset({"playcanvas"})
+# How the names of the programs that bbfit frames measures begin.
+_MEASURED: dict[str | None, str] = {"three": "three.js", "babylon": "Babylon.js"}
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -87,7 +95,7 @@ def build_lod(
     out
         The .glb file to write.
     config
-        The levels, and the error and the screen that determine their distances.
+        The levels, and the error, the screen and the times that determine their distances.
     stages
         The options for rendering views and for fitting and exporting billboards. ``config.planes`` sets the numbers of billboards.
     work
@@ -101,8 +109,8 @@ def build_lod(
     InputError, OSError
         If an input cannot be used or a file cannot be written. Earlier results stay as they were.
     """
-    config, stages, on_progress = config or LodConfig(), stages or RunConfig(), on_progress or silent
-    out = Path(out)
+    stages, on_progress = stages or RunConfig(), on_progress or silent
+    config, out = with_measured_speed(config or LodConfig(), stages.export.profile), Path(out)
     if out.suffix.lower() != ".glb":
         fail("out", f"{out} ends in {out.suffix or 'nothing'}", "give a name that ends in .glb")
     check_output_file("out", out)
@@ -113,6 +121,20 @@ def build_lod(
         check_blender(stages.views)
     with used_folder("out's folder", out.parent), claimed_folder("work", work) as folder:
         return _built(tree, out, folder, config, stages, on_progress)
+
+
+def with_measured_speed(config: Levels, profile: Profile | None) -> Levels:
+    """The options with the number that ``config.frames`` measured for a profile. Raises ``InputError`` if there is none."""
+    if config.frames is None:
+        return config
+    path = check_folder("frames", config.frames) / FRAMES_FILE
+    known = {cost.program: cost.fragments_per_triangle for cost in read_costs(path) if cost.fragments_per_triangle is not None}
+    if not known:
+        fail("frames", f"{path} has no program's time of a triangle and of a fragment", "measure more fields, or give the number")
+    own = [program for program in known if program.startswith(_MEASURED.get(profile, " "))]
+    program = (own or list(known))[0]
+    _log.info("a triangle takes as long as %.2g fragments in %s", known[program], program)
+    return replace(config, frames=None, fragments_per_triangle=known[program])
 
 
 def check_unset(config: LodConfig, stages: RunConfig) -> None:
@@ -134,7 +156,7 @@ def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: R
     """The stages of :func:`build_lod` in a claimed folder. The options were checked."""
     record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
     converted = {"convert": (ORIGINAL,)} if _converts(tree, config) else {}
-    thinned = {f"thin {count}": (_thinned_file(count),) for count in config.thinned}
+    thinned = {f"thin {count}": (thinned_file(count),) for count in config.thinned}
     record.check({"join": _outputs(out, folder, config, stages.export)} | converted | thinned)
     output_folder("work", folder / LEVELS)
     record.run(views_stage(folder, tree, stages.views), on_progress)
@@ -269,14 +291,15 @@ def _original(record: Record, tree: TreeFile, config: LodConfig, on_progress: On
 
 def _thinned(record: Record, tree: TreeFile, count: int, views: ViewDataset, stages: RunConfig, on_progress: OnProgress) -> _Thinned:
     """The tree with at most ``count`` triangles, and its pictures."""
-    file = record.folder / _thinned_file(count)
+    file = record.folder / thinned_file(count)
     record.run(convert_stage(record.folder, tree, file.name, triangles=count, stage=f"thin {count}"), on_progress)
     stage, train, test = pictures_stage(record.folder, file, views, stages.views, stage=f"render {count}")
     record.run(stage, on_progress)
     return _Thinned(file, train, test)
 
 
-def _thinned_file(count: int) -> str:
+def thinned_file(count: int | str) -> str:
+    """The file of a tree that was thinned out to a number of triangles."""
     return f"thinned_{count}.glb"
 
 

@@ -26,9 +26,9 @@ VERSIONS: Mapping[str, int] = {
     "export": 14,
     "evaluate": 16,
     "report": 8,
-    "lod": 7,
+    "lod": 8,
     "compare": 6,
-    "frames": 1,
+    "frames": 2,
     "library": 1,
     "forest": 1,
 }

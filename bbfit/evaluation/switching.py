@@ -118,15 +118,16 @@ def switches(
     """The switch of each candidate, finest first; ``None`` for one that nowhere draws faster than a level whose error is hidden too.
 
     The bounds hold in the training views. Speed counts if ``config.fragments_per_triangle`` is given: then a level takes over only from
-    the distance from which it also draws faster. ``tree`` is the cost of the tree itself, if that is a level. ``on_level`` is called with
-    the number of finished candidates.
+    the distance from which it also draws faster. It need not wait for a finer level whose error is hidden only from farther away. ``tree``
+    is the cost of the tree itself, if that is a level. ``on_level`` is called with the number of finished candidates.
     """
     view_scale, found = float(pixels_per_meter(views.train.cameras)), list[Switch]()
     for candidate in candidates:
         error, held_out_error = (worst_silhouette(candidate.draw, split) / view_scale for split in (views.train, views.test))
         silhouette = scale_within(error, config.error_pixels)
         color = view_scale * share_within(candidate.draw, views.train, config.color_error)
-        scale = min([view_scale, silhouette, color, *(switch.scale for switch in found)])
+        finer = () if config.fragments_per_triangle is not None else (switch.scale for switch in found)
+        scale = min(view_scale, silhouette, color, *finer)
         found.append(Switch(scale, silhouette, color, (error, held_out_error)))
         on_level(len(found))
     chosen = list[Switch | None](found)

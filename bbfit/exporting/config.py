@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import itertools
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from bbfit.checks import Count, Range, check_fields, fail
@@ -188,6 +189,8 @@ class LodConfig:
     """How many pixels of triangles (fragments) are shaded in the time that a triangle takes; bbfit frames measures it.
     A level then takes over only where it also draws faster, with the outline that draws fastest there.
     A level that nowhere draws faster is left out. Default: the errors alone count."""
+    frames: Path | None = None
+    """Folder of bbfit frames that measured this number. The times of the profile's program count, or else those of the first program."""
     screen_width: Count = 1920
     """Width in pixels of the screen for which distances and screen coverages are computed."""
     screen_height: Count = 1080
@@ -199,6 +202,8 @@ class LodConfig:
         if not isinstance(self.planes, tuple | list) or not self.planes:
             fail("planes", "expected one or more numbers of billboards", "for example 16 8 4 2")
         check_fields(self)
+        if self.frames is not None and self.fragments_per_triangle is not None:
+            fail("frames", "fragments_per_triangle is given too", "leave out one of them")
         meshes = (*(() if self.triangles is None else (self.triangles,)), *self.thinned)
         for name, numbers in (("planes", self.planes), ("thinned", meshes)):
             if any(coarse >= fine for fine, coarse in itertools.pairwise(numbers)):

@@ -39,10 +39,9 @@ def size_error(model: DrawnModel, page: FieldPage, views: ViewSet, tree_pixels: 
 
     The targets are the views, averaged to that size; if they are smaller, they keep their own size. The page has loaded the model, and
     draws it over each background with four samples a pixel. Colors of a model that takes a program's light are not those of the views. Its
-    pictures by Blender are averaged to the size instead, so they have no aliasing at all; ``None`` if there are none.
+    pictures by Blender are averaged to the size instead, so they have no aliasing at all; ``None`` if there are none. The same holds for
+    the level of detail that is shown at that size.
     """
-    if all(model.lit) and model.pictures is None:
-        return None
     flips, psnrs, heights = [], [], []
     for index in spread_views(view_angles(views.cameras).numpy(), count):
         target = views.targets([index], torch.float64)[0]
@@ -53,18 +52,15 @@ def size_error(model: DrawnModel, page: FieldPage, views: ViewSet, tree_pixels: 
         size = max(metrics.SSIM_WINDOW, round(share * views.cameras.width)), max(metrics.SSIM_WINDOW, round(share * views.cameras.height))
         heights.append((rows[-1] + 1 - rows[0]) * size[1] / views.cameras.height)
         target = shrunk(target, *size)
-        drawn = None
-        if all(model.lit) and model.pictures is not None:
-            picture = read_rgba(model.pictures / f"{views.names[index]}.png")
-            drawn = shrunk(premultiply(torch.from_numpy(picture).double() / 255), *size)
         for name, color in BACKGROUNDS.items():
-            if drawn is not None:
-                pair = over_background(target, drawn, name)
-            else:
-                background = torch.tensor(color, dtype=torch.float64)
-                pair = over_color(target, background).numpy(), _drawn(page, views.cameras[index].resized(*size), color).numpy()
-                if model.lit[page.call("level")]:
+            background = torch.tensor(color, dtype=torch.float64)
+            pair = over_color(target, background).numpy(), _drawn(page, views.cameras[index].resized(*size), color).numpy()
+            level = page.call("level")
+            if model.lit[level]:
+                if not (model.pictures and model.pictures[level]):
                     return None
+                picture = read_rgba(model.pictures[level][index])
+                pair = over_background(target, shrunk(premultiply(torch.from_numpy(picture).double() / 255), *size), name)
             flips.append(metrics.flip(*pair))
             psnrs.append(metrics.psnr(*pair))
     return SizeError(float(np.mean(heights)), float(np.mean(flips)), float(np.mean(psnrs))) if heights else None

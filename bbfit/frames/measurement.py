@@ -28,7 +28,7 @@ from bbfit.frames.models import DrawnModel, drawn_models
 from bbfit.inputs import InputLimits, reading
 from bbfit.outputs import claimed_folder, output_folder
 from bbfit.provenance import digest_file
-from bbfit.reporting.frame_tables import FrameCosts, FrameRow, Machine, frames_csv, frames_json, frames_markdown, frames_plot
+from bbfit.reporting.frame_tables import FRAMES_FILE, FrameCosts, FrameRow, Machine, frames_csv, frames_json, frames_markdown, frames_plot
 from bbfit.scratch import ScratchFolder
 from bbfit.stages.stage import OnProgress, Record, Stage, silent
 from bbfit.stages.trees import convert_stage
@@ -37,7 +37,7 @@ from bbfit.views.dataset import ViewDataset
 
 ORIGINAL = "original"
 """The name of the tree itself among the models."""
-_TABLES = ("frames.csv", "frames.json", "frames.md", "frames.png")
+_TABLES = ("frames.csv", FRAMES_FILE, "frames.md", "frames.png")
 _log = logging.getLogger(__name__)
 
 
@@ -114,7 +114,7 @@ def measure_frames(
 
         def write_tables(on_progress: OnProgress) -> None:
             write_bytes(folder / "frames.csv", frames_csv(rows))
-            write_json(folder / "frames.json", frames_json(rows, costs, machine))
+            write_json(folder / FRAMES_FILE, frames_json(rows, costs, machine))
             write_bytes(folder / "frames.md", frames_markdown(rows, costs, machine).encode(errors="backslashreplace"))
             frames_plot(rows, folder / "frames.png")
 
@@ -180,7 +180,7 @@ class _Fields:
         with reading("frames", self._record.folder / name, "remove it, then start bbfit frames again"):
             error = SizeError(**stored)
             check_record("error", error, SizeError)
-        return {"flip": error.flip, "psnr": error.psnr, "error_pixels": error.tree_pixels}
+        return {"flip": error.flip, "psnr": error.psnr if error.flip else None, "error_pixels": error.tree_pixels}
 
     def _store(self, name: str, measure: Callable[[], tuple[list[dict[str, Any]], bytes]], _: OnProgress = silent) -> None:
         """Store the rows of a program and height, and a picture of the field with the fewest trees."""

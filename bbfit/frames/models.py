@@ -15,11 +15,14 @@ from bbfit.exporting.lod_files import LOD_FILE
 from bbfit.files import read_json
 from bbfit.glb import gltf_parts
 from bbfit.inputs import InputLimits, reading
-from bbfit.layout import REQUEST_FILE
+from bbfit.lod import thinned_file
+from bbfit.provenance import digest_file
 from bbfit.reporting.comparison_tables import CompareRow
 from bbfit.reporting.frame_tables import ModelKind
 from bbfit.rivals.octahedral_files import THREE_PROGRAM
+from bbfit.stages.trees import pictures_folder, pictures_in
 from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 
 _FOLDERS = "give folders of bbfit run, compare and lod, and GLB files"
 
@@ -38,8 +41,8 @@ class DrawnModel:
     """Its GLB files: one, or one for each level of detail, finest first."""
     distances: tuple[float, ...] = (0.0,)
     """The distance from which each is shown, over the focal length in pixels: meters for each pixel of a meter's length."""
-    pictures: Path | None = None
-    """A folder with its pictures of the held-out views, if Blender drew them in the light of the views."""
+    pictures: tuple[tuple[Path, ...], ...] = ()
+    """What Blender drew of each file in the held-out views and in their light, for the files of which it did; or empty."""
 
     @cached_property
     def bytes(self) -> int:
@@ -69,10 +72,10 @@ def drawn_models(sources: Sequence[str | Path], limits: InputLimits | None = Non
             models.append(_single(check_file("sources", source), source.stem))
             continue
         folder = check_folder("sources", source)
+        own = ViewDataset.load(folder / "views", limits=limits) if (folder / "views").is_dir() else None
+        views = views or own
         with reading("sources", folder, "start bbfit again for this folder"):
-            models += _in_folder(folder)
-        if views is None and (folder / "views" / REQUEST_FILE).is_file():
-            views = ViewDataset.load(folder / "views", limits=limits)
+            models += _in_folder(folder, own.test if own and views and own.fingerprint == views.fingerprint else None)
     for model in models:
         with reading("model", model.files[0], "export it again"):
             _ = model.lit
@@ -89,12 +92,13 @@ def _with_different_names(models: Sequence[DrawnModel]) -> list[DrawnModel]:
     return list(named.values())
 
 
-def _in_folder(folder: Path) -> list[DrawnModel]:
+def _in_folder(folder: Path, views: ViewSet | None) -> list[DrawnModel]:
+    """The models of a folder. ``views`` are its held-out views, if they are those of the measurement."""
     if (folder / "levels" / LOD_FILE).is_file():
-        return [_levels(folder)]
+        return [_levels(folder, views)]
     if (folder / "compare.json").is_file():
         rows = [CompareRow.from_json(row) for row in read_json("comparison", folder / "compare.json")]
-        models = [model for row in rows if (model := _compared(folder / row.system, row)) is not None]
+        models = [model for row in rows if (model := _compared(folder / row.system, row, views)) is not None]
     else:
         models = [_single(folder / "model.glb", folder.resolve().name)] if (folder / "model.glb").is_file() else []
     if not models:
@@ -106,18 +110,18 @@ def _single(path: Path, name: str) -> DrawnModel:
     return DrawnModel(name, name, "mesh", (path,))
 
 
-def _compared(folder: Path, row: CompareRow) -> DrawnModel | None:
+def _compared(folder: Path, row: CompareRow, views: ViewSet | None) -> DrawnModel | None:
     """A system of a comparison; ``None`` if it has no model, or one that needs a shader that bbfit does not write."""
     path, program = folder / "model.glb", folder / THREE_PROGRAM
     if not path.is_file() or (row.costs.shader and not program.is_file()):
         return None
-    pictures = folder / "held_out"
-    return DrawnModel(
-        row.system, row.title, "impostor" if row.costs.shader else "mesh", (path,), pictures=pictures if pictures.is_dir() else None
-    )
+    pictures = () if views is None else tuple(folder / "held_out" / f"{name}.png" for name in views.names)
+    drawn = all(picture.is_file() for picture in pictures)
+    kind: ModelKind = "impostor" if row.costs.shader else "mesh"
+    return DrawnModel(row.system, row.title, kind, (path,), pictures=(pictures,) if pictures and drawn else ())
 
 
-def _levels(folder: Path) -> DrawnModel:
+def _levels(folder: Path, views: ViewSet | None) -> DrawnModel:
     stored = read_json("levels of detail", folder / "levels" / LOD_FILE)
     levels = tuple(LodLevel(**level) for level in stored["levels"])
     check_record("levels", levels, tuple[LodLevel, ...])
@@ -126,4 +130,15 @@ def _levels(folder: Path) -> DrawnModel:
     names = ", ".join(level.content for level in levels)
     files = tuple(check_file("levels of detail", folder / "levels" / level.file) for level in levels)
     distances = tuple(level.distance_meters / focal for level in levels)
-    return DrawnModel(f"{folder.resolve().name}-levels", f"levels of detail: {names}", "levels", files, distances)
+    whole = stored["config"].get("triangles") is None
+    pictures = () if views is None else tuple(_level_pictures(folder, level, views, whole=whole) for level in levels)
+    return DrawnModel(f"{folder.resolve().name}-levels", f"levels of detail: {names}", "levels", files, distances, pictures)
+
+
+def _level_pictures(folder: Path, level: LodLevel, views: ViewSet, *, whole: bool) -> tuple[Path, ...]:
+    """What Blender drew of a level that takes a program's light: of the whole tree the views themselves."""
+    if level.content == "tree":
+        return views.paths if whole else ()
+    digest = digest_file(folder / "levels" / level.file)
+    thinned = [file for file in sorted(folder.glob(thinned_file("*"))) if level.planes is None and digest_file(file) == digest]
+    return pictures_in(folder / pictures_folder(thinned[0], "test"), views) if thinned else ()

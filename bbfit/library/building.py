@@ -13,7 +13,7 @@ from bbfit.library.config import LibraryConfig
 from bbfit.library.files import STAGE, WORK, FinishedTree, library_outputs, library_stage
 from bbfit.library.manifest import Library, read_library
 from bbfit.library.trees import library_tree
-from bbfit.lod import check_levels, check_unset
+from bbfit.lod import check_levels, check_unset, with_measured_speed
 from bbfit.outputs import claimed_folder
 from bbfit.pipeline import RunConfig, needs_blender
 from bbfit.provenance import VERSIONS, cache_key, digest_file, identity
@@ -65,7 +65,8 @@ def build_library(
         If there are no trees, an option is unusable, no tree succeeds, the atlas would be too large, or the folder cannot be written to.
         Finished trees are kept.
     """
-    config, stages, on_progress = config or LibraryConfig(), stages or RunConfig(), on_progress or silent
+    stages, on_progress = stages or RunConfig(), on_progress or silent
+    config = with_measured_speed(config or LibraryConfig(), stages.export.profile)
     if not trees and not species:
         fail("library", "there are no trees", "give files, or species to grow, as in --species acer")
     chosen = seeded_sources(species, seeds, trees, stages.grow.species_file)

@@ -9,9 +9,14 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from bbfit.checks import check_record
+from bbfit.files import read_json
+from bbfit.inputs import reading
 from bbfit.reporting.plots import write_figure
 from bbfit.reporting.sweep_tables import markdown
 
+FRAMES_FILE = "frames.json"
+"""The file of all rows, of the machine, and of what frames take time for."""
 ModelKind = Literal["mesh", "impostor", "levels"]
 """One model, an octahedral impostor, or several levels of detail."""
 
@@ -49,9 +54,9 @@ class FrameRow:
     file_bytes: int
     """Bytes of the model's files."""
     flip: float | None
-    """FLIP at this height in three.js, the mean over backgrounds and held-out views; 0 for the tree itself, ``None`` if not known."""
+    """FLIP at this height in three.js, the mean over backgrounds and held-out views; 0 of the tree itself, ``None`` if not known."""
     psnr: float | None
-    """PSNR in dB at this height; ``None`` for the tree itself, or if not known."""
+    """PSNR in dB at this height; ``None`` of the tree itself, or if not known."""
     error_pixels: float | None
     """The height of the tree in the pictures of ``flip``, which is at most that in the views."""
 
@@ -125,6 +130,15 @@ def frames_json(rows: Sequence[FrameRow], costs: Sequence[FrameCosts], machine: 
     return {"machine": asdict(machine), "rows": [asdict(row) for row in rows], "costs": [asdict(cost) for cost in costs]}
 
 
+def read_costs(path: Path) -> tuple[FrameCosts, ...]:
+    """What frames take time for, from the file of :func:`frames_json`. Raises ``InputError`` if it cannot be read."""
+    stored = read_json("frames", path)
+    with reading("frames", path, "start bbfit frames again"):
+        costs = tuple(FrameCosts(**cost) for cost in stored["costs"])
+        check_record("costs", costs, tuple[FrameCosts, ...])
+    return costs
+
+
 def frames_markdown(rows: Sequence[FrameRow], costs: Sequence[FrameCosts], machine: Machine) -> str:
     """A Markdown document: for each program and height a table of milliseconds by the number of trees, and what frames take time for."""
     parts = [
@@ -137,9 +151,7 @@ def frames_markdown(rows: Sequence[FrameRow], costs: Sequence[FrameCosts], machi
     ]
     if costs:
         parts += ["## What takes the time", markdown(["program", *_COSTS], [_cost_line(cost) for cost in costs])]
-        parts.append(
-            "Give the number of fragments to `bbfit lod --fragments-per-triangle`: levels then take over only where they draw faster."
-        )
+        parts.append("Give this folder to `bbfit lod --frames`: levels then take over only where they draw faster.")
     for program in dict.fromkeys(row.program for row in rows):
         for pixels in dict.fromkeys(row.tree_pixels for row in rows):
             of_field = [row for row in rows if (row.program, row.tree_pixels) == (program, pixels)]
@@ -214,8 +226,7 @@ def _errors(axis: Any, rows: Sequence[FrameRow], names: Sequence[str], pixels: i
     count = max(set.intersection(*counts), default=min(row.count for row in rows))
     for row in rows:
         if row.count == count and row.flip is not None:
-            own = row.model.startswith("bbfit") or row.kind == "levels"
-            color = f"C{names.index(row.model) % 10}"
+            color, own = f"C{names.index(row.model) % 10}", _is_own(row)
             axis.scatter(row.ms, row.flip, s=120 if own else 50, marker="*" if own else "o", color=color, zorder=3)
             axis.annotate(row.model, (row.ms, row.flip), (6, 4), textcoords="offset points", fontsize=8, color="#70767e")
     axis.set_xscale("log")
@@ -226,13 +237,18 @@ def _errors(axis: Any, rows: Sequence[FrameRow], names: Sequence[str], pixels: i
     axis.grid(alpha=0.3)
 
 
+def _is_own(row: FrameRow) -> bool:
+    """Whether bbfit made the model."""
+    return row.model.startswith("bbfit") or row.kind == "levels"
+
+
 def _growth(axis: Any, rows: Sequence[FrameRow], names: Sequence[str], pixels: int) -> None:
     for number, name in enumerate(names):
-        times = [(row.count, row.ms) for row in rows if row.model == name]
-        if times:
-            own = name.startswith("bbfit") or rows[0].kind == "levels"
+        of_model = [row for row in rows if row.model == name]
+        if of_model:
+            own = _is_own(of_model[0])
             line = {"color": f"C{number % 10}", "linestyle": "-" if number < 10 else "--", "marker": "*" if own else "o"}
-            axis.plot(*zip(*times, strict=True), label=name, markersize=8 if own else 4, **line)
+            axis.plot([row.count for row in of_model], [row.ms for row in of_model], label=name, markersize=8 if own else 4, **line)
     axis.set_xscale("log")
     axis.set_yscale("log")
     axis.set_title(f"trees of {pixels} pixels", fontsize=10)

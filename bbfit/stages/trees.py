@@ -68,9 +68,9 @@ def pictures_stage(folder: Path, model: Path, views: ViewDataset, config: ViewsC
 
     ``config`` has the options with which the views were rendered.
     """
-    digest, splits = digest_file(model), (views.train, views.test)
-    folders = [f"{model.stem}_{digest[:8]}/{name}" for name in ("train", "test")]  # so that another model has other folders
-    paths = [tuple(folder / out / f"{index:04}.png" for index in range(len(split))) for out, split in zip(folders, splits, strict=True)]
+    splits = (views.train, views.test)
+    folders = [pictures_folder(model, name) for name in ("train", "test")]
+    paths = [pictures_in(folder / out, split) for out, split in zip(folders, splits, strict=True)]
 
     def work(on_progress: OnProgress) -> None:
         done, total = 0, sum(map(len, splits))
@@ -83,9 +83,19 @@ def pictures_stage(folder: Path, model: Path, views: ViewDataset, config: ViewsC
             done += len(split)
 
     outputs = tuple(f"{out}/{files}" for out in folders for files in ("*.png", PICTURES_FILE))
-    made = Stage(stage, (digest, views.fingerprint, config), outputs, work, algorithm="views", claims=False)
+    made = Stage(stage, (digest_file(model), views.fingerprint, config), outputs, work, algorithm="views", claims=False)
     train, test = (ViewSet(own, split.cameras, _picture) for own, split in zip(paths, splits, strict=True))
     return made, train, test
+
+
+def pictures_folder(model: Path, split: str) -> str:
+    """The folder of a model's pictures with the cameras of a split, ``train`` or ``test``. Another model has another folder."""
+    return f"{model.stem}_{digest_file(model)[:8]}/{split}"
+
+
+def pictures_in(folder: Path, views: ViewSet) -> tuple[Path, ...]:
+    """The pictures of all views in a folder of :func:`~bbfit.blender.pictures.render_pictures`."""
+    return tuple(folder / f"{index:04}.png" for index in range(len(views)))
 
 
 def _picture(path: Path) -> Tensor:

@@ -23,6 +23,7 @@ from bbfit.exporting.lod import glb_counts
 from bbfit.exporting.model import shipped_model
 from bbfit.files import read_json
 from bbfit.fitting.config import FitConfig
+from bbfit.frames.models import drawn_models
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.glb import split_glb
 from bbfit.lod import LodLevel, LodResult, build_lod
@@ -189,6 +190,10 @@ def test_thinned_trees_are_levels_between_the_tree_and_the_billboards(built: Lod
         assert (level.vertices, level.triangles) == glb_counts((built.folder / "levels" / level.file).read_bytes())
     assert fine.error_meters <= coarse.error_meters and fine.psnr > coarse.psnr  # type: ignore[operator]
     assert (fine.psnr or 0) > max(level.psnr or 0 for level in built.levels[1:])
+    (drawn,), views = drawn_models([built.folder])
+    assert views and drawn.pictures[0] == views.test.paths and drawn.pictures[3:] == ((), ())
+    assert {len(pictures) for pictures in drawn.pictures[:3]} == {len(views.test)} and len(set(drawn.pictures[:3])) == 3
+    assert all(picture.is_file() for pictures in drawn.pictures for picture in pictures)
     distances = [level.distance_meters for level in result.levels]
     assert distances == sorted(distances) and distances[3:] == [level.distance_meters for level in built.levels[1:]]
     before = {path: path.stat().st_mtime_ns for path in built.folder.rglob("*.png")}

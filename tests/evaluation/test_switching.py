@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from billboard_scene import crossing_billboards, write_views
 
-from bbfit.evaluation.switching import DrawingCost, Switch, _fastest, mesh_cost
+from bbfit.evaluation.switching import Candidate, DrawingCost, Switch, _fastest, mesh_cost, switches
+from bbfit.exporting.config import LodConfig
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics
 from bbfit.views.view_set import ViewSet
 
@@ -46,6 +49,19 @@ def test_of_several_outlines_the_fastest_where_the_level_takes_over_is_taken() -
         outlines = [Switch(scale, outline="pieces", cost=many), Switch(scale, outline="rectangle", cost=few)]
         (chosen,) = _fastest([outlines], 1.0, tree)
         assert chosen and (chosen.outline, chosen.scale) == (outline, scale)
+
+
+def test_a_level_waits_for_a_finer_one_only_without_speed(tmp_path: Path) -> None:
+    """The finer candidate is gray; the coarser one is what the views show."""
+    views = write_views(tmp_path, crossing_billboards())
+    shown = ViewSet.joined([views.train, views.test])
+    exact = Candidate(shown.draw, lambda: {None: DrawingCost(10, 100.0)})
+    gray = Candidate(lambda camera: 0.2 * shown.draw(camera), lambda: {None: DrawingCost(100, 100.0)})
+    first, second = switches([gray, exact], views, LodConfig())
+    assert first and second and first.scale == second.scale < second.silhouette_scale
+    tree = DrawingCost(100_000, 100.0)
+    left_out, alone = switches([gray, exact], views, LodConfig(fragments_per_triangle=1.0), tree=tree)
+    assert left_out is None and alone and alone.scale > first.scale
 
 
 @pytest.mark.parametrize("size", [32, 64])

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from bbfit.checks import InputError, MissingFileError
+from bbfit.exporting.config import LodConfig, Profile
+from bbfit.files import write_json
 from bbfit.frames.costs import frame_costs
-from bbfit.reporting.frame_tables import FrameRow, Machine, fastest, frames_markdown
+from bbfit.lod import with_measured_speed
+from bbfit.reporting.frame_tables import FrameCosts, FrameRow, Machine, fastest, frames_json, frames_markdown
 
 MACHINE = Machine("a processor, 2 cores", "a renderer", "a browser", "1280 x 720 pixels", 0.0)
 
@@ -38,6 +44,36 @@ def test_without_fragments_or_with_few_fields_nothing_is_claimed() -> None:
     fields = [field(random, 0.0) for _ in range(6)]
     assert frame_costs(fields) and not frame_costs(fields[:5]) and not frame_costs([])
     assert not frame_costs([row(fragments=None)] * 9)
+
+
+@pytest.mark.parametrize(("profile", "expected"), [("three", 20.0), ("babylon", 5.0), ("unity", 20.0), (None, 20.0)])
+def test_levels_of_detail_take_the_number_of_the_profiles_program(profile: Profile | None, expected: float, tmp_path: Path) -> None:
+    costs = [FrameCosts(name, 0.0, number, 1.0, 0.1, 9) for name, number in (("three.js 1", 20.0), ("Babylon.js 9", 5.0))]
+    write_json(tmp_path / "frames.json", frames_json([], [FrameCosts("another 1", 0.0, 9.0, 0.0, 0.1, 9), *costs], MACHINE))
+    assert with_measured_speed(LodConfig(frames=tmp_path), profile) == LodConfig(fragments_per_triangle=expected)
+    assert with_measured_speed(LodConfig(), profile) == LodConfig()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{", "frames: .*is not valid JSON"),
+        ("{}", "frames: .*'costs' is missing.*start bbfit frames again"),
+        ('{"costs": []}', "no program's time of a triangle"),
+        ('{"costs": [{"program": "three.js", "tree_ns": "x"}]}', "start bbfit frames again"),
+    ],
+)
+def test_a_measurement_that_says_nothing_is_one_line(content: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "frames.json").write_text(content)
+    with pytest.raises(InputError, match=rf"^(?=[^\n]+$).*{said}"):
+        with_measured_speed(LodConfig(frames=tmp_path), "three")
+
+
+def test_a_number_and_a_measurement_are_refused_together(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="frames: fragments_per_triangle is given too"):
+        LodConfig(frames=tmp_path, fragments_per_triangle=4.0)
+    with pytest.raises(MissingFileError, match="frames"):
+        with_measured_speed(LodConfig(frames=tmp_path / "none"), None)
 
 
 def test_a_model_that_no_other_one_beats_has_a_star() -> None:

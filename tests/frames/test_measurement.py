@@ -103,6 +103,29 @@ def test_the_error_is_that_of_the_pictures_in_the_program(tmp_path: Path) -> Non
         assert gray.flip > 5 * same.flip
 
 
+def test_the_error_of_a_lit_level_is_that_of_blenders_pictures_of_it(tmp_path: Path) -> None:
+    """Of the level that is shown: the finer one has the views themselves as pictures, and the coarser one has none."""
+    cloud, names = opaque(), ("finer.glb", "coarser.glb")
+    (tmp_path / "views").mkdir()
+    views = write_views(tmp_path / "views", cloud, width=96, height=96).test
+    for name in names:
+        export(cloud, tmp_path / name, ExportConfig(material="pbr"))
+    distances = (0.0, 3 / 45)  # a tree of 3 meters is 45 pixels high there
+    files = [{"url": f"/{name}?lit", "distance": distance} for name, distance in zip(names, distances, strict=True)]
+    model = DrawnModel("oak", "oak", "levels", tuple(tmp_path / name for name in names), distances, (views.paths, ()))
+    with open_pages(replace(QUICK, programs=("three",))) as pages:
+        page = pages["three"]
+        page.answers.update({name: tmp_path / name for name in names})
+        page.call("load", {"kind": "levels", "files": files, "extent": {"low": [-1, 0, -1], "high": [1, 3, 1]}})
+        near, far = (size_error(model, page, views, pixels, 4) for pixels in (60, 30))
+        assert near is not None and (near.flip, near.psnr) == (0.0, 120.0)
+        assert far is None
+        assert size_error(replace(model, pictures=()), page, views, 60, 4) is None
+        Image.new("RGBA", (96, 96), (128, 128, 128, 255)).save(tmp_path / "gray.png")
+        gray = size_error(replace(model, pictures=((), (tmp_path / "gray.png",) * len(views))), page, views, 30, 4)
+        assert gray is not None and gray.flip > 0.1
+
+
 def test_the_coarser_level_is_drawn_at_the_smaller_size(tmp_path: Path) -> None:
     """Levels of one and of two billboards; the switch lies between the heights."""
     levels = tmp_path / "oak" / "levels"

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from billboard_scene import crossing_billboards
+from billboard_scene import crossing_billboards, write_views
 
 from bbfit.checks import InputError, MissingFileError
 from bbfit.exporting.config import ExportConfig
@@ -43,14 +43,20 @@ def test_of_a_comparison_programs_draw_models_and_impostors(tmp_path: Path) -> N
     for name in ("plain", "octahedral", "slices"):
         model(tmp_path / name / "model.glb")
     (tmp_path / "octahedral" / THREE_PROGRAM).write_text("")
+    (tmp_path / "views").mkdir()
+    held_out = write_views(tmp_path / "views", crossing_billboards(), width=32, height=32).test
     (tmp_path / "plain" / "held_out").mkdir()
+    pictures = tuple(tmp_path / "plain" / "held_out" / f"{name}.png" for name in held_out.names)
+    for picture in pictures:
+        picture.write_bytes(b"")
     (tmp_path / "compare.json").write_text(json.dumps([row.to_json() for row in rows]))
-    models, _ = drawn_models([tmp_path])
+    models, views = drawn_models([tmp_path])
     assert [(each.name, each.title, each.kind) for each in models] == [
         ("plain", "the plain", "mesh"),
         ("octahedral", "the octahedral", "impostor"),
     ]
-    assert models[0].pictures == tmp_path / "plain" / "held_out" and models[1].pictures is None
+    assert models[0].pictures == (pictures,) and models[1].pictures == ()
+    assert views and views.test.names == held_out.names
 
 
 @pytest.mark.parametrize("content", ["", "{}", '{"levels": [{}]}', '{"levels": 3, "config": {}}', "[1"])
