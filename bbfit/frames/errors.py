@@ -30,8 +30,8 @@ class SizeError:
     """Mean height of the tree in the pictures, in pixels."""
     flip: float
     """FLIP, the mean over backgrounds, views and pixels."""
-    psnr: float
-    """PSNR in dB, the mean over backgrounds and views."""
+    psnr: float | None
+    """PSNR in dB, the mean over backgrounds and views; ``None`` if a picture has no error."""
 
 
 def size_error(model: DrawnModel, page: FieldPage, views: ViewSet, tree_pixels: int, count: int) -> SizeError | None:
@@ -63,7 +63,10 @@ def size_error(model: DrawnModel, page: FieldPage, views: ViewSet, tree_pixels: 
                 pair = over_background(target, shrunk(premultiply(torch.from_numpy(picture).double() / 255), *size), name)
             flips.append(metrics.flip(*pair))
             psnrs.append(metrics.psnr(*pair))
-    return SizeError(float(np.mean(heights)), float(np.mean(flips)), float(np.mean(psnrs))) if heights else None
+    if not heights:
+        return None
+    psnr = None if metrics.decibels(0.0) in psnrs else float(np.mean(psnrs))
+    return SizeError(float(np.mean(heights)), float(np.mean(flips)), psnr)
 
 
 def _drawn(page: FieldPage, camera: Camera, color: tuple[float, float, float]) -> Tensor:

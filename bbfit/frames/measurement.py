@@ -180,7 +180,7 @@ class _Fields:
         with reading("frames", self._record.folder / name, "remove it, then start bbfit frames again"):
             error = SizeError(**stored)
             check_record("error", error, SizeError)
-        return {"flip": error.flip, "psnr": error.psnr if error.flip else None, "error_pixels": error.tree_pixels}
+        return {"flip": error.flip, "psnr": error.psnr, "error_pixels": error.tree_pixels}
 
     def _store(self, name: str, measure: Callable[[], tuple[list[dict[str, Any]], bytes]], _: OnProgress = silent) -> None:
         """Store the rows of a program and height, and a picture of the field with the fewest trees."""

@@ -56,7 +56,7 @@ class FrameRow:
     flip: float | None
     """FLIP at this height in three.js, the mean over backgrounds and held-out views; 0 of the tree itself, ``None`` if not known."""
     psnr: float | None
-    """PSNR in dB at this height; ``None`` of the tree itself, or if not known."""
+    """PSNR in dB at this height; ``None`` if a picture shows the tree itself, or if not known."""
     error_pixels: float | None
     """The height of the tree in the pictures of ``flip``, which is at most that in the views."""
 
@@ -217,7 +217,7 @@ def frames_plot(rows: Sequence[FrameRow], path: Path) -> None:
         if scored:
             _errors(panels[0][column], of_height, names, pixels)
         _growth(panels[-1][column], of_height, names, pixels)
-    panels[-1][0].legend(fontsize=8, loc="upper left")
+    figure.legend(*panels[-1][0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=len(names))
     write_figure(figure, path)
 
 
