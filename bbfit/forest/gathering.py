@@ -138,7 +138,8 @@ class _Extent:
             places[:, 0] = first[0] + apart[:, 0]
             apart *= np.radians(6371e3) * np.array([np.cos(np.radians(first[1])), 1])
         distances = np.hypot(*apart.T)
-        if (far := np.argmax(distances)) and distances[far] > _FARTHEST:
+        far = int(np.argmax(distances))
+        if distances[far] > _FARTHEST:
             kind = "feature" if self._path.suffix.lower() in (".geojson", ".json") else "row"
             problem = f"{self._path}, {kind} {batch['row'][far]} is {distances[far] / 1000:,.0f} km away from the first tree"
             fail("placements", f"{problem}, expected at most {_FARTHEST / 1000:g} km", "correct its coordinates, or remove the row")

@@ -68,8 +68,11 @@ class _Level:
 
 
 def library_outputs(names: Sequence[str], config: LibraryConfig) -> tuple[str, ...]:
-    """The files of a library of trees with ``names``, relative to its folder; ``*`` stands for the pictures of the atlas."""
-    count = config.original + len(config.planes)
+    """The most files of a library of trees with ``names``, relative to its folder; ``*`` stands for the pictures of the atlas.
+
+    Levels that nowhere draw faster are left out.
+    """
+    count = config.original + len(config.thinned) + len(config.planes)
     models = [f"{TREES}/{level_file(name, number)}" for name in names for number in range(count)]
     return (*models, f"{TREES}/atlas*", CONTACT_FILE, TIMES_FILE, LIBRARY_FILE)
 
@@ -128,7 +131,8 @@ def library_stage(
 
     known = [(tree.source.name, tree.source.species, tree.seed, tree.facts) for tree in trees]
     inputs = (known, dict(failures), config.page_size, config.levels, export, VERSIONS["export"])
-    return Stage(STAGE, inputs, library_outputs(list(levels), config), work)
+    written = [level.file for own in levels.values() for level in own]
+    return Stage(STAGE, inputs, (*written, f"{TREES}/atlas*", CONTACT_FILE, TIMES_FILE, LIBRARY_FILE), work)
 
 
 def _levels(folder: Path, tree: FinishedTree) -> list[_Level]:

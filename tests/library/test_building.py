@@ -208,6 +208,8 @@ def test_the_trees_themselves_can_be_the_finest_levels(built: Library, tmp_path:
     assert [level.planes for level in tree.levels] == [None, None, 3, 2] and tree.scores[:2] == (None, None)
     assert tree.levels[0].psnr is None and tree.levels[1].psnr and tree.levels[1].triangles <= 800
     assert (folder / tree.levels[0].file).read_bytes() == TREE.read_bytes()
+    outputs = json.loads((folder / "run.json").read_text())["stages"]["library"]["outputs"]
+    assert {level.file for level in tree.levels} <= set(outputs)
     assert found.atlas == ("trees/atlas.png",) and json.loads((folder / "library.json").read_text())["trees"][0]["scores"][0] is None
 
 
