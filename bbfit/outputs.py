@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import platform
+import re
 import shutil
 import sys
 import tempfile
@@ -27,6 +28,7 @@ from bbfit.files import read_json, remove_parts, write_json
 from bbfit.provenance import digest_file
 
 LOCK_FILE, WRITTEN_FILE = ".bbfit.lock", ".bbfit.json"
+_ASIDE = re.compile(r"\.changed\d*$")
 _OTHER = "choose another output folder"
 # Seconds to wait for a lock that other processes hold only for a moment.
 _MOMENT = 30.0
@@ -137,6 +139,18 @@ def _holder(path: Path) -> str:
         return "another process"
 
 
+def results(folder: Path, pattern: str) -> list[Path]:
+    """The files in a folder that match a pattern, without those that were renamed because somebody had changed them."""
+    return [path for path in sorted(folder.glob(pattern)) if path.is_file() and not _ASIDE.search(path.name)]
+
+
+def remove_results(folder: Path, *patterns: str) -> None:
+    """Remove the files of earlier work from a folder, after :meth:`Written.begin` has refused or renamed those of the user."""
+    for pattern in patterns:
+        for path in results(folder, pattern):
+            path.unlink()
+
+
 class Written:
     """The files that bbfit wrote to a folder, by their paths relative to it, and by what: the name of a stage or a command.
 
@@ -209,7 +223,7 @@ class Written:
                 self._begun.pop(by, None)
 
     def _existing(self, names: Sequence[str]) -> list[Path]:
-        paths = [path for name in names for path in (sorted(self._folder.glob(name)) if "*" in name else [self._folder / name])]
+        paths = [path for name in names for path in (results(self._folder, name) if "*" in name else [self._folder / name])]
         return [path for path in paths if path.is_file()]
 
     def _relative(self, path: Path) -> str:

@@ -17,7 +17,7 @@ from bbfit.forest.georeference import Origin
 from bbfit.forest.instances import InstancedGltf, Instances
 from bbfit.forest.placements import Placements
 from bbfit.forest.prototypes import read_prototype
-from bbfit.forest.tiles import TILES, ForestTile, leaves, read_tile, write_tiles
+from bbfit.forest.tiles import FOREST_FILE, TILES, ForestTile, leaves, read_tile, write_tiles
 from bbfit.forest.tileset import JOURNAL, SCHEMA, SHARED, TILESET, write_tileset
 from bbfit.forest.usd_stage import STAGE, TEXTURES, TREES, USD_JOURNAL, USD_TILES, check_usd, write_usd
 from bbfit.forest.web_page import PAGE_FILES, PageConfig, write_page
@@ -28,7 +28,7 @@ from bbfit.outputs import claimed_folder, output_folder
 from bbfit.provenance import digest_files
 from bbfit.stages.stage import OnProgress, Record, Stage, silent
 
-FOREST_FILE, GLB_FILE = "forest.json", "forest.glb"
+GLB_FILE = "forest.glb"
 """The names of the description of a forest and of its GLB."""
 _VERSION = 1
 _HINT = "start bbfit forest again"
@@ -159,10 +159,8 @@ class _Stages:
         relevant = {name: getattr(config, name) for name in _PLACING}
 
         def work(on_progress: OnProgress) -> None:
-            place = output_folder("out", folder / TILES)
             with gathered(source, library, folder, config, (register, scatter), on_progress) as trees:
-                _remove(place, "*.npy")
-                root = write_tiles(trees, place, library, config.tile_trees, on_progress)
+                root = write_tiles(trees, folder, library, config.tile_trees, on_progress)
                 document = {
                     "version": _VERSION,
                     "generator": generator(),
@@ -255,9 +253,3 @@ def _tile(stored: dict[str, Any]) -> ForestTile:
     children = tuple(_tile(child) for child in stored["children"])
     (x, y, z), (right, top, front) = stored["low"], stored["high"]
     return ForestTile(stored["name"], (float(x), float(y), float(z)), (float(right), float(top), float(front)), stored["count"], children)
-
-
-def _remove(folder: Path, pattern: str) -> None:
-    """Remove the files of an earlier forest from a folder of ours. Those of the user were refused or renamed before."""
-    for path in folder.glob(pattern):
-        path.unlink()

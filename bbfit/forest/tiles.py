@@ -17,8 +17,11 @@ from bbfit.forest.gathering import Gathered
 from bbfit.forest.placements import RECORD, Placements, placements_of
 from bbfit.inputs import reading
 from bbfit.library.manifest import Library
+from bbfit.outputs import output_folder, remove_results
 from bbfit.stages.stage import OnProgress
 
+FOREST_FILE = "forest.json"
+"""The description of a forest, in its folder."""
 TILES = "placements"
 """The folder of the tiles' files in the folder of a forest."""
 _HINT = "start bbfit forest again"
@@ -73,8 +76,9 @@ def read_tile(folder: str | Path, name: str) -> Placements:
 def write_tiles(gathered: Gathered, folder: Path, library: Library, most: int, on_progress: OnProgress) -> ForestTile:
     """Sort placements into a quadtree whose leaves have at most ``most`` trees, and write a file for each tile to ``folder``.
 
-    In memory are 16 bytes for each tree, and one tile. The same placements give the same files. Raises InputError if more than ``most``
-    trees are at one place.
+    ``folder`` is that of the forest. The files of an earlier forest go first, its description before them. In memory are 16 bytes for each
+    tree, and one tile. The same placements give the same files. Raises InputError if more than ``most`` trees are at one place; an earlier
+    forest is then as it was.
     """
     records = np.memmap(gathered.file, RECORD, "r", shape=(gathered.count,))
     parts = [records[start : start + _BATCH] for start in range(0, len(records), _BATCH)]
@@ -86,7 +90,13 @@ def write_tiles(gathered: Gathered, folder: Path, library: Library, most: int, o
         keys[start : start + len(part)] = _keys(part["x"] - low[0], -part["z"] - low[1], side)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
-    quadtree = _Quadtree(records, order, keys, folder, library, most, on_progress)
+    places, counts = np.unique(keys, return_counts=True)
+    if (largest := int(counts.max())) > most:
+        row = records[order[np.searchsorted(keys, places[counts.argmax()])]]["row"]
+        fail("placements", f"{largest:,} trees are at one place, such as that of row {row}", f"remove them, or give --tile-trees {largest}")
+    (folder / FOREST_FILE).unlink(missing_ok=True)
+    remove_results(output_folder("out", folder / TILES), "*.npy")
+    quadtree = _Quadtree(records, order, keys, folder / TILES, library, most, on_progress)
     return quadtree.written(0, len(keys), 0, 0, 0)
 
 
@@ -115,10 +125,6 @@ class _Quadtree:
         """The tile with the sorted trees from ``start`` to ``end``, after it and its children were written."""
         children = list[ForestTile]()
         if end - start > self._most:
-            if depth == _DEEPEST:
-                record = self._records[self._order[start]]
-                problem = f"{end - start:,} trees are at one place, such as that of row {record['row']}"
-                fail("placements", problem, f"remove them, or give --tile-trees {end - start}")
             step = 2 * (_DEEPEST - depth - 1)
             quarters = self._keys[start:end] >> np.uint64(step) & np.uint64(3)
             edges = start + np.searchsorted(quarters, np.arange(5, dtype=np.uint64))

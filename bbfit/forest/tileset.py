@@ -34,7 +34,7 @@ from bbfit.forest.tiles import ForestTile, read_tile
 from bbfit.inputs import InputLimits
 from bbfit.library.manifest import Library
 from bbfit.model_files import generator
-from bbfit.outputs import output_folder
+from bbfit.outputs import output_folder, remove_results
 from bbfit.stages.stage import OnProgress
 
 TILESET = "tileset.json"
@@ -59,8 +59,9 @@ def write_tileset(
     folder, root, origin, species = forest
     output_folder("out", out / SHARED)
     with Journal(out / JOURNAL, key) as journal:
-        for path in [] if journal.known else [*out.glob("*.glb"), *(out / SHARED).iterdir()]:
-            path.unlink()  # of an earlier forest
+        if not journal.known:
+            (out / TILESET).unlink(missing_ok=True)  # until all tiles are there, the folder is no tileset
+            remove_results(out, "*.glb", f"{SHARED}/*")
         writer = _Writer(out, folder, origin, _names(species, library), library, config, journal)
         writer.write_shared()
         total, done = _size(root), 0

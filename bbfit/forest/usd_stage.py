@@ -21,7 +21,7 @@ from bbfit.forest.prototypes import Part, Prototype, read_prototype, rotated
 from bbfit.forest.tiles import ForestTile, leaves, read_tile
 from bbfit.inputs import InputLimits, reading
 from bbfit.library.manifest import Library
-from bbfit.outputs import output_folder
+from bbfit.outputs import output_folder, remove_results
 from bbfit.scratch import ScratchFolder
 from bbfit.stages.stage import OnProgress
 
@@ -49,9 +49,9 @@ def write_usd(out: Path, forest: tuple[Path, ForestTile], library: Library, limi
     for part in (TREES, TEXTURES, USD_TILES):
         output_folder("out", out / part)
     with Journal(out / USD_JOURNAL, key) as journal:
-        for part in () if journal.known else (TREES, TEXTURES, USD_TILES):
-            for path in (out / part).iterdir():
-                path.unlink()  # of an earlier forest
+        if not journal.known:
+            (out / STAGE).unlink(missing_ok=True)  # until all parts are there, the folder has no stage
+            remove_results(out, *(f"{part}/*" for part in (TREES, TEXTURES, USD_TILES)))
         textures = set[str]()
         for tree in range(len(library.trees)):
             if f"tree {tree}" not in journal.known or not (out / TREES / f"tree_{tree}.usdc").is_file():

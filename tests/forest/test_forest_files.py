@@ -346,11 +346,15 @@ def test_a_bad_register_leaves_nothing_behind(text: str, message: str, library: 
     assert not (tmp_path / "out").exists() or not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
 
 
-def test_a_bad_register_leaves_an_earlier_forest_as_it_was(library: Path, tmp_path: Path) -> None:
-    build_forest(register(tmp_path), library, tmp_path / "out")
+@pytest.mark.parametrize(
+    ("text", "message"), [("x,y\nnan,1\n", "row 2"), ("x,y\n5,6\n" + "1,2\n" * 101, "101 trees are at one place, such as that of row 3")]
+)
+def test_a_bad_register_leaves_an_earlier_forest_as_it_was(text: str, message: str, library: Path, tmp_path: Path) -> None:
+    config = ForestConfig(tile_trees=100)
+    build_forest(register(tmp_path), library, tmp_path / "out", config)
     before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
-    with pytest.raises(InputError, match="row 2"):
-        build_forest(register(tmp_path, "x,y\nnan,1\n"), library, tmp_path / "out")
+    with pytest.raises(InputError, match=message):
+        build_forest(register(tmp_path, text), library, tmp_path / "out", config)
     after = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
     assert {path: data for path, data in after.items() if path.name != ".bbfit.json"} == {
         path: data for path, data in before.items() if path.name != ".bbfit.json"
@@ -365,6 +369,18 @@ def test_no_file_of_the_user_is_replaced(name: str, library: Path, tmp_path: Pat
     with pytest.raises(InputError, match="is a file that bbfit did not write"):
         build_forest(register(tmp_path), library, tmp_path / "out", CONFIG)
     assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == [place] and place.read_text() == "mine"
+
+
+@pytest.mark.parametrize("pattern", ["usd/trees/*.usdc", "tiles/trees/*.bin", "tiles/*.glb"])
+def test_what_a_user_changed_is_kept_beside_the_new_file(pattern: str, library: Path, tmp_path: Path) -> None:
+    """And is not taken for a file of bbfit the next time."""
+    config, out = ForestConfig(formats=("tiles", "usd")), tmp_path / "out"
+    build_forest(register(tmp_path, "x,y\n1,2\n"), library, out, config)
+    (changed := min(out.glob(pattern))).write_text("mine")
+    for text in ("x,y\n3,4\n", "x,y\n5,6\n"):
+        build_forest(register(tmp_path, text), library, out, config)
+        assert changed.with_name(f"{changed.name}.changed").read_text() == "mine" and changed.read_bytes() != b"mine"
+        assert ".changed" not in (out / "run.json").read_text()
 
 
 def test_projected_coordinates_are_moved_to_the_origin(library: Path, tmp_path: Path) -> None:
