@@ -30,7 +30,7 @@ VERSIONS: Mapping[str, int] = {
     "compare": 6,
     "frames": 2,
     "library": 1,
-    "forest": 1,
+    "forest": 2,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""
 EXECUTION = {"affects_result": False}

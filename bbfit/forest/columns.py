@@ -26,13 +26,46 @@ NAMES: Mapping[str, tuple[str, ...]] = {
     "point": ("geopoint2d", "geopoint", "shape", "thegeom", "geom", "geometry", "geometrie", "wkt", "wktgeom"),
     "z": ("z", "elevation", "groundheight", "gelaendehoehe", "gelandehohe", "altitude"),
     "height": (
-        *("height", "heightm", "treeheight", "treeheightm", "totalheight", "heightft", "treeheightft", "hoehe", "hohe", "hoehem", "hohem"),
+        *(
+            "height",
+            "heightm",
+            "treeheight",
+            "treeheightm",
+            "totalheight",
+            "heightft",
+            "treeheightft",
+            "heightcm",
+            "hoehe",
+            "hohe",
+            "hoehem",
+            "hohem",
+        ),
         *("baumhoehe", "baumhohe", "baumhoehem", "baumhohem", "hauteur", "hauteurm", "hauteurenm", "hauteurtotale", "hoogte", "hoogtem"),
-        *("boomhoogte", "altura", "alturam", "altezza", "altezzam"),
+        *("boomhoogte", "altura", "alturam", "altezza", "altezzam", "heightcm"),
     ),
     "crown": (
-        *("crown", "crowndiameter", "crowndiameterm", "crownwidth", "crownspread", "spread", "kronendurchmesser", "kronedurch"),
-        *("kronendurchmesserm", "kronenbreite", "kronedurchmesser", "diametrecouronne", "envergure", "kroondiameter", "diametrocopa"),
+        *(
+            "crown",
+            "crowndiameter",
+            "crowndiameterm",
+            "crownwidth",
+            "crownspread",
+            "spread",
+            "crownft",
+            "crowndiameterft",
+            "kronendurchmesser",
+            "kronedurch",
+        ),
+        *(
+            "kronendurchmesserm",
+            "kronenbreite",
+            "kronedurchmesser",
+            "diametrecouronne",
+            "envergure",
+            "kroondiameter",
+            "diametrocopa",
+            "crownft",
+        ),
     ),
     "turn": ("turn", "rotation", "angle", "drehung"),
     "scale": ("scale", "factor", "massstab"),
@@ -46,7 +79,8 @@ NAMES: Mapping[str, tuple[str, ...]] = {
     "genus": ("genus", "gattung", "gattunglat", "genre", "geslacht", "genero", "genere"),
 }
 """Names of columns for each value of a tree, without accents, spaces and signs."""
-_UNITS = {"ft": 0.3048, "feet": 0.3048, "cm": 0.01}
+_UNITS = {"ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "cm": 0.01, "m": 1.0}
+_FEET_AND_INCHES = re.compile("\\d\\s*['\"\u2019\u201d\u2032\u2033]")
 _NUMBER = re.compile(r"\d+(?:[.,]\d+)?")
 _POINT = re.compile(r"\s*POINT\s*Z?\s*\(\s*(\S+)\s+(\S+?)(?:\s+(\S+?))?\s*\)\s*", re.IGNORECASE)
 _EMPTY = ("", "na", "n/a", "nan", "null", "none", "-", "?", "unknown", "unbekannt", "inconnu", "onbekend")
@@ -93,8 +127,8 @@ def find_columns(header: Iterable[str], given: Sequence[str] = ()) -> Columns:
     found |= dict(_given(each, names) for each in given)
     units = dict[str, float]()
     for key in {"height", "crown"} & found.keys():
-        last = re.split(r"[^a-z]+", found[key].casefold().rstrip(") ]"))[-1]
-        units |= {key: _UNITS[last]} if last in _UNITS else {}
+        unit = re.search(r"(?:feet|foot|ft|cm)$", plain(found[key]))
+        units |= {key: _UNITS[unit[0]]} if unit else {}
     return Columns(found, units)
 
 
@@ -135,15 +169,22 @@ def number(value: Any, *, comma: bool) -> float:
     return found
 
 
-def length(value: Any, *, comma: bool) -> float:
-    """The length in a cell: a number, or the middle of a class such as ``6-10 m``. Raises ``ValueError`` if there is none or more."""
+def length(value: Any, *, comma: bool, factor: float = 1.0) -> float:
+    """The length in a cell in meters: a number, or the middle of a class such as ``6-10 m``.
+
+    ``factor`` makes meters of a number without a unit; a unit in the cell takes precedence. Raises ``ValueError`` if there is no number,
+    or more than two, or feet and inches.
+    """
     try:
-        return number(value, comma=comma)
+        return factor * number(value, comma=comma)
     except ValueError:
         numbers = [float(each.replace(",", ".")) for each in _NUMBER.findall(value)] if isinstance(value, str) else []
         if not 1 <= len(numbers) <= 2 or value.strip().startswith("-") or not all(map(math.isfinite, numbers)):
             raise
-        return sum(numbers) / len(numbers)
+        if _FEET_AND_INCHES.search(value):
+            raise ValueError("has signs of feet or inches; give meters, or feet as in 12.5 ft") from None
+        unit = re.search(r"(?<![^\W\d_])(feet|foot|ft|cm|m)(?![^\W\d_])", value.casefold())
+        return (_UNITS[unit[1]] if unit else factor) * sum(numbers) / len(numbers)
 
 
 def point(value: Any) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from bbfit.checks import check_file, fail
 from bbfit.files import PART, PREFIX
 from bbfit.forest.config import ForestConfig, RegisterConfig, ScatterConfig
-from bbfit.forest.georeference import Coordinates, Origin, local_from_degrees
+from bbfit.forest.georeference import Coordinates, Origin, kilometers_on_earth, like_degrees, local_from_degrees
 from bbfit.forest.planting import planted
 from bbfit.forest.registers import ROW, Register
 from bbfit.forest.scattering import scatter_area, scattered
@@ -28,6 +29,8 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".geojson", ".json")
 _BATCH = 1 << 16
 # Farthest tree from the first one, in meters.
 _FARTHEST = 200_000.0
+# Fewest trees that are too close together for meters, and the least ground of each in square meters.
+_FEWEST, _LEAST_GROUND = 10, 0.01
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,8 @@ def gathered(
                 _append(rows, batch, counts)
                 on_progress("read", sum(counts.values()), sum(counts.values()), f"{sum(counts.values()):,} trees")
             degrees, names, skipped = reader.coordinates == "degrees", reader.species, reader.skipped
+            if not degrees and register.coordinates is None:
+                extent.check_meters(sum(counts.values()))
             origin = extent.origin(config, degrees=degrees)
             matches = [nearest_trees(library, name, table) for name in names]
             offset = (origin.east, origin.north)
@@ -146,11 +151,24 @@ class _Extent:
         self._low, self._high = np.minimum(self._low, places.min(0)), np.maximum(self._high, places.max(0))
         return places[:, 0]
 
+    def check_meters(self, count: int) -> None:
+        """Require that ``count`` trees with coordinates in meters are not as close together as degrees would be."""
+        sides = self._high - self._low
+        if count >= _FEWEST and like_degrees(np.stack([self._low, self._high])) and 0 < sides.max() ** 2 < count * _LEAST_GROUND:
+            problem = f"{self._path} has {count:,} trees on {sides[0]:.3g} by {sides[1]:.3g} meters"
+            fail("placements", problem, "give --coordinates degrees, or --coordinates meters if these are meters")
+
     def origin(self, config: ForestConfig, *, degrees: bool) -> Origin:
-        """The origin of the local frame."""
+        """The origin of the local frame. Raises InputError if a given one is far away from trees in degrees."""
         middle = (self._low + self._high) / 2
         if degrees:
-            return Origin(*(config.origin or np.round(middle, 6).tolist()))
+            origin = Origin(*(config.origin or np.round(middle, 6).tolist()))
+            corners = np.array(list(itertools.product(*np.stack([self._low, self._high], -1))))
+            far = kilometers_on_earth(corners, np.array([[origin.longitude, origin.latitude]])).max()
+            if far > _FARTHEST / 1000:
+                problem = f"is {far:,.0f} km away from trees, expected at most {_FARTHEST / 1000:g} km"
+                fail("origin", problem, "give the longitude first, then the latitude")
+            return origin
         far = max(np.abs(self._low).max(), np.abs(self._high).max()) > 1e5
         offset = config.origin_meters or (np.round(middle).tolist() if far else (0.0, 0.0))
         return Origin(*(config.origin or (None, None)), *offset)

@@ -7,6 +7,7 @@ each kilometer than on the ground. Programs that show a globe need the way back:
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,12 +16,33 @@ from numpy.typing import NDArray
 
 Coordinates = Literal["degrees", "meters"]
 """The unit of coordinates: longitude and latitude in degrees, or plain or projected meters."""
+_DEGREES = re.compile(r"CRS8[34]|EPSG:+(?:4326|4258|4269|4267|4283|7844|4674|4171|4490|4230)(?!\d)", re.IGNORECASE)
+# Web Mercator, whose meters are longer than those on the ground, and the frame of the whole Earth.
+_NO_METERS = re.compile(r"EPSG:+(?:3857|3785|900913|102100|102113|4978)(?!\d)", re.IGNORECASE)
 # The ellipsoid of WGS 84: half the axes, in meters.
 _A, _B = 6378137.0, 6356752.314245179
 _SQUARES = np.array([_A * _A, _A * _A, _B * _B])
 # From glTF's axes (east, up, south) to those of tiles (east, north, up).
 TO_TILES = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """Turns glTF's axes (Y up) to those of 3D Tiles (Z up), [3, 3]."""
+
+
+def coordinates_of(system: str | None) -> Coordinates | None:
+    """The unit of the coordinates of a GeoJSON whose member ``crs`` names a system, or of one without it (RFC 7946, section 4).
+
+    ``None`` for a projected system, whose unit is most often the meter, and for one that is not known. Raises ``ValueError`` for a system
+    whose unit is not a meter on the ground.
+    """
+    if system is None or _DEGREES.search(system):
+        return "degrees"
+    if _NO_METERS.search(system):
+        raise ValueError(f"is in {system[:60]}, whose unit is not the meter on the ground")
+    return None
+
+
+def like_degrees(places: NDArray[np.float64]) -> bool:
+    """Whether coordinates, [P, 2], may be longitudes and latitudes."""
+    return bool((np.abs(places) <= [180, 90]).all())
 
 
 @dataclass(frozen=True)
@@ -40,6 +62,12 @@ class Origin:
     def on_earth(self) -> bool:
         """Whether its place on the Earth is known."""
         return self.longitude is not None and self.latitude is not None
+
+
+def kilometers_on_earth(places: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances of longitudes and latitudes, [P, 2], from others, [P, 2] or [1, 2], straight through the Earth, in kilometers, [P]."""
+    distances: NDArray[np.float64] = np.linalg.norm(_on_ellipsoid(places) - _on_ellipsoid(others), axis=-1) / 1000
+    return distances
 
 
 def earth_matrix(origin: Origin) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from bbfit.checks import InputError, fail
 from bbfit.forest import columns
 from bbfit.forest.columns import Columns, find_columns
 from bbfit.forest.config import RegisterConfig
-from bbfit.forest.georeference import Coordinates
+from bbfit.forest.georeference import Coordinates, coordinates_of, like_degrees
 from bbfit.inputs import reading
 
 ROW = np.dtype(
@@ -55,6 +55,8 @@ class Register:
         self._kinds = dict[str, int]()  # the first rows with coordinates like degrees and like projected meters
         self._header: Columns | None = None  # of a table
         self._known = dict[tuple[str, ...], Columns]()
+        self._unseen = {each.partition("=")[2] for each in config.columns}  # given columns that no feature had so far
+        self._system: str | None = None  # what a GeoJSON with coordinates in meters names as its reference system
 
     def batches(self) -> Iterator[NDArray[np.void]]:
         """Its rows as records of the type :data:`ROW`, at most 65,536 at a time.
@@ -64,8 +66,8 @@ class Register:
         with reading("placements", self.path, _HINT):
             found = self._features() if self.path.suffix.lower() in (".geojson", ".json") else self._table()
             batch, total = list[tuple[Any, ...]](), 0
-            for row, values, place in found:
-                record = self._record(row, values, place)
+            for row, values, geometry in found:
+                record = self._record(row, values, geometry)
                 if record is None:
                     self.skipped += 1
                     continue
@@ -77,8 +79,10 @@ class Register:
                 yield np.array(batch, ROW)
         if not total and not batch:
             fail("placements", f"{self.path} has no trees", _HINT)
+        if self._header is None and self._unseen:
+            fail("columns", f"no feature of {self.path} has the property {min(self._unseen)}", "correct its name, or leave it out")
 
-    def _table(self) -> Iterator[tuple[int, Mapping[str, Any], tuple[float, ...] | None]]:
+    def _table(self) -> Iterator[tuple[int, Mapping[str, Any], Any]]:
         """The rows of a table: their numbers as spreadsheet programs count, their cells by the columns' names."""
         with self.path.open(encoding=self._config.encoding, newline="") as file:
             rows = None
@@ -98,6 +102,9 @@ class Register:
                     )
                 self._header = found
                 for number, cells in enumerate(rows, 2):
+                    if any(cells[len(header) :]):
+                        problem = f"{self.path}, row {number} has {len(cells)} cells, and the header has {len(header)}"
+                        fail("placements", problem, f"put cells that contain {delimiter!r} into quotes")
                     if any(cells):
                         yield number, dict(zip(header, cells, strict=False)), None
             except UnicodeDecodeError as error:
@@ -105,8 +112,8 @@ class Register:
             except csv.Error as error:
                 fail("placements", f"{self.path}, row {rows.line_num if rows else 1} cannot be read ({error})", _HINT)
 
-    def _features(self) -> Iterator[tuple[int, Mapping[str, Any], tuple[float, ...] | None]]:
-        """The features of a GeoJSON, one at a time: their numbers from 1, their properties and their coordinates."""
+    def _features(self) -> Iterator[tuple[int, Mapping[str, Any], Any]]:
+        """The features of a GeoJSON, one at a time: their numbers from 1, their properties and their geometries."""
         with self.path.open(encoding="utf-8-sig") as file:
             text = file.read(_PIECE)
             start = _FEATURES.search(text)
@@ -115,7 +122,7 @@ class Register:
             self._note_system(text[: start.start()])
             yield from self._each_feature(file, text[start.end() :])
 
-    def _each_feature(self, file: TextIO, text: str) -> Iterator[tuple[int, Mapping[str, Any], tuple[float, ...] | None]]:
+    def _each_feature(self, file: TextIO, text: str) -> Iterator[tuple[int, Mapping[str, Any], Any]]:
         decoder, at, number = json.JSONDecoder(), 0, 0
         while True:
             while at < len(text) and text[at] in " \t\r\n,":
@@ -140,37 +147,50 @@ class Register:
         except (ValueError, RecursionError) as error:
             fail("placements", f"{self.path} does not end as JSON after feature {number} ({error})", _HINT)
 
-    def _feature(self, number: int, feature: Any) -> tuple[Mapping[str, Any], tuple[float, ...] | None]:
-        geometry = feature.get("geometry") if isinstance(feature, dict) else fail("placements", f"feature {number} is no object", _HINT)
-        place = None
-        if isinstance(geometry, dict):
-            place = geometry.get("coordinates")
-            if geometry.get("type") == "MultiPoint" and isinstance(place, list) and len(place) == 1:
-                place = place[0]
-            elif geometry.get("type") != "Point":
-                self._refuse(number, "geometry", f"is a {str(geometry.get('type'))[:40]}, not a Point")
-            if not isinstance(place, list) or not 2 <= len(place) <= 4:
-                self._refuse(number, "geometry", "has no coordinates")
+    def _feature(self, number: int, feature: Any) -> tuple[Mapping[str, Any], Any]:
+        """The properties and the geometry of a feature."""
+        if not isinstance(feature, dict):
+            fail("placements", f"feature {number} is no object", _HINT)
         properties = feature.get("properties")
-        properties = properties if isinstance(properties, dict) else {}
-        return properties, None if place is None else tuple(place)
+        return properties if isinstance(properties, dict) else {}, feature.get("geometry")
+
+    def _point(self, row: int, geometry: Any) -> list[Any]:
+        """The coordinates of a geometry."""
+        if not isinstance(geometry, dict):
+            self._refuse(row, "geometry", "is missing")
+        place = geometry.get("coordinates")
+        if geometry.get("type") == "MultiPoint" and isinstance(place, list) and len(place) == 1:
+            place = place[0]
+        elif geometry.get("type") != "Point":
+            self._refuse(row, "geometry", f"is a {str(geometry.get('type'))[:40]}, not a Point")
+        if not isinstance(place, list) or not 2 <= len(place) <= 4:
+            self._refuse(row, "geometry", "has no coordinates")
+        return place
 
     def _note_system(self, head: str) -> None:
         """The unit of a GeoJSON's coordinates, by the member ``crs`` of older files."""
-        name = re.search(r'"crs".*?"name"\s*:\s*"([^"]*)"', head, re.DOTALL)
+        if self.coordinates is not None:
+            return
+        system = re.search(r'"crs"\s*:\s*\{[^{}]*"properties"\s*:\s*\{[^{}]*"(name|code)"\s*:\s*"?([^",}]*)', head)
+        name = None if system is None else f"EPSG:{system[2].strip()}" if system[1] == "code" else system[2]
+        try:
+            self.coordinates = coordinates_of(name)
+        except ValueError as error:
+            fail("placements", f"{self.path} {error}", "export it in EPSG:4326, or give --coordinates meters")
         if self.coordinates is None:
-            self.coordinates = "meters" if name and not re.search(r"CRS84|EPSG:+4326|EPSG:+4258", name[1]) else "degrees"
+            self.coordinates, self._system = "meters", name
 
-    def _record(self, row: int, values: Mapping[str, Any], place: tuple[float, ...] | None) -> tuple[Any, ...] | None:
+    def _record(self, row: int, values: Mapping[str, Any], geometry: Any) -> tuple[Any, ...] | None:
         """The record of a row, or ``None`` if it has no usable coordinates and such rows are left out."""
         found = self._columns(values)
         try:
-            x, y, z = self._place(row, values, place, found)
+            x, y, z = self._place(row, values, geometry, found)
             self._check_place(row, x, y, found)
         except InputError:
             if self._config.incomplete == "skip":
                 return None
             raise
+        self._check_system(row, x, y, found)
         height = self._length(row, values, found, "height", _HIGHEST)
         crown = self._length(row, values, found, "crown", _WIDEST)
         scale = self._number(row, values, found, "scale")
@@ -186,18 +206,18 @@ class Register:
         if keys not in self._known:
             if len(self._known) > 1000:
                 self._known.clear()
+            self._unseen -= set(keys)
             self._known[keys] = find_columns(keys, [each for each in self._config.columns if each.partition("=")[2] in values])
         return self._known[keys]
 
-    def _place(self, row: int, values: Mapping[str, Any], place: tuple[float, ...] | None, found: Columns) -> tuple[float, float, float]:
+    def _place(self, row: int, values: Mapping[str, Any], geometry: Any, found: Columns) -> tuple[float, float, float]:
         z = self._number(row, values, found, "z")
         if self._header is None:
-            if place is None:
-                self._refuse(row, "geometry", "is missing")
+            place = self._point(row, geometry)
             try:
                 x, y = (columns.number(value, comma=False) for value in place[:2])
             except ValueError as error:
-                self._refuse(row, "geometry", f"has {list(place)!r:.60}, which {error}")
+                self._refuse(row, "geometry", f"has {place!r:.60}, which {error}")
             return x, y, z
         keys = found.places
         if keys == ("point",):
@@ -210,9 +230,11 @@ class Register:
         return x, y, z
 
     def _check_place(self, row: int, x: float, y: float, found: Columns) -> None:
-        """Require a place on the Earth, in the reference system of the rows before."""
-        names = [found.names[key] for key in found.places] if self._header is not None else ["geometry"]
+        """Require a place on the Earth."""
+        names = self._place_names(found)
         if self.coordinates == "degrees":
+            if x == y == 0:
+                self._refuse(row, " and ".join(names), "is 0, 0, which is no place of a tree")
             for value, most, name in ((x, 180, names[0]), (y, 90, names[-1])):
                 if abs(value) > most:
                     problem = f"is {value:g}, expected degrees from -{most} to {most}"
@@ -220,13 +242,27 @@ class Register:
             return
         if max(abs(x), abs(y)) > 1e8:
             self._refuse(row, names[0], f"is ({x:g}, {y:g}), expected meters up to 100,000,000")
+
+    def _check_system(self, row: int, x: float, y: float, found: Columns) -> None:
+        """Require the reference system of the rows before, unless the unit of the coordinates is given."""
+        if self.coordinates == "degrees" or self._config.coordinates is not None:
+            return
+        names = self._place_names(found)
+        if self._system is not None and like_degrees(np.array([[x, y]])):
+            problem = f"is ({x:g}, {y:g}), which looks like degrees, and the file names the system {self._system[:60]}"
+            self._refuse(row, " and ".join(names), problem, "give --coordinates degrees or --coordinates meters")
         kind = "degrees" if abs(x) <= 180 and abs(y) <= 90 else "meters" if max(abs(x), abs(y)) > 1e4 else None
         if kind is not None:
             self._kinds.setdefault(kind, row)
             if len(self._kinds) == 2:
                 other = next(number for name, number in self._kinds.items() if name != kind)
                 problem = f"is ({x:g}, {y:g}), which looks like {kind}, and row {other} does not"
-                self._refuse(row, " and ".join(names), problem, "give all rows one reference system")
+                hint = "give all rows one reference system; if all are meters, give --coordinates meters"
+                self._refuse(row, " and ".join(names), problem, hint)
+
+    def _place_names(self, found: Columns) -> list[str]:
+        """The names of the columns of coordinates."""
+        return [found.names[key] for key in found.places] if self._header is not None else ["geometry"]
 
     def _cell(self, row: int, values: Mapping[str, Any], found: Columns, key: str, read: Any) -> Any:
         name = found.names[key]
@@ -251,8 +287,8 @@ class Register:
         """An optional length in meters. Registers write 0 where they do not know it."""
         if key not in found.names or columns.is_empty(values.get(found.names[key])):
             return math.nan
-        value = self._cell(row, values, found, key, lambda value: columns.length(value, comma=self._comma))
-        value *= found.units.get(key, 1.0)
+        factor = found.units.get(key, 1.0)
+        value = self._cell(row, values, found, key, lambda value: columns.length(value, comma=self._comma, factor=factor))
         if not 0 <= value <= most:
             self._refuse(row, found.names[key], f"is {value:g} m, expected 0 to {most:g} m")
         return value or math.nan

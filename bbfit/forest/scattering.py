@@ -21,7 +21,7 @@ from bbfit.checks import check_file, fail
 from bbfit.files import read_json
 from bbfit.forest.columns import number
 from bbfit.forest.config import ForestConfig, ScatterConfig
-from bbfit.forest.georeference import Origin, local_from_degrees
+from bbfit.forest.georeference import Origin, coordinates_of, like_degrees, local_from_degrees
 from bbfit.forest.planting import uniform
 from bbfit.forest.registers import ROW
 from bbfit.inputs import reading
@@ -44,8 +44,8 @@ class Area:
     """Its least (east, north) in meters."""
     high: tuple[float, float]
     """Its greatest (east, north) in meters."""
-    rings: tuple[NDArray[np.float64], ...] = ()
-    """The corners of its polygons and their holes, each [C, 2]; none for the whole rectangle."""
+    polygons: tuple[tuple[NDArray[np.float64], ...], ...] = ()
+    """Its polygons, which may overlap: the corners of each and of its holes, each [C, 2]; none for the whole rectangle."""
 
 
 def scatter_area(config: ScatterConfig, forest: ForestConfig) -> Area:
@@ -55,22 +55,21 @@ def scatter_area(config: ScatterConfig, forest: ForestConfig) -> Area:
         origin = Origin(*forest.origin) if forest.origin else Origin()
         return Area(origin, (-width / 2, -depth / 2), (width / 2, depth / 2))
     path = check_file("scatter_area", config.scatter_area)
-    rings, degrees = _polygons(path)
-    corners = np.concatenate(rings)
-    low, high = corners.min(0), corners.max(0)
-    middle = (low + high) / 2
+    polygons, degrees = _polygons(path)
+    corners = _corners(polygons)
+    middle = (corners.min(0) + corners.max(0)) / 2
     if degrees:
         origin = Origin(*(forest.origin or np.round(middle, 6).tolist()))
-        rings = [local_from_degrees(origin, ring) for ring in rings]
+        polygons = [tuple(local_from_degrees(origin, ring) for ring in polygon) for polygon in polygons]
     else:
         offset = forest.origin_meters or (np.round(middle).tolist() if np.abs(corners).max() > 1e5 else (0.0, 0.0))
         origin = Origin(*(forest.origin or (None, None)), *offset)
-        rings = [ring - offset for ring in rings]
-    corners = np.concatenate(rings)
+        polygons = [tuple(ring - offset for ring in polygon) for polygon in polygons]
+    corners = _corners(polygons)
     low, high = corners.min(0), corners.max(0)
     if np.abs(corners).max() > 2e5:
         fail("scatter_area", f"{path} reaches {np.abs(corners).max() / 1000:,.0f} km from the origin, expected at most 200", _HINT)
-    return Area(origin, tuple(low.tolist()), tuple(high.tolist()), tuple(rings))
+    return Area(origin, tuple(low.tolist()), tuple(high.tolist()), tuple(polygons))
 
 
 def scattered(area: Area, config: ScatterConfig, seed: int) -> Iterator[tuple[NDArray[np.void], float]]:
@@ -82,7 +81,8 @@ def scattered(area: Area, config: ScatterConfig, seed: int) -> Iterator[tuple[ND
     shares = np.cumsum([share for _, share in config.shares])
     count = 0
     for places, done in _strips(np.array(area.low), np.array(area.high), config.spacing, seed):
-        places = places[_inside(places, area.rings)] if area.rings else places
+        if area.polygons:
+            places = places[np.logical_or.reduce([_inside(places, polygon) for polygon in area.polygons])]
         rows = np.zeros(len(places), ROW)
         for name in ("height", "crown", "turn", "scale"):
             rows[name] = np.nan
@@ -128,38 +128,48 @@ def _strips(low: NDArray[np.float64], high: NDArray[np.float64], spacing: float,
 
 
 def _inside(places: NDArray[np.float64], rings: Sequence[NDArray[np.float64]]) -> NDArray[np.bool_]:
-    """Whether points lie in an odd number of rings, [P]."""
+    """Whether points lie in an odd number of the rings of a polygon, [P]."""
     inside = np.zeros(len(places), bool)
-    x, y = places.T
     if not len(places):
         return inside
+    (x, y), least, most = places.T, places.min(0), places.max(0)
     for ring in rings:
-        low, high = ring.min(0), ring.max(0)
-        if (low > places.max(0)).any() or (high < places.min(0)).any():
+        if (ring.min(0) > most).any() or (ring.max(0) < least).any():
             continue
         for (x0, y0), (x1, y1) in zip(ring, np.roll(ring, -1, 0), strict=True):
-            if max(y0, y1) <= y.min() or min(y0, y1) > y.max():
+            if max(y0, y1) <= least[1] or min(y0, y1) > most[1]:
                 continue
             crosses = (y0 > y) != (y1 > y)
             inside[crosses] ^= x[crosses] < (x1 - x0) * (y[crosses] - y0) / (y1 - y0) + x0
     return inside
 
 
-def _polygons(path: Path) -> tuple[list[NDArray[np.float64]], bool]:
-    """The rings of all polygons of a GeoJSON, and whether they are in degrees."""
+def _polygons(path: Path) -> tuple[list[tuple[NDArray[np.float64], ...]], bool]:
+    """The polygons of a GeoJSON with their rings, and whether they are in degrees."""
     content = read_json("scatter_area", path)
     with reading("scatter_area", path, _HINT):
-        name = str((content.get("crs") or {}).get("properties", {}).get("name", "CRS84"))
-        rings = [_ring(ring) for geometry in _geometries(content) for ring in _rings(geometry)]
-        if not rings or sum(map(len, rings)) > _MOST_CORNERS:
-            fail("scatter_area", f"{path} has {'no polygons' if not rings else f'more than {_MOST_CORNERS:,} corners'}", _HINT)
-        corners = np.concatenate(rings)
-        degrees = any(known in name for known in ("CRS84", "EPSG::4326", "EPSG:4326", "EPSG::4258"))
-        if degrees and not ((np.abs(corners) <= [180, 90]).all()):
+        system = (content.get("crs") or {}).get("properties", {})
+        name = system.get("name") or (f"EPSG:{system['code']}" if "code" in system else None)
+        polygons = [tuple(map(_ring, polygon)) for geometry in _geometries(content) for polygon in _polygons_of(geometry)]
+        if not polygons or sum(len(ring) for polygon in polygons for ring in polygon) > _MOST_CORNERS:
+            fail("scatter_area", f"{path} has {'no polygons' if not polygons else f'more than {_MOST_CORNERS:,} corners'}", _HINT)
+        corners = _corners(polygons)
+        try:
+            degrees = coordinates_of(name) == "degrees"
+        except ValueError as error:
+            fail("scatter_area", f"{path} {error}", "export it in EPSG:4326")
+        if degrees and not like_degrees(corners):
             fail("scatter_area", f"{path} has corners beyond 180 and 90 degrees", "name the reference system of meters in its member crs")
+        if not degrees and like_degrees(corners):
+            fail("scatter_area", f"{path} names the system {str(name)[:60]}, and its corners look like degrees", "export it in EPSG:4326")
         if np.abs(corners).max() > 1e8:
             fail("scatter_area", f"{path} has corners beyond 100,000,000 meters", _HINT)
-    return rings, degrees
+    return polygons, degrees
+
+
+def _corners(polygons: Sequence[Sequence[NDArray[np.float64]]]) -> NDArray[np.float64]:
+    """The corners of all rings, [C, 2]."""
+    return np.concatenate([ring for polygon in polygons for ring in polygon])
 
 
 def _geometries(content: Any) -> Iterator[Any]:
@@ -170,9 +180,8 @@ def _geometries(content: Any) -> Iterator[Any]:
         yield content["geometry"] if content["type"] == "Feature" else content
 
 
-def _rings(geometry: Any) -> Iterator[Any]:
-    for polygon in {"Polygon": lambda: [geometry["coordinates"]], "MultiPolygon": lambda: geometry["coordinates"]}[geometry["type"]]():
-        yield from polygon
+def _polygons_of(geometry: Any) -> Iterator[Any]:
+    yield from {"Polygon": lambda: [geometry["coordinates"]], "MultiPolygon": lambda: geometry["coordinates"]}[geometry["type"]]()
 
 
 def _ring(corners: Any) -> NDArray[np.float64]:

@@ -29,6 +29,8 @@ STAGE, TREES, TEXTURES, USD_TILES, USD_JOURNAL = "forest.usda", "trees", "textur
 _HINT = "build the library again"
 _NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+# The wrap modes of glTF's samplers in USD.
+_WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 
 
 def check_usd() -> None:
@@ -191,8 +193,9 @@ def _write_material(stage: Any, out: Path, prototype: Prototype, number: int, te
         texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float2))
         texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
         texture.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(*map(float, color), alpha))
+        sampler = _sampler(prototype, pbr["baseColorTexture"]["index"])
         for side in ("wrapS", "wrapT"):
-            texture.CreateInput(side, Sdf.ValueTypeNames.Token).Set("clamp")
+            texture.CreateInput(side, Sdf.ValueTypeNames.Token).Set(_WRAPS[sampler.get(side, 10497)])
         shown.ConnectToSource(texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
         if mode != "OPAQUE":
             opacity.ConnectToSource(texture.CreateOutput("a", Sdf.ValueTypeNames.Float))
@@ -223,6 +226,12 @@ def _texture(out: Path, prototype: Prototype, index: int, textures: set[str]) ->
         textures.add(name)
         write_bytes(out / TEXTURES / name, data)
     return f"../{TEXTURES}/{name}"
+
+
+def _sampler(prototype: Prototype, index: int) -> dict[str, Any]:
+    """The sampler of a texture; its defaults are those of glTF."""
+    number = prototype.document["textures"][index].get("sampler")
+    return {} if number is None else prototype.document["samplers"][number]
 
 
 def _materials(prototype: Prototype) -> list[dict[str, Any]]:

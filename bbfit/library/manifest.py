@@ -126,7 +126,7 @@ def read_library(folder: str | Path, limits: InputLimits | None = None) -> Libra
     """The library in a folder.
 
     Raises MissingFileError or InputError if the folder has no usable ``library.json``, or if a file that it names is missing, empty or lies
-    outside the folder.
+    outside the folder, or a picture of the atlas has another size.
     """
     folder, limits = check_folder("library", folder), limits or InputLimits()
     path = folder / LIBRARY_FILE
@@ -146,6 +146,9 @@ def read_library(folder: str | Path, limits: InputLimits | None = None) -> Libra
         place = limits.referenced("library", path, file, folder)
         if not place.is_file() or not place.stat().st_size:
             fail("library", f"{place}, which {path} lists, is missing or empty", _HINT)
+    for page in pages:
+        if sum((folder / file).stat().st_size for file in page.files) != page.bytes:
+            fail("library", f"{folder / page.files[0]} does not have the size that {path} lists", _HINT)
     return library
 
 

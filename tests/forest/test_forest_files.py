@@ -20,9 +20,11 @@ from bbfit.cli import main
 from bbfit.forest import tileset, usd_stage
 from bbfit.forest.building import Forest, build_forest, read_forest
 from bbfit.forest.config import ForestConfig, RegisterConfig, ScatterConfig
+from bbfit.forest.gathering import _Extent
 from bbfit.forest.placements import Placements, matrices, quaternions
+from bbfit.forest.registers import ROW
 from bbfit.forest.tiles import ForestTile, leaves
-from bbfit.glb import gltf_parts
+from bbfit.glb import gltf_parts, joined_glb, split_glb
 from bbfit.library.manifest import read_library
 
 SCATTER = ScatterConfig(scatter=(220, 160), spacing=7, mix=("oak=2", "birch=1"))
@@ -245,6 +247,29 @@ def test_usd_trees_have_their_levels_and_sizes(forest: Forest) -> None:
         assert len(mesh.GetFaceVertexCountsAttr().Get()) == 2 * planes
 
 
+@pytest.mark.parametrize(
+    ("sampler", "wraps"),
+    [(b'{"wrapS":33071,"wrapT":33648}', ("clamp", "mirror")), (b"{}", ("repeat", "repeat"))],
+)
+def test_usd_textures_wrap_as_those_of_gltf(sampler: bytes, wraps: tuple[str, str], tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd")
+
+    def change(folder: Path) -> None:
+        for path in (folder / "trees").glob("*.glb"):
+            content, views = split_glb(path.read_bytes())
+            content["samplers"] = [json.loads(sampler)]
+            content["textures"][0]["sampler"] = 0
+            path.write_bytes(joined_glb(content, views))
+
+    library = damaged(tmp_path / "library", change)
+    build_forest(register(tmp_path), library, tmp_path / "out", ForestConfig(formats=("usd",)))
+    stage = usd.Stage.Open(str(tmp_path / "out" / "usd" / "trees" / "tree_0.usdc"))
+    textures = [prim for prim in stage.Traverse() if prim.GetAttribute("info:id").Get() == "UsdUVTexture"]
+    assert textures
+    for prim in textures:
+        assert tuple(prim.GetAttribute(f"inputs:{side}").Get() for side in ("wrapS", "wrapT")) == wraps
+
+
 def test_an_interrupted_build_continues(library: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forest: Forest) -> None:
     """Of tiles and of USD; what was written is not written again, and the result is that of one go."""
     written: list[str] = []
@@ -337,6 +362,7 @@ def test_a_library_with_a_damaged_tree_is_refused_before_anything_is_written(dam
     [
         ("x,y\n1,2\nx,2\n", "row 3, column x"),
         ("lon,lat\n13,52\n13,-52\n", "row 3 is .* km away from the first tree"),
+        ("x,y\n" + "".join(f"13.{row},52.5\n" for row in range(10, 40)), "30 trees on 0.29 by 0 meters; give --coordinates degrees"),
         ("x,y\n" + "1,2\n" * 101, "101 trees are at one place, such as that of row 2; .*--tile-trees 101"),
     ],
 )
@@ -390,6 +416,23 @@ def test_projected_coordinates_are_moved_to_the_origin(library: Path, tmp_path: 
     assert every(forest).positions.tolist() == [[-50, 0, 20], [50, 0, -20]]
     given = ForestConfig(formats=("tiles",), origin_meters=(391000.0, 5820000.0))
     assert every(build_forest(path, library, tmp_path / "out", given)).positions.tolist() == [[0, 0, 0], [100, 0, -40]]
+
+
+def test_an_origin_far_from_the_trees_is_refused(library: Path, tmp_path: Path) -> None:
+    path = register(tmp_path, "lon,lat\n13.38,52.51\n")
+    with pytest.raises(InputError, match=r"origin: is 5,\d\d\d km away from trees, .*; give the longitude first"):
+        build_forest(path, library, tmp_path / "out", ForestConfig(origin=(52.51, 13.38)))
+    assert build_forest(path, library, tmp_path / "out", ForestConfig(origin=(13.4, 52.5))).origin.longitude == 13.4
+
+
+def test_a_tree_that_is_far_away_is_named_where_it_is_the_first_of_a_batch(tmp_path: Path) -> None:
+    extent = _Extent(tmp_path / "trees.csv")
+    berlin, nowhere = np.zeros(2, ROW), np.zeros(2, ROW)
+    berlin["x"], berlin["y"] = nowhere["x"], nowhere["y"] = 13.4, 52.5
+    nowhere["x"][0], nowhere["y"][0], nowhere["row"] = 1.0, 1.0, [65_538, 65_539]
+    extent.widened(berlin, "degrees")
+    with pytest.raises(InputError, match=r"row 65538 is .* km away from the first tree"):
+        extent.widened(nowhere, "degrees")
 
 
 def test_a_forest_on_both_sides_of_180_degrees_is_one(library: Path, tmp_path: Path) -> None:

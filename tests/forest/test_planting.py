@@ -142,9 +142,27 @@ def test_trees_are_scattered_on_polygons_without_their_holes(tmp_path: Path) -> 
     assert len(rows) * 9 / area == pytest.approx(0.69, abs=0.05)
 
 
+def test_where_polygons_overlap_there_are_trees_too(tmp_path: Path) -> None:
+    square, beside = ([[x, 0], [x + 200, 0], [x + 200, 200], [x, 200], [x, 0]] for x in (0, 100))
+    path = tmp_path / "parks.geojson"
+    crs = {"type": "name", "properties": {"name": "EPSG:25833"}}
+    path.write_text(json.dumps({"type": "MultiPolygon", "coordinates": [[square], [beside], [square]], "crs": crs}))
+    rows, _ = _scattered(ScatterConfig(scatter_area=path, spacing=4.0))
+    counts = [((rows["x"] >= x) & (rows["x"] < x + 100)).sum() * 16 / (100 * 200) for x in (0, 100, 200)]
+    assert counts == pytest.approx([0.69] * 3, abs=0.06)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
+        (
+            {"type": "Polygon", "coordinates": [[[13, 52], [14, 52], [13, 53]]], "crs": {"properties": {"name": "EPSG:2263"}}},
+            "names the system EPSG:2263, and its corners look like degrees",
+        ),
+        (
+            {"type": "Polygon", "coordinates": [[[1e6, 5e6], [1.1e6, 5e6], [1e6, 6e6]]], "crs": {"properties": {"name": "EPSG:3857"}}},
+            "is in EPSG:3857, whose unit is not the meter",
+        ),
         ({"type": "Point", "coordinates": [1, 2]}, "'?Point'? is missing"),
         ({"type": "Polygon", "coordinates": [[[0, 0], [1, 1]]]}, "fewer than three corners"),
         ({"type": "Polygon", "coordinates": [[[0, 0], [400, 0], [0, 1]]]}, "beyond 180 and 90 degrees"),

@@ -115,6 +115,12 @@ TABLES = {
     "no trees": ("x,y\n", "has no trees"),
     "far away meters": ("x,y\n1e9,2\n", r"row 2, column x is \(1e\+09, 2\)"),
     "quotes": ('x,y\n1,"2\n', "row 2 cannot be read"),
+    "decimal commas between commas": (
+        "lon,lat,species\n13,38,52,51,Acer\n",
+        r"row 2 has 5 cells, and the header has 3; put cells that contain ','",
+    ),
+    "no place": ("lon,lat\n13,52\n0,0\n", r"row 3, column lon and lat is 0, 0, which is no place of a tree"),
+    "feet and inches": ("x,y,height\n1,2,6' 10\"\n", "row 2, column height is .* has signs of feet or inches"),
 }
 
 
@@ -138,6 +144,14 @@ DOCUMENTS = {
     "no numbers": (collection(feature("a", 2)), r"feature 1, column geometry has \['a', 2\], which is no number"),
     "out of range": (collection(feature(1, 2), feature(181, 2)), "feature 2, column geometry is 181, expected degrees from -180 to 180"),
     "a number": (collection(3), "feature 1 is no object"),
+    "degrees, said to be meters": (
+        collection(feature(13, 52), crs={"type": "name", "properties": {"name": "EPSG:2263"}}),
+        r"feature 1, column geometry is \(13, 52\), which looks like degrees, and the file names the system EPSG:2263; give --coordinates",
+    ),
+    "web mercator": (
+        collection(feature(1.4e6, 6.8e6), crs={"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}),
+        "trees.geojson is in urn:.*3857, whose unit is not the meter on the ground; export it in EPSG:4326",
+    ),
     "bad height": (collection(feature(1, 2, height=[1])), r"feature 1, column height is \[1\], which is no number"),
     "nan": ('{"features": [{"geometry": {"type": "Point", "coordinates": [NaN, 1]}}]}', "which is no finite number"),
 }
@@ -150,6 +164,59 @@ def test_bad_features_are_named(name: str, tmp_path: Path) -> None:
     path.write_text(text)
     with pytest.raises(InputError, match="^placements: .*" + message):
         read(path)
+
+
+@pytest.mark.parametrize(
+    ("crs", "unit"),
+    [
+        ({"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::4269"}}, "degrees"),
+        ({"type": "EPSG", "properties": {"code": 4326}}, "degrees"),
+        ({"properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}, "type": "name"}, "degrees"),
+        (None, "degrees"),
+    ],
+)
+def test_systems_of_geojson_are_known(crs: Any, unit: str, tmp_path: Path) -> None:
+    """Also beside a name of the collection itself."""
+    path = tmp_path / "trees.geojson"
+    path.write_text(collection(feature(-79.4, 43.6), crs=crs, name="EPSG:25833 trees"))
+    assert read(path)[0].coordinates == unit
+
+
+def test_given_meters_are_not_guessed_about(tmp_path: Path) -> None:
+    path = table(tmp_path, "x,y\n10,20\n12000,300\n")
+    with pytest.raises(InputError, match="if all are meters, give --coordinates meters"):
+        read(path)
+    assert read(path, coordinates="meters")[1]["x"].tolist() == [10, 12000]
+
+
+def test_what_cannot_be_used_is_left_out_and_mixed_systems_are_not(tmp_path: Path) -> None:
+    path = tmp_path / "trees.geojson"
+    line = {"geometry": {"type": "LineString", "coordinates": [[1, 2]]}}
+    path.write_text(collection({"geometry": {"type": "Point", "coordinates": []}}, line, feature(0, 0), feature(13, 52)))
+    register, rows = read(path, incomplete="skip")
+    assert register.skipped == 3 and rows["row"].tolist() == [4]
+    with pytest.raises(InputError, match=r"row 3, .* looks like meters, and row 2 does not"):
+        read(table(tmp_path, "x,y\n0,0\n391000,5820000\n391001,5820000\n"), incomplete="skip")
+
+
+def test_a_given_property_that_no_feature_has_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "trees.geojson"
+    path.write_text(collection(feature(13, 52, H=5), feature(13, 52)))
+    assert read(path, columns=("height=H",))[1]["height"][0] == 5
+    with pytest.raises(InputError, match=r"columns: no feature of .*trees.geojson has the property HH"):
+        read(path, columns=("height=HH",))
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "meters"),
+    [
+        *(("HeightFt", "10", 3.048), ("TreeHeightFt", "10", 3.048), ("Height (ft.)", "10", 3.048), ("height", "35 ft", 10.668)),
+        *(("height", "25-35 feet", 9.144), ("height", "120 cm", 1.2), ("height_ft", "12 m", 12.0), ("height_cm", "120", 1.2)),
+        *(("Höhe (m)", "7.5", 7.5), ("height", "b. 6 tot 9 m.", 7.5), ("height", "10m", 10.0)),
+    ],
+)
+def test_lengths_have_the_unit_of_their_cell_or_column(column: str, cell: str, meters: float, tmp_path: Path) -> None:
+    assert read(table(tmp_path, f"x,y,{column}\n1,2,{cell}\n"))[1]["height"][0] == pytest.approx(meters)
 
 
 def test_other_encodings_are_named(tmp_path: Path) -> None:
