@@ -52,15 +52,18 @@ def size_error(model: DrawnModel, page: FieldPage, views: ViewSet, tree_pixels: 
         size = max(metrics.SSIM_WINDOW, round(share * views.cameras.width)), max(metrics.SSIM_WINDOW, round(share * views.cameras.height))
         heights.append((rows[-1] + 1 - rows[0]) * size[1] / views.cameras.height)
         target = shrunk(target, *size)
+        rendered = None
         for name, color in BACKGROUNDS.items():
-            background = torch.tensor(color, dtype=torch.float64)
-            pair = over_color(target, background).numpy(), _drawn(page, views.cameras[index].resized(*size), color).numpy()
-            level = page.call("level")
-            if model.lit[level]:
-                if not (model.pictures and model.pictures[level]):
-                    return None
-                picture = read_rgba(model.pictures[level][index])
-                pair = over_background(target, shrunk(premultiply(torch.from_numpy(picture).double() / 255), *size), name)
+            if rendered is None:
+                background = torch.tensor(color, dtype=torch.float64)
+                pair = over_color(target, background).numpy(), _drawn(page, views.cameras[index].resized(*size), color).numpy()
+                level = page.call("level")
+                if model.lit[level]:
+                    if not (model.pictures and model.pictures[level]):
+                        return None
+                    rendered = shrunk(premultiply(torch.from_numpy(read_rgba(model.pictures[level][index])).double() / 255), *size)
+            if rendered is not None:
+                pair = over_background(target, rendered, name)
             flips.append(metrics.flip(*pair))
             psnrs.append(metrics.psnr(*pair))
     if not heights:

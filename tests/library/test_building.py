@@ -7,6 +7,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
 from bbfit.files import write_bytes
 from bbfit.glb import split_glb
-from bbfit.library import files
+from bbfit.library import building, files
 from bbfit.library.building import build_library
 from bbfit.library.config import LibraryConfig
 from bbfit.library.manifest import Library, read_library
@@ -198,6 +199,22 @@ def test_a_file_of_the_user_stays(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"tree_LOD0\.glb exists, and is a file that bbfit did not write"):
         build_library([TREE], tmp_path, LEVELS, SMALL)
     assert mine.read_bytes() == b"mine" and not (tmp_path / "work").exists()
+
+
+def test_a_library_has_as_many_files_as_levels(built: Library, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a level is left out, because it nowhere draws faster."""
+    folder, made = copied(built, tmp_path), building._built
+
+    def fewer(*args: Any) -> dict[str, Any]:
+        outcomes = made(*args)
+        facts = outcomes["acer"].facts
+        return outcomes | {"acer": replace(outcomes["acer"], facts=facts | {"levels": facts["levels"][:-1]})}
+
+    monkeypatch.setattr(building, "_built", fewer)
+    found = again(folder)
+    assert [len(tree.levels) for tree in found.trees] == [1, 2] and not (folder / "trees" / "acer_LOD1.glb").exists()
+    before = times(folder)
+    assert again(folder) == found and times(folder) == before
 
 
 def test_the_trees_themselves_can_be_the_finest_levels(built: Library, tmp_path: Path) -> None:
