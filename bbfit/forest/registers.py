@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import json
 import math
@@ -108,7 +109,8 @@ class Register:
                     if any(cells):
                         yield number, dict(zip(header, cells, strict=False)), None
             except UnicodeDecodeError as error:
-                fail("placements", f"{self.path} is no text in {self._config.encoding} ({error.reason})", "try --encoding latin-1")
+                encoding = "utf-16" if error.object[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "latin-1"
+                fail("placements", f"{self.path} is no text in {self._config.encoding} ({error.reason})", f"try --encoding {encoding}")
             except csv.Error as error:
                 fail("placements", f"{self.path}, row {rows.line_num if rows else 1} cannot be read ({error})", _HINT)
 

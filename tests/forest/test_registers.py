@@ -224,6 +224,10 @@ def test_other_encodings_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"is no text in utf-8-sig .*--encoding latin-1"):
         read(path)
     assert read(path, encoding="latin-1")[1]["height"].tolist() == [3]
+    path = table(tmp_path, "x,y,Höhe\n1,2,3\n", "utf-16")
+    with pytest.raises(InputError, match=r"is no text in utf-8-sig .*--encoding utf-16"):
+        read(path)
+    assert read(path, encoding="utf-16")[1]["height"].tolist() == [3]
 
 
 @pytest.mark.parametrize(
