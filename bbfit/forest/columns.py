@@ -80,6 +80,8 @@ NAMES: Mapping[str, tuple[str, ...]] = {
 }
 """Names of columns for each value of a tree, without accents, spaces and signs."""
 _UNITS = {"ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "cm": 0.01, "m": 1.0}
+# As a word of its own, or right behind what is measured: not in "Luft".
+_UNIT_AT_END = re.compile(r"(?:^|[^a-z]|height|crown|diameter|width|spread)(feet|foot|ft|cm)[^a-z]*$")
 _FEET_AND_INCHES = re.compile("\\d\\s*['\"\u2019\u201d\u2032\u2033]")
 _NUMBER = re.compile(r"\d+(?:[.,]\d+)?")
 _POINT = re.compile(r"\s*POINT\s*Z?\s*\(\s*(\S+)\s+(\S+?)(?:\s+(\S+?))?\s*\)\s*", re.IGNORECASE)
@@ -127,8 +129,8 @@ def find_columns(header: Iterable[str], given: Sequence[str] = ()) -> Columns:
     found |= dict(_given(each, names) for each in given)
     units = dict[str, float]()
     for key in {"height", "crown"} & found.keys():
-        unit = re.search(r"(?:feet|foot|ft|cm)$", plain(found[key]))
-        units |= {key: _UNITS[unit[0]]} if unit else {}
+        unit = _UNIT_AT_END.search(found[key].casefold())
+        units |= {key: _UNITS[unit[1]]} if unit else {}
     return Columns(found, units)
 
 
