@@ -26,46 +26,14 @@ NAMES: Mapping[str, tuple[str, ...]] = {
     "point": ("geopoint2d", "geopoint", "shape", "thegeom", "geom", "geometry", "geometrie", "wkt", "wktgeom"),
     "z": ("z", "elevation", "groundheight", "gelaendehoehe", "gelandehohe", "altitude"),
     "height": (
-        *(
-            "height",
-            "heightm",
-            "treeheight",
-            "treeheightm",
-            "totalheight",
-            "heightft",
-            "treeheightft",
-            "heightcm",
-            "hoehe",
-            "hohe",
-            "hoehem",
-            "hohem",
-        ),
+        *("height", "heightm", "treeheight", "treeheightm", "totalheight", "heightft", "treeheightft", "hoehe", "hohe", "hoehem", "hohem"),
         *("baumhoehe", "baumhohe", "baumhoehem", "baumhohem", "hauteur", "hauteurm", "hauteurenm", "hauteurtotale", "hoogte", "hoogtem"),
-        *("boomhoogte", "altura", "alturam", "altezza", "altezzam", "heightcm"),
+        *("boomhoogte", "altura", "alturam", "altezza", "altezzam", "heightcm", "treeheightcm"),
     ),
     "crown": (
-        *(
-            "crown",
-            "crowndiameter",
-            "crowndiameterm",
-            "crownwidth",
-            "crownspread",
-            "spread",
-            "crownft",
-            "crowndiameterft",
-            "kronendurchmesser",
-            "kronedurch",
-        ),
-        *(
-            "kronendurchmesserm",
-            "kronenbreite",
-            "kronedurchmesser",
-            "diametrecouronne",
-            "envergure",
-            "kroondiameter",
-            "diametrocopa",
-            "crownft",
-        ),
+        *("crown", "crowndiameter", "crowndiameterm", "crownwidth", "crownspread", "spread", "kronendurchmesser", "kronedurch"),
+        *("crownft", "crowndiameterft", "crowncm", "crowndiametercm"),
+        *("kronendurchmesserm", "kronenbreite", "kronedurchmesser", "diametrecouronne", "envergure", "kroondiameter", "diametrocopa"),
     ),
     "turn": ("turn", "rotation", "angle", "drehung"),
     "scale": ("scale", "factor", "massstab"),
@@ -80,8 +48,9 @@ NAMES: Mapping[str, tuple[str, ...]] = {
 }
 """Names of columns for each value of a tree, without accents, spaces and signs."""
 _UNITS = {"ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "cm": 0.01, "m": 1.0}
-# As a word of its own, or right behind what is measured: not in "Luft".
-_UNIT_AT_END = re.compile(r"(?:^|[^a-z]|height|crown|diameter|width|spread)(feet|foot|ft|cm)[^a-z]*$")
+# Feet as a word of their own, also in HtFt, or right behind what is measured; not in "Luft". No common word ends in cm.
+_FEET_AT_END = r"(?:^|[^A-Za-z]|[a-z](?=F)|(?i:height|ht|crown|diameter|width|spread))(?P<feet>(?i:feet|foot|ft))"
+_UNIT_AT_END = re.compile(rf"(?:{_FEET_AT_END}|(?P<cm>(?i:cm)))[^A-Za-z]*$")
 _FEET_AND_INCHES = re.compile("\\d\\s*['\"\u2019\u201d\u2032\u2033]")
 _NUMBER = re.compile(r"\d+(?:[.,]\d+)?")
 _POINT = re.compile(r"\s*POINT\s*Z?\s*\(\s*(\S+)\s+(\S+?)(?:\s+(\S+?))?\s*\)\s*", re.IGNORECASE)
@@ -129,8 +98,8 @@ def find_columns(header: Iterable[str], given: Sequence[str] = ()) -> Columns:
     found |= dict(_given(each, names) for each in given)
     units = dict[str, float]()
     for key in {"height", "crown"} & found.keys():
-        unit = _UNIT_AT_END.search(found[key].casefold())
-        units |= {key: _UNITS[unit[1]]} if unit else {}
+        unit = _UNIT_AT_END.search(found[key])
+        units |= {key: _UNITS["feet" if unit["feet"] else "cm"]} if unit else {}
     return Columns(found, units)
 
 

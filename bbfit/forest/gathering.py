@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,7 +29,7 @@ _BATCH = 1 << 16
 # Farthest tree from the first one, in meters.
 _FARTHEST = 200_000.0
 # Fewest trees that are too close together for meters, and the least ground of each in square meters.
-_FEWEST, _LEAST_GROUND = 10, 0.01
+_FEWEST, _LEAST_GROUND = 10, 0.25
 
 
 @dataclass(frozen=True)
@@ -129,6 +128,7 @@ class _Extent:
         self._path = path
         self._first: NDArray[np.float64] | None = None
         self._low, self._high = np.full(2, np.inf), np.full(2, -np.inf)
+        self._bounds = np.array([self._low, self._high])  # without trees at 0, 0, where many registers have those of unknown place
 
     def widened(self, batch: NDArray[np.void], coordinates: Coordinates) -> NDArray[np.float64]:
         """Add a batch. Returns its x; longitudes are those nearest to the first one, so that a forest may lie on both sides of 180 degrees.
@@ -149,24 +149,25 @@ class _Extent:
             problem = f"{self._path}, {kind} {batch['row'][far]} is {distances[far] / 1000:,.0f} km away from the first tree"
             fail("placements", f"{problem}, expected at most {_FARTHEST / 1000:g} km", "correct its coordinates, or remove the row")
         self._low, self._high = np.minimum(self._low, places.min(0)), np.maximum(self._high, places.max(0))
+        if len(known := places[places.any(1)]):
+            self._bounds = np.array([np.minimum(self._bounds[0], known.min(0)), np.maximum(self._bounds[1], known.max(0))])
         return places[:, 0]
 
     def check_meters(self, count: int) -> None:
         """Require that ``count`` trees with coordinates in meters are not as close together as degrees would be."""
-        sides = self._high - self._low
-        if count >= _FEWEST and like_degrees(np.stack([self._low, self._high])) and 0 < sides.max() ** 2 < count * _LEAST_GROUND:
+        sides = self._bounds[1] - self._bounds[0]
+        if count >= _FEWEST and like_degrees(self._bounds) and 0 < sides.max() ** 2 < count * _LEAST_GROUND:
             problem = f"{self._path} has {count:,} trees on {sides[0]:.3g} by {sides[1]:.3g} meters"
             fail("placements", problem, "give --coordinates degrees, or --coordinates meters if these are meters")
 
     def origin(self, config: ForestConfig, *, degrees: bool) -> Origin:
-        """The origin of the local frame. Raises InputError if a given one is far away from trees in degrees."""
+        """The origin of the local frame. Raises InputError if a given one is far away from the middle of trees in degrees."""
         middle = (self._low + self._high) / 2
         if degrees:
             origin = Origin(*(config.origin or np.round(middle, 6).tolist()))
-            corners = np.array(list(itertools.product(*np.stack([self._low, self._high], -1))))
-            far = kilometers_on_earth(corners, np.array([[origin.longitude, origin.latitude]])).max()
+            far = kilometers_on_earth(middle[None], np.array([[origin.longitude, origin.latitude]])).item()
             if far > _FARTHEST / 1000:
-                problem = f"is {far:,.0f} km away from trees, expected at most {_FARTHEST / 1000:g} km"
+                problem = f"is {far:,.0f} km away from the trees, expected at most {_FARTHEST / 1000:g} km"
                 fail("origin", problem, "give the longitude first, then the latitude")
             return origin
         far = max(np.abs(self._low).max(), np.abs(self._high).max()) > 1e5

@@ -16,9 +16,12 @@ from numpy.typing import NDArray
 
 Coordinates = Literal["degrees", "meters"]
 """The unit of coordinates: longitude and latitude in degrees, or plain or projected meters."""
-_DEGREES = re.compile(r"CRS8[34]|EPSG:+(?:4326|4258|4269|4267|4283|7844|4674|4171|4490|4230)(?!\d)", re.IGNORECASE)
+# A code, as in EPSG:4326, urn:ogc:def:crs:EPSG::4326, urn:ogc:def:crs:EPSG:9.9.1:4326 and http://www.opengis.net/def/crs/EPSG/0/4326.
+_CODE = r"(?:EPSG|ESRI)(?:[:/][\d.]*)?[:/]"
+_CODES = re.compile(_CODE, re.IGNORECASE)
+_DEGREES = re.compile(rf"CRS8[34]|{_CODE}(?:4326|4258|4269|4267|4283|7844|4674|4171|4490|4230)(?!\d)", re.IGNORECASE)
 # Web Mercator, whose meters are longer than those on the ground, and the frame of the whole Earth.
-_NO_METERS = re.compile(r"EPSG:+(?:3857|3785|900913|102100|102113|4978)(?!\d)", re.IGNORECASE)
+_NO_METERS = re.compile(rf"{_CODE}(?:3857|3785|900913|102100|102113|4978)(?!\d)", re.IGNORECASE)
 # The ellipsoid of WGS 84: half the axes, in meters.
 _A, _B = 6378137.0, 6356752.314245179
 _SQUARES = np.array([_A * _A, _A * _A, _B * _B])
@@ -38,6 +41,11 @@ def coordinates_of(system: str | None) -> Coordinates | None:
     if _NO_METERS.search(system):
         raise ValueError(f"is in {system[:60]}, whose unit is not the meter on the ground")
     return None
+
+
+def unlike_meters(system: str, places: NDArray[np.float64]) -> bool:
+    """Whether coordinates, [P, 2], look like degrees, although their system has a code and is not known to be one of degrees."""
+    return bool(_CODES.search(system)) and not _DEGREES.search(system) and like_degrees(places)
 
 
 def like_degrees(places: NDArray[np.float64]) -> bool:

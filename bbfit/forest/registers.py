@@ -18,7 +18,7 @@ from bbfit.checks import InputError, fail
 from bbfit.forest import columns
 from bbfit.forest.columns import Columns, find_columns
 from bbfit.forest.config import RegisterConfig
-from bbfit.forest.georeference import Coordinates, coordinates_of, like_degrees
+from bbfit.forest.georeference import Coordinates, coordinates_of, like_degrees, unlike_meters
 from bbfit.inputs import reading
 
 ROW = np.dtype(
@@ -57,7 +57,7 @@ class Register:
         self._header: Columns | None = None  # of a table
         self._known = dict[tuple[str, ...], Columns]()
         self._unseen = {each.partition("=")[2] for each in config.columns}  # given columns that no feature had so far
-        self._system: str | None = None  # what a GeoJSON with coordinates in meters names as its reference system
+        self._system: str | None = None  # what a GeoJSON names as its reference system
 
     def batches(self) -> Iterator[NDArray[np.void]]:
         """Its rows as records of the type :data:`ROW`, at most 65,536 at a time.
@@ -103,7 +103,7 @@ class Register:
                     )
                 self._header = found
                 for number, cells in enumerate(rows, 2):
-                    if any(cells[len(header) :]):
+                    if any(cell.strip() for cell in cells[len(header) :]):
                         problem = f"{self.path}, row {number} has {len(cells)} cells, and the header has {len(header)}"
                         fail("placements", problem, f"put cells that contain {delimiter!r} into quotes")
                     if any(cells):
@@ -171,16 +171,13 @@ class Register:
 
     def _note_system(self, head: str) -> None:
         """The unit of a GeoJSON's coordinates, by the member ``crs`` of older files."""
-        if self.coordinates is not None:
-            return
         system = re.search(r'"crs"\s*:\s*\{[^{}]*"properties"\s*:\s*\{[^{}]*"(name|code)"\s*:\s*"?([^",}]*)', head)
         name = None if system is None else f"EPSG:{system[2].strip()}" if system[1] == "code" else system[2]
         try:
-            self.coordinates = coordinates_of(name)
+            self.coordinates = self.coordinates or coordinates_of(name) or "meters"
         except ValueError as error:
             fail("placements", f"{self.path} {error}", "export it in EPSG:4326, or give --coordinates meters")
-        if self.coordinates is None:
-            self.coordinates, self._system = "meters", name
+        self._system = name
 
     def _record(self, row: int, values: Mapping[str, Any], geometry: Any) -> tuple[Any, ...] | None:
         """The record of a row, or ``None`` if it has no usable coordinates and such rows are left out."""
@@ -244,23 +241,28 @@ class Register:
             return
         if max(abs(x), abs(y)) > 1e8:
             self._refuse(row, names[0], f"is ({x:g}, {y:g}), expected meters up to 100,000,000")
+        if x == y == 0 and ("meters" in self._kinds or self._is_unlike_meters(x, y)):
+            self._refuse(row, " and ".join(names), "is 0, 0, which is no place of a tree")
+        if (kind := _kind(x, y)) is not None:
+            self._kinds.setdefault(kind, row)
 
     def _check_system(self, row: int, x: float, y: float, found: Columns) -> None:
         """Require the reference system of the rows before, unless the unit of the coordinates is given."""
         if self.coordinates == "degrees" or self._config.coordinates is not None:
             return
         names = self._place_names(found)
-        if self._system is not None and like_degrees(np.array([[x, y]])):
-            problem = f"is ({x:g}, {y:g}), which looks like degrees, and the file names the system {self._system[:60]}"
+        if self._is_unlike_meters(x, y):
+            problem = f"is ({x:g}, {y:g}), which looks like degrees, and the file names the system {str(self._system)[:60]}"
             self._refuse(row, " and ".join(names), problem, "give --coordinates degrees or --coordinates meters")
-        kind = "degrees" if abs(x) <= 180 and abs(y) <= 90 else "meters" if max(abs(x), abs(y)) > 1e4 else None
-        if kind is not None:
-            self._kinds.setdefault(kind, row)
-            if len(self._kinds) == 2:
-                other = next(number for name, number in self._kinds.items() if name != kind)
-                problem = f"is ({x:g}, {y:g}), which looks like {kind}, and row {other} does not"
-                hint = "give all rows one reference system; if all are meters, give --coordinates meters"
-                self._refuse(row, " and ".join(names), problem, hint)
+        if len(self._kinds) == 2:
+            kind = _kind(x, y)
+            other = next(number for name, number in self._kinds.items() if name != kind)
+            problem = f"is ({x:g}, {y:g}), which looks like {kind}, and row {other} does not"
+            hint = "give all rows one reference system; if all are meters, give --coordinates meters"
+            self._refuse(row, " and ".join(names), problem, hint)
+
+    def _is_unlike_meters(self, x: float, y: float) -> bool:
+        return self._system is not None and unlike_meters(self._system, np.array([[x, y]]))
 
     def _place_names(self, found: Columns) -> list[str]:
         """The names of the columns of coordinates."""
@@ -315,3 +317,10 @@ class Register:
         kind = "feature" if self.path.suffix.lower() in (".geojson", ".json") else "row"
         hint = hint or "correct it, or remove the row"
         fail("placements", f"{self.path}, {kind} {row}, column {column} {problem}", hint)
+
+
+def _kind(x: float, y: float) -> str | None:
+    """What coordinates look like: degrees, or projected meters; ``None`` if they may be both or neither."""
+    if like_degrees(np.array([[x, y]])):
+        return "degrees"
+    return "meters" if max(abs(x), abs(y)) > 1e4 else None

@@ -90,9 +90,11 @@ def write_tiles(gathered: Gathered, folder: Path, library: Library, most: int, o
         keys[start : start + len(part)] = _keys(part["x"] - low[0], -part["z"] - low[1], side)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
-    places, counts = np.unique(keys, return_counts=True)
-    if (largest := int(counts.max())) > most:
-        row = records[order[np.searchsorted(keys, places[counts.argmax()])]]["row"]
+    crowded = np.unique(keys[most:][keys[most:] == keys[:-most]])
+    if len(crowded):
+        starts = np.searchsorted(keys, crowded)
+        counts = np.searchsorted(keys, crowded, "right") - starts
+        largest, row = int(counts.max()), records[order[starts[counts.argmax()]]]["row"]
         fail("placements", f"{largest:,} trees are at one place, such as that of row {row}", f"remove them, or give --tile-trees {largest}")
     (folder / FOREST_FILE).unlink(missing_ok=True)
     remove_results(output_folder("out", folder / TILES), "*.npy")

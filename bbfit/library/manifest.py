@@ -142,13 +142,14 @@ def read_library(folder: str | Path, limits: InputLimits | None = None) -> Libra
     names = [tree.name for tree in trees]
     if not names or len(set(names)) < len(names):
         fail("library", f"{path} lists {'no tree' if not names else 'two trees with one name'}", _HINT)
-    for file in [*library.atlas, *(level.file for tree in trees for level in tree.levels)]:
+    pictures = [*library.atlas, *(file for page in pages for file in page.files)]
+    for file in [*pictures, *(level.file for tree in trees for level in tree.levels)]:
         place = limits.referenced("library", path, file, folder)
         if not place.is_file() or not place.stat().st_size:
             fail("library", f"{place}, which {path} lists, is missing or empty", _HINT)
     for page in pages:
         if sum((folder / file).stat().st_size for file in page.files) != page.bytes:
-            fail("library", f"{folder / page.files[0]} does not have the size that {path} lists", _HINT)
+            fail("library", f"{' and '.join(page.files) or 'a picture'} of {folder} has not the size that {path.name} lists", _HINT)
     return library
 
 

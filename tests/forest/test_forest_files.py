@@ -363,6 +363,8 @@ def test_a_library_with_a_damaged_tree_is_refused_before_anything_is_written(dam
         ("x,y\n1,2\nx,2\n", "row 3, column x"),
         ("lon,lat\n13,52\n13,-52\n", "row 3 is .* km away from the first tree"),
         ("x,y\n" + "".join(f"13.{row},52.5\n" for row in range(10, 40)), "30 trees on 0.29 by 0 meters; give --coordinates degrees"),
+        ("x,y\n0,0\n" + "".join(f"13.{row},52.5\n" for row in range(10, 40)), "31 trees on 0.29 by 0 meters; give --coordinates degrees"),
+        ("x,y\n" + "".join(f"{row % 7 / 3.5},{row // 7 / 3.5}\n" for row in range(49)), "49 trees on 1.71 by 1.71 meters"),
         ("x,y\n" + "1,2\n" * 101, "101 trees are at one place, such as that of row 2; .*--tile-trees 101"),
     ],
 )
@@ -373,7 +375,7 @@ def test_a_bad_register_leaves_nothing_behind(text: str, message: str, library: 
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [("x,y\nnan,1\n", "row 2"), ("x,y\n5,6\n" + "1,2\n" * 101, "101 trees are at one place, such as that of row 3")]
+    ("text", "message"), [("x,y\nnan,1\n", "row 2"), ("x,y\n50,60\n" + "1,2\n" * 101, "101 trees are at one place, such as that of row 3")]
 )
 def test_a_bad_register_leaves_an_earlier_forest_as_it_was(text: str, message: str, library: Path, tmp_path: Path) -> None:
     config = ForestConfig(tile_trees=100)
@@ -420,9 +422,11 @@ def test_projected_coordinates_are_moved_to_the_origin(library: Path, tmp_path: 
 
 def test_an_origin_far_from_the_trees_is_refused(library: Path, tmp_path: Path) -> None:
     path = register(tmp_path, "lon,lat\n13.38,52.51\n")
-    with pytest.raises(InputError, match=r"origin: is 5,\d\d\d km away from trees, .*; give the longitude first"):
+    with pytest.raises(InputError, match=r"origin: is 5,\d\d\d km away from the trees, .*; give the longitude first"):
         build_forest(path, library, tmp_path / "out", ForestConfig(origin=(52.51, 13.38)))
     assert build_forest(path, library, tmp_path / "out", ForestConfig(origin=(13.4, 52.5))).origin.longitude == 13.4
+    wide = register(tmp_path, "lon,lat\n10,50\n12.7,50\n7.3,50\n10,51.7\n10,48.3\n")
+    assert build_forest(wide, library, tmp_path / "wide").origin.longitude == 10
 
 
 def test_a_tree_that_is_far_away_is_named_where_it_is_the_first_of_a_batch(tmp_path: Path) -> None:

@@ -142,6 +142,14 @@ def test_trees_are_scattered_on_polygons_without_their_holes(tmp_path: Path) -> 
     assert len(rows) * 9 / area == pytest.approx(0.69, abs=0.05)
 
 
+def test_an_area_in_meters_of_ones_own_may_be_small(tmp_path: Path) -> None:
+    path = tmp_path / "plot.geojson"
+    square = [[0, 0], [80, 0], [80, 60], [0, 60]]
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": [square], "crs": {"properties": {"name": "our own plot"}}}))
+    rows, origin = _scattered(ScatterConfig(scatter_area=path, spacing=4.0))
+    assert len(rows) * 16 / 4800 == pytest.approx(0.69, abs=0.1) and not origin.on_earth
+
+
 def test_where_polygons_overlap_there_are_trees_too(tmp_path: Path) -> None:
     square, beside = ([[x, 0], [x + 200, 0], [x + 200, 200], [x, 200], [x, 0]] for x in (0, 100))
     path = tmp_path / "parks.geojson"

@@ -171,6 +171,9 @@ def test_bad_features_are_named(name: str, tmp_path: Path) -> None:
     [
         ({"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::4269"}}, "degrees"),
         ({"type": "EPSG", "properties": {"code": 4326}}, "degrees"),
+        ({"type": "name", "properties": {"name": "http://www.opengis.net/def/crs/EPSG/0/4326"}}, "degrees"),
+        ({"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG:9.9.1:4326"}}, "degrees"),
+        ({"type": "name", "properties": {"name": "our own plot"}}, "meters"),
         ({"properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}, "type": "name"}, "degrees"),
         (None, "degrees"),
     ],
@@ -180,6 +183,35 @@ def test_systems_of_geojson_are_known(crs: Any, unit: str, tmp_path: Path) -> No
     path = tmp_path / "trees.geojson"
     path.write_text(collection(feature(-79.4, 43.6), crs=crs, name="EPSG:25833 trees"))
     assert read(path)[0].coordinates == unit
+
+
+@pytest.mark.parametrize(
+    "name", ["EPSG:3857", "urn:ogc:def:crs:ESRI::102100", "http://www.opengis.net/def/crs/EPSG/0/3857", "urn:ogc:def:crs:EPSG:9.9.1:3857"]
+)
+def test_web_mercator_is_refused_under_all_its_names(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "trees.geojson"
+    path.write_text(collection(feature(1.4e6, 6.8e6), crs={"type": "name", "properties": {"name": name}}))
+    with pytest.raises(InputError, match="whose unit is not the meter on the ground"):
+        read(path)
+    assert read(path, coordinates="meters")[0].coordinates == "meters"
+
+
+@pytest.mark.parametrize("coordinates", [None, "meters"])
+def test_zeros_for_an_unknown_place_can_be_left_out(coordinates: str | None, tmp_path: Path) -> None:
+    """But not a tree at the origin of meters of one's own."""
+    path = table(tmp_path, "x,y\n391000,5820000\n391001,5820001\n0,0\n")
+    register, rows = read(path, incomplete="skip", coordinates=coordinates)
+    assert rows["row"].tolist() == [2, 3] and register.skipped == 1
+    with pytest.raises(InputError, match="row 4, column x and y is 0, 0, which is no place of a tree"):
+        read(path, coordinates=coordinates)
+    assert len(read(table(tmp_path, "x,y\n0,0\n500,200\n"), coordinates=coordinates)[1]) == 2
+    path = tmp_path / "trees.geojson"
+    path.write_text(collection(feature(0, 0), feature(391000, 5820000), crs={"type": "name", "properties": {"name": "EPSG:25833"}}))
+    assert read(path, incomplete="skip", coordinates=coordinates)[1]["row"].tolist() == [2]
+
+
+def test_a_blank_behind_the_last_column_is_no_cell(tmp_path: Path) -> None:
+    assert len(read(table(tmp_path, "x,y\n1,2, \n3,4,\n"))[1]) == 2
 
 
 def test_given_meters_are_not_guessed_about(tmp_path: Path) -> None:
@@ -212,13 +244,19 @@ def test_a_given_property_that_no_feature_has_is_named(tmp_path: Path) -> None:
     [
         *(("HeightFt", "10", 3.048), ("TreeHeightFt", "10", 3.048), ("Height (ft.)", "10", 3.048), ("height", "35 ft", 10.668)),
         *(("height", "25-35 feet", 9.144), ("height", "120 cm", 1.2), ("height_ft", "12 m", 12.0), ("height_cm", "120", 1.2)),
-        *(("Höhe (m)", "7.5", 7.5), ("Höhe, Luft", "7.5", 7.5), ("height", "b. 6 tot 9 m.", 7.5), ("height", "10m", 10.0)),
+        *(("HtFt", "10", 3.048), ("TREEHTFT", "10", 3.048), ("HoeheCm", "120", 1.2), ("HAUTEURCM", "1450", 14.5)),
+        *(
+            ("Höhe (m)", "7.5", 7.5),
+            ("Höhe, Luft", "7.5", 7.5),
+            ("SCHAFT", "7.5", 7.5),
+            ("height", "b. 6 tot 9 m.", 7.5),
+            ("height", "10m", 10.0),
+        ),
     ],
 )
 def test_lengths_have_the_unit_of_their_cell_or_column(column: str, cell: str, meters: float, tmp_path: Path) -> None:
     path = table(tmp_path, f'x,y,"{column}"\n1,2,{cell}\n')
     assert read(path, columns=(f"height={column}",))[1]["height"][0] == pytest.approx(meters)
-    assert column == "Höhe, Luft" or read(path)[1]["height"][0] == pytest.approx(meters)
 
 
 def test_other_encodings_are_named(tmp_path: Path) -> None:
