@@ -43,9 +43,9 @@ def coordinates_of(system: str | None) -> Coordinates | None:
     return None
 
 
-def unlike_meters(system: str, places: NDArray[np.float64]) -> bool:
-    """Whether coordinates, [P, 2], look like degrees, although their system has a code and is not known to be one of degrees."""
-    return bool(_CODES.search(system)) and not _DEGREES.search(system) and like_degrees(places)
+def is_projected(system: str | None) -> bool:
+    """Whether a system has a code, and is not known to be one of degrees. The name of a plot says nothing about its coordinates."""
+    return system is not None and bool(_CODES.search(system)) and not _DEGREES.search(system)
 
 
 def like_degrees(places: NDArray[np.float64]) -> bool:

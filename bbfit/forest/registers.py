@@ -18,7 +18,7 @@ from bbfit.checks import InputError, fail
 from bbfit.forest import columns
 from bbfit.forest.columns import Columns, find_columns
 from bbfit.forest.config import RegisterConfig
-from bbfit.forest.georeference import Coordinates, coordinates_of, like_degrees, unlike_meters
+from bbfit.forest.georeference import Coordinates, coordinates_of, is_projected
 from bbfit.inputs import reading
 
 ROW = np.dtype(
@@ -58,6 +58,7 @@ class Register:
         self._known = dict[tuple[str, ...], Columns]()
         self._unseen = {each.partition("=")[2] for each in config.columns}  # given columns that no feature had so far
         self._system: str | None = None  # what a GeoJSON names as its reference system
+        self._is_projected = False
 
     def batches(self) -> Iterator[NDArray[np.void]]:
         """Its rows as records of the type :data:`ROW`, at most 65,536 at a time.
@@ -177,7 +178,7 @@ class Register:
             self.coordinates = self.coordinates or coordinates_of(name) or "meters"
         except ValueError as error:
             fail("placements", f"{self.path} {error}", "export it in EPSG:4326, or give --coordinates meters")
-        self._system = name
+        self._system, self._is_projected = name, is_projected(name)
 
     def _record(self, row: int, values: Mapping[str, Any], geometry: Any) -> tuple[Any, ...] | None:
         """The record of a row, or ``None`` if it has no usable coordinates and such rows are left out."""
@@ -241,7 +242,7 @@ class Register:
             return
         if max(abs(x), abs(y)) > 1e8:
             self._refuse(row, names[0], f"is ({x:g}, {y:g}), expected meters up to 100,000,000")
-        if x == y == 0 and ("meters" in self._kinds or self._is_unlike_meters(x, y)):
+        if x == y == 0 and ("meters" in self._kinds or self._is_projected):
             self._refuse(row, " and ".join(names), "is 0, 0, which is no place of a tree")
         if (kind := _kind(x, y)) is not None:
             self._kinds.setdefault(kind, row)
@@ -251,7 +252,7 @@ class Register:
         if self.coordinates == "degrees" or self._config.coordinates is not None:
             return
         names = self._place_names(found)
-        if self._is_unlike_meters(x, y):
+        if self._is_projected and _kind(x, y) == "degrees":
             problem = f"is ({x:g}, {y:g}), which looks like degrees, and the file names the system {str(self._system)[:60]}"
             self._refuse(row, " and ".join(names), problem, "give --coordinates degrees or --coordinates meters")
         if len(self._kinds) == 2:
@@ -260,9 +261,6 @@ class Register:
             problem = f"is ({x:g}, {y:g}), which looks like {kind}, and row {other} does not"
             hint = "give all rows one reference system; if all are meters, give --coordinates meters"
             self._refuse(row, " and ".join(names), problem, hint)
-
-    def _is_unlike_meters(self, x: float, y: float) -> bool:
-        return self._system is not None and unlike_meters(self._system, np.array([[x, y]]))
 
     def _place_names(self, found: Columns) -> list[str]:
         """The names of the columns of coordinates."""
@@ -321,6 +319,6 @@ class Register:
 
 def _kind(x: float, y: float) -> str | None:
     """What coordinates look like: degrees, or projected meters; ``None`` if they may be both or neither."""
-    if like_degrees(np.array([[x, y]])):
+    if abs(x) <= 180 and abs(y) <= 90:
         return "degrees"
     return "meters" if max(abs(x), abs(y)) > 1e4 else None

@@ -21,7 +21,7 @@ from bbfit.checks import check_file, fail
 from bbfit.files import read_json
 from bbfit.forest.columns import number
 from bbfit.forest.config import ForestConfig, ScatterConfig
-from bbfit.forest.georeference import Origin, coordinates_of, like_degrees, local_from_degrees, unlike_meters
+from bbfit.forest.georeference import Origin, coordinates_of, is_projected, like_degrees, local_from_degrees
 from bbfit.forest.planting import uniform
 from bbfit.forest.registers import ROW
 from bbfit.inputs import reading
@@ -163,7 +163,7 @@ def _polygons(path: Path) -> tuple[list[tuple[NDArray[np.float64], ...]], bool]:
             fail("scatter_area", f"{path} {error}", "export it in EPSG:4326")
         if degrees and not like_degrees(corners):
             fail("scatter_area", f"{path} has corners beyond 180 and 90 degrees", "name the reference system of meters in its member crs")
-        if name and unlike_meters(name, corners):
+        if is_projected(name) and like_degrees(corners):
             fail("scatter_area", f"{path} names the system {str(name)[:60]}, and its corners look like degrees", "export it in EPSG:4326")
         if np.abs(corners).max() > 1e8:
             fail("scatter_area", f"{path} has corners beyond 100,000,000 meters", _HINT)
