@@ -61,6 +61,16 @@ def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     return bind
 
 
+def described(command: Callable[..., None]) -> Callable[[], Any]:
+    """A function for tyro that has the description of a command but not its options, which take long to make."""
+
+    def unused() -> None:
+        raise AssertionError("the program has the options of the command that is called")
+
+    unused.__doc__ = command.__doc__
+    return unused
+
+
 def _flattened(default: Any, name: str, taken: set[str]) -> Any:
     """A configuration of a type in which the options in ``taken`` are hidden; those of its fields are added to them."""
     kind, hints = type(default), get_type_hints(type(default), include_extras=True)

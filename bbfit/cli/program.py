@@ -10,30 +10,29 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from typing import Any
 
 import tyro
 
 from bbfit.checks import InputError, in_words
 from bbfit.cli import commands, forests, studies, viewing
 from bbfit.cli.console import OutputError, err_console, out_console, printing, take_any_text
-from bbfit.cli.options import deferred, refuse_old
+from bbfit.cli.options import deferred, described, refuse_old
 from bbfit.scratch import remove_abandoned
 
-COMMANDS: dict[str, Callable[..., Any]] = {
-    "run": deferred(commands.run_command),
-    "grow": deferred(commands.grow_command),
-    "views": deferred(commands.views_command),
-    "fit": deferred(commands.fit_command),
-    "evaluate": deferred(commands.evaluate_command),
-    "export": deferred(commands.export_command),
-    "lod": deferred(commands.lod_command),
-    "view": deferred(viewing.view_command),
-    "sweep": deferred(studies.sweep_command),
-    "compare": deferred(studies.compare_command),
-    "frames": deferred(studies.frames_command),
-    "library": deferred(studies.library_command),
-    "forest": deferred(forests.forest_command),
+COMMANDS: dict[str, Callable[..., None]] = {
+    "run": commands.run_command,
+    "grow": commands.grow_command,
+    "views": commands.views_command,
+    "fit": commands.fit_command,
+    "evaluate": commands.evaluate_command,
+    "export": commands.export_command,
+    "lod": commands.lod_command,
+    "view": viewing.view_command,
+    "sweep": studies.sweep_command,
+    "compare": studies.compare_command,
+    "frames": studies.frames_command,
+    "library": studies.library_command,
+    "forest": forests.forest_command,
 }
 """The commands by their names."""
 
@@ -77,7 +76,7 @@ def _parse(args: Sequence[str]) -> Callable[[], None]:
     try:
         with contextlib.redirect_stderr(complaint), printing():
             return tyro.extras.subcommand_cli_from_dict(
-                COMMANDS,
+                {name: deferred(command) if name in args else described(command) for name, command in COMMANDS.items()},
                 prog="bbfit",
                 description="Compress a 3D tree into a handful of textured planes that look like it from every side.",
                 args=args,

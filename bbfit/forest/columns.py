@@ -7,10 +7,12 @@ import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from bbfit.checks import fail
 
+Coordinates = Literal["degrees", "meters"]
+"""The unit of coordinates: longitude and latitude in degrees, or plain or projected meters."""
 # For each value of a tree the names of columns, without accents, spaces and signs, the most telling first.
 NAMES: Mapping[str, tuple[str, ...]] = {
     "longitude": ("longitude", "lon", "lng", "long", "geolon", "laengengrad", "langengrad", "lengtegraad", "longitud", "longitudine"),

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from bbfit.checks import Count, Range, Seed, check_fields, check_file, fail
-from bbfit.forest.columns import check_given
-from bbfit.forest.georeference import Coordinates
+from bbfit.forest.columns import Coordinates, check_given
 
 Format = Literal["glb", "tiles", "usd", "page"]
 """What shows a forest: a GLB, 3D Tiles, a USD stage, or a web page."""

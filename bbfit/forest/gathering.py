@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from bbfit.checks import check_file, fail
 from bbfit.files import PART, PREFIX
+from bbfit.forest.columns import Coordinates
 from bbfit.forest.config import ForestConfig, RegisterConfig, ScatterConfig
-from bbfit.forest.georeference import Coordinates, Origin, kilometers_on_earth, like_degrees, local_from_degrees
+from bbfit.forest.georeference import Origin, kilometers_on_earth, like_degrees, local_from_degrees
 from bbfit.forest.planting import planted
 from bbfit.forest.registers import ROW, Register
 from bbfit.forest.scattering import scatter_area, scattered

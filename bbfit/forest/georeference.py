@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-Coordinates = Literal["degrees", "meters"]
-"""The unit of coordinates: longitude and latitude in degrees, or plain or projected meters."""
+from bbfit.forest.columns import Coordinates
+
 # A code, as in EPSG:4326, urn:ogc:def:crs:EPSG::4326, urn:ogc:def:crs:EPSG:9.9.1:4326 and http://www.opengis.net/def/crs/EPSG/0/4326.
 _CODE = r"(?:EPSG|ESRI)(?:[:/][\d.]*)?[:/]"
 _CODES = re.compile(_CODE, re.IGNORECASE)

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from bbfit.checks import InputError, fail
 from bbfit.forest import columns
-from bbfit.forest.columns import Columns, find_columns
+from bbfit.forest.columns import Columns, Coordinates, find_columns
 from bbfit.forest.config import RegisterConfig
-from bbfit.forest.georeference import Coordinates, coordinates_of, is_projected
+from bbfit.forest.georeference import coordinates_of, is_projected
 from bbfit.inputs import reading
 
 ROW = np.dtype(
