@@ -20,7 +20,7 @@ from bbfit.checks import check_file
 VERSIONS: Mapping[str, int] = {
     "grow": 2,
     "convert": 1,
-    "views": 6,
+    "views": 7,
     "budget": 10,
     "fit": 23,
     "export": 14,

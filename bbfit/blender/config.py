@@ -44,9 +44,11 @@ class ViewsConfig:
     orthographic: bool = False
     """Parallel projection instead of a field of view."""
     samples: Count = 16
-    """Light paths per pixel: more are slower and less noisy."""
+    """Light paths per pixel of held-out views: more are slower and less noisy."""
+    training_samples: Count | None = None
+    """Light paths per pixel of training views, whose noise averages out in a fit. Default: half of --samples; with suns, all of them."""
     denoise: bool = True
-    """Denoise the pictures with Open Image Denoise; this is about half of the time, and makes a few samples look like hundreds."""
+    """Denoise the pictures with Open Image Denoise, which makes a few samples look like many."""
     sun_strength: _Strength = 2.5
     """Strength of the sun in watts per square meter; 0 leaves only the ambient light."""
     sun_azimuth: Annotated[float, Range(-360, 360)] = 30.0
@@ -78,6 +80,13 @@ class ViewsConfig:
             fail("count", f"expected at least one view for each of {len(self.rings)} rings, got {self.count}")
         if self.suns and self.hdri is not None:
             fail("suns", "they need an even sky, and a panorama replaces it", "leave out --hdri, or set --suns 0")
+
+    @property
+    def samples_of_training(self) -> int:
+        """Light paths per pixel of training views, with the default filled in."""
+        if self.training_samples is not None:
+            return self.training_samples
+        return self.samples if self.suns else (self.samples + 1) // 2
 
     @property
     def rings(self) -> tuple[float, ...]:

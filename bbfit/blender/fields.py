@@ -58,7 +58,7 @@ def render_field(
     require_bpy()
     with ScratchFolder() as scratch:
         write_bytes(scratch / "matrices.bin", matrices.astype(np.float32).tobytes())
-        (frame,) = frames(cameras, [picture], [0], [(1e-3 * reach, reach)], config.seed)
+        (frame,) = frames(cameras, [picture], [0], [(1e-3 * reach, reach)], config)
         with BlenderPool(worker_settings(tree, config, cameras.width, 1) | {"denoise": False}) as pool:
             cost = pool.render_field(scratch / "matrices.bin", frame)
     return RenderCost(cost["seconds"], cost["bytes"])

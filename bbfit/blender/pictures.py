@@ -20,6 +20,7 @@ from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputError, check_range, fail
 from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, camera_to_nerf
 from bbfit.geometry.light import direction, to_z_up
+from bbfit.geometry.orbit import hull_vertices
 from bbfit.images import read_rgba
 from bbfit.outputs import claimed_folder
 from bbfit.tree_files.tree_file import TreeFile
@@ -29,7 +30,7 @@ PICTURES_FILE = "pictures.json"
 FILTER_REACH = 2.0
 """How far, in pixels, the filter of Cycles spreads a surface beyond its outline. The Blackman-Harris filter reaches 1.5 pixels."""
 # The options of views that explicit cameras replace.
-_UNUSED = ("count", "size", "elevations", "fov_degrees", "orthographic", "axis", "turned", "suns")
+_UNUSED = ("count", "size", "training_samples", "elevations", "fov_degrees", "orthographic", "axis", "turned", "suns")
 # The largest difference in pixels between a camera's intrinsics and those that Blender can represent.
 _INTRINSICS_TOLERANCE = 1e-6
 
@@ -105,12 +106,12 @@ def render_pictures(
         return paths
     require_bpy()
     with claimed_folder("out", out), BlenderPool(worker_settings(tree, config, size, len(missing))) as pool:
-        points = to_y_up(pool.load()["payload"])
+        points = hull_vertices(to_y_up(pool.load()["payload"]))
         request.save(out / PICTURES_FILE)
         visible = clips or [clip_distances(points, position) for position in cameras.position]
         report, finished = on_progress, count - len(missing)
-        requests = frames(cameras, paths, missing, visible, config.seed)
-        if depth:
+        requests = frames(cameras, paths, missing, visible, config, None if depth else points)
+        if depth:  # which is 0, as at the nearest distance, outside the part that is rendered
             requests = [request | {"depth": str(depth_path(paths[request["frame"]]).resolve())} for request in requests]
         pool.render(requests, config.render_workers, finished, lambda done: report(done, count))
     return paths
@@ -158,7 +159,6 @@ def worker_settings(tree: TreeFile, config: ViewsConfig, size: int, count: int, 
     return {
         **tree_settings(tree),
         "size": size,
-        "samples": config.samples,
         "denoise": config.denoise,
         "sun_direction": to_z_up(direction(config.sun_azimuth, config.sun_elevation).tolist()),
         "sun_strength": config.sun_strength,
@@ -177,9 +177,17 @@ def clip_distances(points: NDArray[np.float64], position: Tensor) -> tuple[float
 
 
 def frames(
-    camera: Camera, paths: Sequence[Path], indices: Sequence[int], clips: Sequence[tuple[float, float]], seed: int
+    camera: Camera,
+    paths: Sequence[Path],
+    indices: Sequence[int],
+    clips: Sequence[tuple[float, float]],
+    config: ViewsConfig,
+    hull: NDArray[np.float64] | None = None,
 ) -> list[dict[str, Any]]:
-    """The worker's requests for the pictures ``indices``. Blender has the camera axes and the Z-up world of the NeRF-synthetic layout."""
+    """The worker's requests for the pictures ``indices``. Blender has the camera axes and the Z-up world of the NeRF-synthetic layout.
+
+    Only the part of a picture is rendered that the vertices of the tree's convex hull, [P, 3], bound; without them all of it.
+    """
     matrices = camera_to_nerf(camera.world_to_camera)
     requests = []
     for index in indices:
@@ -192,10 +200,26 @@ def frames(
                 "fov_degrees": None if camera.orthographic else math.degrees(2 * math.atan(extent / 2)),
                 "extent": extent if camera.orthographic else None,
                 "clip": [float(end) for end in clips[index]],
-                "seed": (seed + index) % 2**31,
+                "border": None if hull is None else _border(camera[index], hull),
+                "seed": (config.seed + index) % 2**31,
+                "samples": config.samples,
             }
         )
     return requests
+
+
+def _border(camera: Camera, hull: NDArray[np.float64]) -> list[float] | None:
+    """Left, bottom, right and top edge of the pixels that show the tree, in [0, 1] from the lower left.
+
+    ``None`` for all pixels: if the tree is not all in front of the camera, or is outside the picture.
+    """
+    pixels = camera.project(torch.from_numpy(hull))
+    if pixels.isnan().any():
+        return None
+    size = torch.tensor([camera.width, camera.height])
+    low, high = (pixels.amin(0) - FILTER_REACH).floor(), (pixels.amax(0) + FILTER_REACH).ceil() + 1  # pixel centers are whole numbers
+    (left, top), (right, bottom) = (torch.minimum(edge.clamp_min(0), size) / size for edge in (low, high))
+    return [float(left), 1 - float(bottom), float(right), 1 - float(top)] if left < right and top < bottom else None
 
 
 def _check(cameras: Camera, clips: Sequence[tuple[float, float]] | None) -> None:

@@ -21,6 +21,7 @@ from bbfit.checks import fail
 from bbfit.files import remove_parts
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.light import Light, direction
+from bbfit.geometry.orbit import hull_vertices
 from bbfit.layout import (
     LIT_TEST_FILE,
     LIT_TRAIN_FILE,
@@ -116,7 +117,7 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
     suns = max((len(each.suns) for each in lit.values()), default=0)
     with BlenderPool(worker_settings(tree, config, config.size, left, suns=suns)) as pool:
         measured = pool.load()
-        points = to_y_up(measured["payload"])
+        points = hull_vertices(to_y_up(measured["payload"]))
         camera, target, distance = _cameras(points, config)
         bounds = (points.min(0).tolist(), points.max(0).tolist())
         request = replace(
@@ -145,8 +146,10 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
         on_done(finished)
         clips = [clip_distances(points, camera.position[0])] * config.count
         neighbors = camera.turned(_TURN, target)
-        own = frames(camera, paths, missing, clips, config.seed)
-        second = frames(neighbors, turned_paths, missing_turned, clips, config.seed)
+        own = frames(camera, paths, missing, clips, config, points)
+        second = frames(neighbors, turned_paths, missing_turned, clips, config, points)
+        training = set(train)
+        own = [frame | {"samples": config.samples_of_training} if frame["frame"] in training else frame for frame in own]
         if lit:
             own = [frame | {"lights": _light(frame, lit, config, alone=False)} for frame in own]
             second = [frame | {"lights": _light(frame, lit, config, alone=True)} for frame in second]

@@ -106,7 +106,7 @@ class Orbit:
         direction = self.directions
         rotation = look_at(target + direction, target)[:, :3, :3].numpy()
         # Only hull vertices can touch the frame; the hull of a million-vertex tree has a few hundred.
-        relative = _hull(np.asarray(points, dtype=np.float64)) - target.numpy()
+        relative = hull_vertices(np.asarray(points, dtype=np.float64)) - target.numpy()
         local = np.einsum("vij,pj->vpi", rotation, relative)
         aspect = height / width
         radius = float(np.linalg.norm(relative, axis=-1).max())
@@ -132,10 +132,11 @@ class Orbit:
         )
 
 
-def _hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The vertices of the points' convex hull (Barber et al. 1996, "The Quickhull Algorithm for Convex Hulls").
+def hull_vertices(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The vertices of the convex hull of points, [P, 3], which bound them in every picture.
 
-    Of a flat or tiny set, which has no three-dimensional hull, all points are kept.
+    Barber et al. 1996, "The Quickhull Algorithm for Convex Hulls". Of a flat or tiny set, which has no three-dimensional hull, all points
+    are kept.
     """
     from scipy.spatial import ConvexHull, QhullError
 

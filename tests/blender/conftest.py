@@ -112,7 +112,7 @@ def thing_glb(things: Path) -> Path:
     return things / "thing.glb"
 
 
-SMALL = {"count": 4, "size": 32, "samples": 4, "denoise": False, "elevations": (0.0,), "turned": 0}
+SMALL = {"count": 4, "size": 32, "samples": 4, "training_samples": 4, "denoise": False, "elevations": (0.0,), "turned": 0}
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ from bbfit.images import read_rgba, srgb_to_linear, sum_of_lights
 from bbfit.views.dataset import ViewDataset
 from tests.blender.conftest import SMALL, box, thing
 
-CONFIG = ViewsConfig(**SMALL | {"count": 8, "samples": 16, "suns": 2, "turned": 1})
+CONFIG = ViewsConfig(**SMALL | {"count": 8, "samples": 16, "training_samples": 16, "suns": 2, "turned": 1})
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,10 @@ def test_a_picture_under_a_sun_is_that_of_a_render_with_that_sun(folder: Path, t
 def test_unit_lights_show_white_as_white_and_passes_show_what_surfaces_are(tmp_path: Path) -> None:
     """A white box under the sky is white. Its front is as bright under a sun as the cosine says. Normals are those of its sides, Z up."""
     trimesh.Scene([box((-1, 0, -1), (1, 2, 1), (255, 255, 255))]).export(str(tmp_path / "white.glb"))
-    config = ViewsConfig(**SMALL | {"count": 4, "samples": 64, "suns": 1, "orthographic": True, "sun_azimuth": 0.0, "sun_elevation": 60.0})
+    config = ViewsConfig(
+        **SMALL
+        | {"count": 4, "samples": 64, "training_samples": 64, "suns": 1, "orthographic": True, "sun_azimuth": 0.0, "sun_elevation": 60.0}
+    )
     views = ViewDataset.load(render_views(tmp_path / "white.glb", tmp_path / "views", config))
     lit = views.lit_train
     assert lit is not None and lit.albedo is not None and lit.normal is not None

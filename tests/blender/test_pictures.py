@@ -48,7 +48,9 @@ def test_projected_vertices_are_where_the_picture_is(thing_glb: Path, tmp_path: 
 
     The picture's bounding box is that of the projected vertices to a pixel, and the picture covers what the projected triangles cover.
     """
-    config = ViewsConfig(**SMALL | {"count": 8, "size": 96, "samples": 16, "elevations": (0.0, 35.0, -20.0, 90.0)} | setting)
+    config = ViewsConfig(
+        **SMALL | {"count": 8, "size": 96, "samples": 16, "training_samples": 16, "elevations": (0.0, 35.0, -20.0, 90.0)} | setting
+    )
     views = ViewDataset.load(render_views(thing_glb, tmp_path / "views", config))
     mesh = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces) for part in thing()])
     assert sorted(views.train.names + views.test.names) == [f"{i:04}" for i in range(8)]
@@ -108,7 +110,7 @@ def test_matt_white_in_even_light_is_white_and_grey_keeps_its_value(tmp_path: Pa
     """Linear 0.5 is 188 in sRGB under view transform Standard; allowed 3/255 for noise and the dielectric's sheen."""
     for name, value, expected in (("white", 255, 255), ("gray", 128, 188)):
         trimesh.Scene([box((-1, 0, -1), (1, 2, 1), (value, value, value))]).export(str(tmp_path / f"{name}.glb"))
-        config = ViewsConfig(**SMALL | {"count": 2, "samples": 16, "sun_strength": 0.0})
+        config = ViewsConfig(**SMALL | {"count": 2, "samples": 16, "training_samples": 16, "sun_strength": 0.0})
         seen = color(pictures(render_views(tmp_path / f"{name}.glb", tmp_path / name, config)))
         np.testing.assert_allclose(seen, expected, atol=3)
 
@@ -118,7 +120,7 @@ def test_alpha_is_straight(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(2)
     ball.visual = box((0, 0, 0), (1, 1, 1), (255, 255, 255)).visual
     ball.export(str(tmp_path / "white.glb"))
-    config = ViewsConfig(**SMALL | {"count": 2, "samples": 64, "sun_strength": 0.0})
+    config = ViewsConfig(**SMALL | {"count": 2, "samples": 64, "training_samples": 64, "sun_strength": 0.0})
     picture = pictures(render_views(tmp_path / "white.glb", tmp_path / "views", config))
     edge = (picture[..., 3] > 60) & (picture[..., 3] < 200)
     assert edge.sum() > 50
@@ -140,7 +142,7 @@ def test_panorama_lights_the_tree(tmp_path: Path) -> None:
     """A panorama of pure blue makes a white box blue."""
     trimesh.Scene([box((-1, 0, -1), (1, 2, 1), (255, 255, 255))]).export(str(tmp_path / "white.glb"))
     cv2.imwrite(str(tmp_path / "sky.hdr"), np.full((8, 16, 3), (1.0, 0.0, 0.0), np.float32))
-    config = ViewsConfig(**SMALL | {"count": 2, "samples": 16, "sun_strength": 0.0, "hdri": tmp_path / "sky.hdr"})
+    config = ViewsConfig(**SMALL | {"count": 2, "samples": 16, "training_samples": 16, "sun_strength": 0.0, "hdri": tmp_path / "sky.hdr"})
     seen = color(pictures(render_views(tmp_path / "white.glb", tmp_path / "views", config)))
     np.testing.assert_allclose(seen, [0, 0, 255], atol=3)
 

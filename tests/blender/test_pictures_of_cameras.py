@@ -11,10 +11,12 @@ import torch
 import trimesh
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.pictures import PICTURES_FILE, depth_path, render_pictures, vertical_axis
+from bbfit.blender.pictures import PICTURES_FILE, depth_path, frames, render_pictures, vertical_axis
+from bbfit.blender.views_folder import render_views
 from bbfit.checks import InputError
 from bbfit.files import read_json, write_json
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinhole_intrinsics
+from bbfit.geometry.orbit import hull_vertices
 from bbfit.images import read_rgba
 from bbfit.views.dataset import ViewDataset
 
@@ -38,16 +40,61 @@ def front(count: int = 1, size: int = 32) -> Camera:
     return Camera(look_at(position, target), intrinsics, size, size, True)
 
 
-def test_pictures_by_the_cameras_of_views_are_the_views(thing_glb: Path, unbroken: Path, tmp_path: Path) -> None:
-    """Bit by bit, light and noise included (the cameras went through a file)."""
-    views = ViewDataset.load(unbroken)
+def cameras_of(folder: Path) -> Camera:
+    """The cameras of four views, in the order of their pictures."""
+    views = ViewDataset.load(folder)
     order = [(*views.train.names, *views.test.names).index(f"{k:04}") for k in range(4)]
     parts = (views.train.cameras, views.test.cameras)
-    cameras = replace(parts[0], **{n: torch.cat([getattr(p, n) for p in parts])[order] for n in ("world_to_camera", "intrinsics")})
-    paths = render_pictures(thing_glb, cameras, tmp_path / "out", CONFIG)
+    return replace(parts[0], **{n: torch.cat([getattr(p, n) for p in parts])[order] for n in ("world_to_camera", "intrinsics")})
+
+
+def test_pictures_by_the_cameras_of_views_are_the_views(thing_glb: Path, unbroken: Path, tmp_path: Path) -> None:
+    """Bit by bit, light and noise included (the cameras went through a file)."""
+    paths = render_pictures(thing_glb, cameras_of(unbroken), tmp_path / "out", CONFIG)
     assert [path.name for path in paths] == [f"{k:04}.png" for k in range(4)]
     for path in paths:
         np.testing.assert_array_equal(read_rgba(path), read_rgba(unbroken / "images" / path.name))
+
+
+@pytest.mark.parametrize(("given", "training"), [({}, 4), ({"training_samples": 2}, 2)], ids=str)
+def test_training_views_have_half_of_the_samples(given: dict[str, int], training: int, thing_glb: Path, tmp_path: Path) -> None:
+    """By default. Each view is, bit by bit, the picture with as many samples, and not the other one."""
+    config = ViewsConfig(**SMALL | {"samples": 8, "training_samples": None} | given)
+    folder = render_views(thing_glb, tmp_path / "views", config)
+    views, cameras = ViewDataset.load(folder), cameras_of(folder)
+    of_samples = {
+        samples: [
+            read_rgba(path) for path in render_pictures(thing_glb, cameras, tmp_path / str(samples), replace(config, samples=samples))
+        ]
+        for samples in (training, 8)
+    }
+    for split, own, other in ((views.train, training, 8), (views.test, 8, training)):
+        for name in split.names:
+            view = read_rgba(folder / "images" / f"{name}.png")
+            np.testing.assert_array_equal(view, of_samples[own][int(name)])
+            assert (view != of_samples[other][int(name)]).any()
+
+
+def test_with_suns_training_views_have_all_samples() -> None:
+    """Each training camera sees a sun of its own once."""
+    assert ViewsConfig(samples=9).samples_of_training == 5 and ViewsConfig(samples=9, suns=1).samples_of_training == 9
+
+
+def test_only_the_part_of_a_picture_with_the_tree_is_rendered(thing_glb: Path, tmp_path: Path) -> None:
+    """With three pixels around it at most. The rest is empty in the whole picture too, which is the same bit by bit."""
+    corners = trimesh.load(str(thing_glb), force="mesh").vertices
+    (path,) = render_pictures(thing_glb, front(), tmp_path / "out", CONFIG)
+    (request,) = frames(front(), [path], [0], [(4.0, 6.0)], CONFIG, hull_vertices(np.asarray(corners)))
+    left, bottom, right, top = np.array(request["border"]) * 32
+    assert request["border"] != [0, 0, 1, 1]
+    rows, columns = np.nonzero(read_rgba(path)[..., 3])
+    assert 0 <= columns.min() - left <= 3 and 1 <= right - columns.max() <= 4
+    assert 0 <= rows.min() - (32 - top) <= 3 and 1 <= 32 - bottom - rows.max() <= 4
+    clips = [(1.0, 9.0)]
+    (whole,) = render_pictures(thing_glb, front(), tmp_path / "whole", CONFIG, clips=clips, depth=True)  # for depth, all is rendered
+    np.testing.assert_array_equal(read_rgba(whole), read_rgba(path))
+    inside = Camera(look_at(torch.zeros(1, 3).double(), torch.tensor([0.0, 0, 1]).double()), pinhole_intrinsics(40, 32, 32)[None], 32, 32)
+    assert frames(inside, [path], [0], clips, CONFIG, np.asarray(corners))[0]["border"] is None
 
 
 def test_clip_distances_show_a_slab(thing_glb: Path, tmp_path: Path) -> None:

@@ -42,7 +42,8 @@ def on_progress(done, total):
     print(done, flush=True)
     if done == int(hold):
         sys.stdin.readline()
-config = ViewsConfig(count=4, size=int(size), samples=int(samples), denoise=False, elevations=(0.0,), turned=0, render_workers=int(workers))
+paths = {"samples": int(samples), "training_samples": int(samples), "denoise": False}
+config = ViewsConfig(count=4, size=int(size), elevations=(0.0,), turned=0, render_workers=int(workers), **paths)
 render_views(tree, out, config, on_progress=on_progress)
 """
 
@@ -84,7 +85,7 @@ def assert_same_pictures(out: Path, expected: Path) -> None:
 
 def test_killed_in_the_middle_and_started_again(thing_glb: Path, tmp_path: Path) -> None:
     """Blender dies with its parent; only what is missing or cut short is rendered again; pixels are those of an unbroken run."""
-    out, config = tmp_path / "views", ViewsConfig(**SMALL | {"samples": 200})
+    out, config = tmp_path / "views", ViewsConfig(**SMALL | {"samples": 200, "training_samples": 200})
     parent = start(thing_glb, out, samples=200, workers=2, hold=2)
     assert parent.stdout
     for _ in range(3):  # 0, 1, 2 views
@@ -136,7 +137,7 @@ def test_stopped_in_the_middle_and_started_again(number: int, code: int, thing_g
     out, temporary = tmp_path / "views", tmp_path / "temporary"
     temporary.mkdir()
     words = ["views", str(thing_glb), "--out", str(out)]
-    words += ["--count", "4", "--size", "32", "--samples", "4", "--no-denoise", "--turned", "0"]
+    words += ["--count", "4", "--size", "32", "--samples", "4", "--training-samples", "4", "--no-denoise", "--turned", "0"]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     environment = os.environ | {"TMPDIR": str(temporary)}
     command = [sys.executable, "-c", _COMMAND, *words, "--render-workers", "2"]
