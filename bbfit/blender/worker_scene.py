@@ -66,7 +66,8 @@ def load(path: str) -> None:
         raise InputRefused("tree", f"{path} cannot be read as {suffix} ({reason})", "get or export the file again") from error
     for mesh in bpy.data.meshes:
         check_finite(path, coordinates(mesh))
-        mesh.validate()  # only now, because it replaces NaN by 0
+        if suffix not in (".glb", ".gltf"):  # whose importer has done it
+            mesh.validate()  # only now, because it replaces NaN by 0
 
 
 def check_files(path: str, files: list[str]) -> None:
@@ -180,7 +181,9 @@ def measure_mesh(evaluated: Any) -> tuple[np.ndarray, int, float]:
     mesh.loops.foreach_get("vertex_index", corners)
     areas = np.empty(len(mesh.loop_triangles), np.float32)
     mesh.loop_triangles.foreach_get("area", areas)
-    result = coordinates(mesh)[np.unique(corners)].astype(np.float64), len(areas), float(areas.sum())
+    used = np.zeros(len(mesh.vertices), np.bool_)
+    used[corners] = True
+    result = coordinates(mesh)[used].astype(np.float64), len(areas), float(areas.sum())
     evaluated.to_mesh_clear()
     return result
 
