@@ -65,13 +65,18 @@ def _initialize() -> None:
 _initialize()
 
 
+def compile_for(kernel: Any, on: Any) -> None:
+    """Compile a kernel's module for a device, or load it from the cache, before several threads launch it and each would compile it."""
+    with cache_of_kernels():
+        kernel.module.load(on, None if on.is_cuda else 1)  # the size of blocks, which is 1 in all launches on a CPU
+
+
 def launch(kernel: Any, count: int, least: int, arguments: Sequence[Any], outputs: Sequence[Any] = (), *, across: int = 1, on: Any) -> None:
     """Launch a kernel over [count, across] on a device: at once on a GPU, in pieces of at least ``least`` of ``count`` on a CPU.
 
     Warp runs a CPU launch in the calling thread; the pieces share all cores. The kernel's first argument is where its piece begins.
     """
-    with cache_of_kernels():
-        kernel.module.load(on)  # or every thread would compile it
+    compile_for(kernel, on)
 
     def piece(begin: int, end: int) -> None:
         wp.launch(kernel, (end - begin, across), [begin, *arguments], outputs, device=on)

@@ -20,7 +20,7 @@ from bbfit.operators.drawing.projection import Projection, project
 from bbfit.operators.drawing.sampling_kernels import BLOCK, COVERAGE, SMOOTH
 from bbfit.operators.image_loss.fused import PixelLoss
 from bbfit.operators.image_loss.kernels import LOSSES
-from bbfit.operators.launching import in_parallel, pieces_of, struct_array, warp_array
+from bbfit.operators.launching import compile_for, in_parallel, pieces_of, struct_array, warp_array
 
 # Most bands of rows that a picture is cut into. Independent of the number of threads, which must not change the order of sums.
 MOST_BANDS = 32
@@ -79,7 +79,7 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None,
         return image.zero_()
     compiled, runs, arguments = _prepared(texels, projection, occupied)
     device, outputs = wp.device_from_torch(texels.device), [warp_array(image, wp.vec4)]
-    compiled.draw.module.load(device)  # or every thread would compile it
+    compile_for(compiled.draw, device)
 
     def launch(begin: int, end: int) -> None:
         wp.launch(compiled.draw, (views, end - begin, runs), [begin, *arguments], outputs, device=device)
@@ -121,7 +121,7 @@ def differentiate(
         arguments += [int(loss.straight), LOSSES[loss.kind], loss.weight, int(loss.own_colors)] if loss else [0, 0, 0.0, 0]
         outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices, wp.vec3d)]
         on = wp.device_from_torch(device)
-        compiled.differentiate.module.load(on)  # or every thread would compile it
+        compile_for(compiled.differentiate, on)
 
         def launch(view: int, number: int, begin: int, end: int) -> None:
             wp.launch(compiled.differentiate, (number, end - begin, runs), [view, begin, *arguments], outputs, device=on)

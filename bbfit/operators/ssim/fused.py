@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from bbfit.operators.launching import differentiable, in_parallel, launch, pieces_of, worker_count
+from bbfit.operators.launching import compile_for, differentiable, in_parallel, launch, pieces_of, worker_count
 from bbfit.operators.ssim.kernels import PAIRS_REACH, REACH, STAGES, kernels
 
 # Least pairs of rows for a thread, which starts PAIRS_REACH pairs early.
@@ -64,7 +64,7 @@ def ssim_and_gradient(a: Tensor, b: Tensor, weight: float, out: Tensor | None = 
                 wp.launch(own.sweep, (1, 1), arguments, outputs, device=device)
             spare.put(scratch)
 
-        own.sweep.module.load(device)  # or every thread would compile it
+        compile_for(own.sweep, device)
         in_parallel(sweep, pieces_of(views * pairs, _LEAST_PAIRS))
     return 1 - sums.sum(dtype=torch.float64) / terms, gradient
 
