@@ -25,7 +25,7 @@ VERSIONS: Mapping[str, int] = {
     "fit": 23,
     "export": 14,
     "evaluate": 16,
-    "report": 8,
+    "report": 9,
     "lod": 8,
     "compare": 6,
     "frames": 2,

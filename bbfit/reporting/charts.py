@@ -199,6 +199,25 @@ def loss_chart(losses: Sequence[float]) -> Chart:
     return Chart(_svg(figure, "loss"), {})
 
 
+def times_chart(seconds: Mapping[str, float]) -> Chart:
+    """The seconds of each stage as a Gantt chart: stages run one after another, and each bar begins where the one before ends."""
+    figure = _figure(0.85 + 0.3 * len(seconds), left=0.72)
+    axes, begun, total = figure.subplots(), 0.0, max(sum(seconds.values()), 1e-9)
+    for place, spent in enumerate(seconds.values()):
+        axes.barh(place, spent, left=begun, height=0.62, color=_ACCENT)
+        outside, at = (-4, begun) if begun + spent > 0.75 * total else (4, begun + spent)
+        said = f"{spent:,.1f}" if spent < 100 else f"{spent:,.0f}"
+        style: dict[str, Any] = {"va": "center", "ha": "left" if outside > 0 else "right", "fontsize": 9, "color": _FAINT}
+        axes.annotate(said, (at, place), (outside, 0), textcoords="offset points", **style)
+        begun += spent
+    axes.set_yticks(range(len(seconds)), list(seconds))
+    axes.invert_yaxis()
+    axes.set_xlim(0, total)
+    axes.set_xlabel("seconds since the start")
+    _plain(axes)
+    return Chart(_svg(figure, "times"), {})
+
+
 def _figure(height: float, panels: int = 1, *, left: float = 0.52) -> Figure:
     """A figure with panels below each other and a margin of ``left`` inches."""
     return plain_figure((_WIDTH, height), 72, panels=(panels, 1), margins=(left, 0.15, 0.52, 0.33), between=0.45)

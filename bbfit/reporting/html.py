@@ -22,7 +22,17 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
 from bbfit.images import shrunk, to_bytes, unpremultiply
 from bbfit.model_files import generator
-from bbfit.reporting.charts import FEW, MEASURES, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
+from bbfit.reporting.charts import (
+    FEW,
+    MEASURES,
+    azimuth_chart,
+    billboard_color,
+    loss_chart,
+    plan_chart,
+    sizes_chart,
+    times_chart,
+    worst_views,
+)
 from bbfit.reporting.plots import magma, spread_views
 from bbfit.reporting.suns import UnderSun, under_suns
 from bbfit.reporting.threejs import drawing_script, library_page, page_light
@@ -93,6 +103,7 @@ def report_page(report: Report, model: ShippedModel, views: ViewSet, facts: RunF
         marks={**azimuth.marks, **plan.marks},
         sizes=Markup(sizes_chart(report.sizes).svg) if report.sizes else None,
         loss=Markup(loss_chart(facts.losses).svg),
+        times=Markup(times_chart(report.seconds).svg) if report.seconds else None,
         billboards=_billboards(cloud),
         many=len(cloud) > FEW,
         library=library_page(),

@@ -15,7 +15,7 @@ from bbfit.evaluation.measures import Over, OverBackground
 from bbfit.evaluation.report import SizeScore, ViewScore
 from bbfit.evaluation.scoring import measure
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.reporting.charts import FEW, Chart, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, worst_views
+from bbfit.reporting.charts import FEW, Chart, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, times_chart, worst_views
 
 HUES = {billboard_color(index) for index in range(10)}
 
@@ -93,6 +93,7 @@ def test_the_plan_numbers_a_few_billboards_and_shows_many(known_cloud: Billboard
 def test_colors_are_the_pages(known_cloud: BillboardCloud) -> None:
     sizes = [SizeScore(64 >> n, 64 >> n, 20.0 + n, None if n else 1.1, 0.1) for n in range(3)]
     charts = [azimuth_chart(scores((20, 0.9, 0.1))), plan_chart(known_cloud), sizes_chart(sizes), loss_chart([3.0, 2.0, float("nan"), 1.0])]
+    charts.append(times_chart({"views": 3.0, "fit": 1.0}))
     for chart in charts:
         assert set(re.findall(r"#[0-9a-fA-F]{6}\b", chart.svg)) <= HUES
         assert "<text" in chart.svg and "<metadata" not in chart.svg
@@ -101,6 +102,18 @@ def test_colors_are_the_pages(known_cloud: BillboardCloud) -> None:
     assert len(names) == len(set(names))
     again = [azimuth_chart(scores((20, 0.9, 0.1))), plan_chart(known_cloud)]
     assert [chart.svg for chart in again] == [chart.svg for chart in charts[:2]]
+
+
+def test_each_stage_begins_where_the_one_before_ends() -> None:
+    """With its seconds beside it, and with bars as long as they are."""
+    svg = times_chart({"views": 60.0, "fit": 30.0, "evaluate": 10.0}).svg
+    bars = re.findall(r'<path d="M ([\d.]+) [\d.]+ \nL ([\d.]+) [\d.]+ \n[^"]*z\n"[^>]*style="fill: var\(--accent\)', svg)
+    starts, ends = ([float(value) for value in side] for side in zip(*bars, strict=True))
+    assert ends[:-1] == pytest.approx(starts[1:], abs=1e-3)
+    shares = [(end - start) / (ends[-1] - starts[0]) for start, end in zip(starts, ends, strict=True)]
+    assert shares == pytest.approx([0.6, 0.3, 0.1], abs=1e-3)
+    places = [svg.index(f">{said}</text>") for said in ("60.0", "30.0", "10.0")]
+    assert places == sorted(places)
 
 
 def test_elevations_where_lines_end_together_do_not_overlap() -> None:

@@ -139,7 +139,8 @@ def drawn(page: Page) -> tuple[NDArray[np.float64], Camera]:
 def test_the_page_loads_without_complaint_and_shows_what_is_there(visit: Visit, result: RunResult) -> None:
     def act(page: Page) -> None:
         headings = page.evaluate("[...document.querySelectorAll('h2')].map(heading => heading.textContent)")
-        assert headings == ["From every side", "The model", "Numbers", "The billboards", "From a distance", "The fit", "Options"]
+        figures = ["The billboards", "From a distance", "The fit", "Where the time went"]
+        assert headings == ["From every side", "The model", "Numbers", *figures, "Options"]
         assert page.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
         key = page.evaluate("document.querySelector('.key').textContent")
         mean = result.report.mean.over.mean
