@@ -16,6 +16,10 @@ quality   for each folder of views: the 10,000 steps of the thesis preset by the
           every 25 steps)
 placement for each folder of views: the thesis preset with four two-sided billboards, with L2 and with L1, and the default preset, which
           has as many vertices; only with ``--only placement``
+start     starting up: ``bbfit --help`` and ``import bbfit`` (medians of five), and a fit of two steps with an empty and with a filled cache
+          of compiled kernels; only with ``--only start``
+render    the default views of a grown aspen, with all samples for training views and with the default number; only with ``--only render``
+run       the stages of ``bbfit run`` without a tree and without options; only with ``--only run``
 memory    the peak resident memory of a default fit of 360 views at 1024 x 1024, in a separate process
 
 PSNR, SSIM and FLIP are means over four backgrounds.
@@ -31,10 +35,11 @@ import json
 import os
 import platform
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -59,6 +64,8 @@ TREES = {"quaking_aspen": 0, "weeping_willow": 0}
 """Species to grow with all their leaves, and their seeds."""
 WARM_STEPS = {"default": 160, "thesis": 1200}
 """Number of steps at an eighth of the size. Each finer level has half as many."""
+ROWS = ("grow", "steps", "quality", "placement", "start", "render", "run", "memory")
+"""What ``--only`` can choose."""
 Row = dict[str, Any]
 
 
@@ -319,6 +326,48 @@ def reference_step(views: ViewSet, config: bbfit.FitConfig, steps: int = 50) -> 
     return (time.perf_counter() - started) / steps
 
 
+def starting() -> list[Row]:
+    """Measure the rows ``start``."""
+    fit = ["-m", "bbfit.cli", "fit", str(DATA / "views"), "--steps", "2", "--placement", "even", "--billboards", "2"]
+    commands = {"bbfit --help": ["-m", "bbfit.cli", "--help"], "import bbfit": ["-c", "import bbfit"]}
+    rows = [
+        {"name": "start", "what": what, "seconds": statistics.median(of_command(own) for _ in range(5))} for what, own in commands.items()
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {"WARP_CACHE_PATH": str(Path(folder) / "cache")}
+        for what in ("a short fit, nothing compiled", "a short fit, compiled before"):
+            rows.append({"name": "start", "what": what, "seconds": of_command([*fit, "--out", str(Path(folder) / what)], environment)})
+    return rows
+
+
+def of_command(arguments: list[str], environment: Mapping[str, str] | None = None) -> float:
+    """Seconds of a Python process."""
+    started = time.perf_counter()
+    subprocess.run([sys.executable, *arguments], check=True, capture_output=True, env=environment)
+    return round(time.perf_counter() - started, 2)
+
+
+def rendering() -> list[Row]:
+    """Measure the rows ``render``."""
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        tree = bbfit.write_tree(bbfit.grow("quaking_aspen"), Path(folder) / "tree.glb")[0]
+        for samples in (bbfit.ViewsConfig().samples, bbfit.ViewsConfig().samples_of_training):
+            started, config = time.perf_counter(), bbfit.ViewsConfig(training_samples=samples)
+            bbfit.render_views(tree, Path(folder) / str(samples), config)
+            seconds = round(time.perf_counter() - started, 2)
+            rows.append({"name": "render", "pictures": config.count + config.turned, "training_samples": samples, "seconds": seconds})
+    return rows
+
+
+def whole() -> list[Row]:
+    """Measure the row ``run``."""
+    with tempfile.TemporaryDirectory() as folder:
+        seconds = of_command(["-m", "bbfit.cli", "run", "--out", folder])
+        stages = json.loads((Path(folder) / "run.json").read_text())["stages"]
+    return [{"name": "run", "seconds": seconds} | {f"{name}_s": round(stage["seconds"], 1) for name, stage in stages.items()}]
+
+
 def memory() -> list[Row]:
     """Measure the row ``memory``."""
     views = enlarged(bbfit.ViewDataset.load(DATA / "views").train, 1024)
@@ -354,7 +403,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="take less than a minute")
     parser.add_argument("--json", type=Path, help="write the rows to this file as a JSON list")
     parser.add_argument("--views", type=Path, nargs="*", help="folders of views for the rows quality and placement")
-    parser.add_argument("--only", nargs="*", choices=["grow", "steps", "quality", "placement", "memory"], help="measure only these rows")
+    parser.add_argument("--only", nargs="*", choices=ROWS, help="measure only these rows")
     arguments = parser.parse_args()
     selected = arguments.only or (["grow", "steps"] if arguments.quick else ["grow", "steps", "quality", "memory"])
     rows: list[Row] = [
@@ -366,7 +415,8 @@ def main() -> None:
         rows += quality(arguments.views or [DATA / "views"])
     if "placement" in selected:
         rows += placement(arguments.views or [DATA / "views"])
-    for name, measured in {"grow": lambda: grow(arguments.quick), "memory": memory}.items():
+    others = {"grow": lambda: grow(arguments.quick), "start": starting, "render": rendering, "run": whole, "memory": memory}
+    for name, measured in others.items():
         if name in selected:
             for row in measured():
                 rows.append(row)
