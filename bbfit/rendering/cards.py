@@ -31,8 +31,8 @@ from bbfit.rendering.sampling import MipChain, filtered, joined
 _SLACK = 1e-9
 # Relative error of corners up to which a card belongs to a sheet.
 _SAME = 1e-6
-# Most pixels that are compared with polygons at once.
-_AT_ONCE = 1 << 21
+# Most pixels that are compared with polygons at once, and of cameras that are drawn together.
+_AT_ONCE, _TOGETHER = 1 << 21, 1 << 18
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,12 @@ class Sheets:
 
 @dataclass(frozen=True)
 class Hits:
-    """The M places where the rays of a camera's pixels meet sheets on a side that is shown."""
+    """The M places where the rays of the pixels of V cameras meet S sheets on a side that is shown."""
 
+    view: Tensor
+    """Which camera, int64 [M], ascending."""
     sheet: Tensor
-    """Which sheet, int64 [M], ascending."""
+    """Which sheet, int64 [M], ascending for each camera."""
     x: Tensor
     """Columns, int64 [M]; no pixel of a sheet occurs twice."""
     y: Tensor
@@ -83,7 +85,7 @@ class Hits:
     depth: Tensor
     """Depth in meters, float64 [M]."""
     to_uv: Tensor
-    """From a pixel (x, y, 1) to homogeneous texture coordinates of each sheet, [S, 3, 3]."""
+    """From a pixel (x, y, 1) to homogeneous texture coordinates of each sheet in each camera, [V, S, 3, 3]."""
 
 
 def draw_cards(cards: Cards, camera: Camera, light: Light | None = None) -> Tensor:
@@ -135,16 +137,18 @@ class CardRenderer:
         cameras, light = camera.batch(), self._cards.light if light is None else light
         if light is not None and self._cards.atlas.surface is None:
             fail("light", "the light of these cards is in their textures", "leave it out")
+        together = max(1, _TOGETHER // (cameras.width * cameras.height)) if light is None else 1
         with torch.no_grad():
             pictures = []
-            for index in range(len(cameras)):
-                met, straight = self._shown(cameras[index])
+            for index in range(0, len(cameras), together):
+                some = cameras[index : index + together]
+                met, straight = self._shown(some)
                 colors = straight[:, :3]
                 if light is not None:
-                    own, axes = light[[index if len(light) > 1 else 0]], _axes(self._sheets, cameras[index])[met.sheet]
+                    own, axes = light[[index if len(light) > 1 else 0]], _axes(self._sheets, some[0])[met.sheet]
                     colors = _lit(colors, straight[:, 4:], axes, own, traced=self._cards.traced)
-                pictures.append(self._composited(colors, straight[:, 3], met, cameras[index]))
-            image = torch.stack(pictures)
+                pictures.append(self._composited(colors, straight[:, 3], met, some))
+            image = torch.cat(pictures) if pictures else torch.zeros(0, cameras.height, cameras.width, 4)
         return image if camera.batched else image[0]
 
     def surfaces(self, camera: Camera) -> Tensor:
@@ -154,15 +158,15 @@ class CardRenderer:
             met, straight = self._shown(camera)
             normals = normalize(2 * straight[:, 4:7] - 1, dim=-1)
             in_world = (normals[:, None] @ _axes(self._sheets, camera)[met.sheet].float())[:, 0]
-            return self._composited(torch.cat([straight[:, :3], in_world], -1), straight[:, 3], met, camera)
+            return self._composited(torch.cat([straight[:, :3], in_world], -1), straight[:, 3], met, camera.batch())[0]
 
     def _shown(self, camera: Camera) -> tuple[Hits, Tensor]:
-        """The places that a single camera sees, and the filtered values of the atlas there, [M, C]."""
+        """The places that cameras see, and the filtered values of the atlas there, [M, C]."""
         met = hits(self._cards, self._sheets, camera)
         return met, filtered(self._levels, met.uv, met.detail) / 255
 
     def _composited(self, values: Tensor, alphas: Tensor, met: Hits, camera: Camera) -> Tensor:
-        """The picture of places with values [M, C] and alpha [M] in a single camera, [H, W, C + 1]."""
+        """The pictures of places with values [M, C] and alpha [M] in V cameras, [V, H, W, C + 1]."""
         alpha = self._cards.alpha
         if alpha.kind == "hash":
             alphas = (alphas >= thresholds(met.x, met.y, self._sheets.first[met.sheet])).to(alphas)
@@ -171,9 +175,10 @@ class CardRenderer:
             alphas = coverage(alphas, across + down, alpha)
         else:
             alphas = opacity(alphas, alpha)
-        shown, pixels, count = alphas > 0, met.y * camera.width + met.x, camera.height * camera.width
+        shape = len(camera), camera.height, camera.width
+        shown, pixels, count = alphas > 0, (met.view * camera.height + met.y) * camera.width + met.x, math.prod(shape)
         image = composite_fragments(values[shown], alphas[shown], met.depth[shown], pixels[shown], count, nested=alpha.nested)
-        return image.unflatten(0, (camera.height, camera.width))
+        return image.unflatten(0, shape)
 
     def fragments(self, camera: Camera) -> int:
         """How many fragments a graphics card shades for a single camera: the pixel centers inside the polygons of all layers.
@@ -242,25 +247,32 @@ def _padded(arrays: list[NDArray[np.float64]], width: int) -> Tensor:
 
 
 def hits(cards: Cards, sheets: Sheets, camera: Camera) -> Hits:
-    """The pixels in which a single camera meets the cards' sheets, whatever their alpha."""
-    camera = camera.to("cpu").to(torch.float64)
-    to_pixel, to_depth = camera.world_to_pixel @ sheets.to_world, camera.world_to_camera[2] @ sheets.to_world
-    shown = _faced(sheets, camera)
+    """The pixels in which one camera or V cameras meet the cards' sheets, whatever their alpha."""
+    camera = camera.batch().to("cpu").to(torch.float64)
+    to_pixel, to_depth = (
+        camera.world_to_pixel[:, None] @ sheets.to_world,
+        (camera.world_to_camera[:, None, 2:3] @ sheets.to_world)[..., 0, :],
+    )
+    shown = torch.stack([_faced(sheets, camera[view]) for view in range(len(camera))])
     # [u, v, 1] / depth for a pinhole, [u, v, 1] for parallel projection, from a pixel [x, y, 1]
-    to_uv = torch.linalg.inv(torch.where(shown[:, None, None], to_pixel, torch.eye(3).double()))
-    low, high = _boxes(sheets, camera, shown)
+    to_uv = torch.linalg.inv(torch.where(shown[..., None, None], to_pixel, torch.eye(3).double()))
+    boxes = zip(*(_boxes(sheets, camera[view], shown[view]) for view in range(len(camera))), strict=True)
+    low, high = (torch.cat(corners) for corners in boxes)  # from here on each camera has pieces and sheets of its own
+    of_piece = (len(sheets) * torch.arange(len(camera))[:, None] + sheets.of_piece).flatten()
+    own_to_uv, own_to_depth = to_uv.flatten(0, 1), to_depth.flatten(0, 1)
     extent, areas, found = high - low, (high - low).prod(-1), list[tuple[Tensor, ...]]()
     for some in torch.arange(len(areas)).split(_pieces_at_once(areas)):
         piece = some.repeat_interleave(areas[some])
         inside = torch.arange(len(piece)) - (areas[some].cumsum(0) - areas[some]).repeat_interleave(areas[some])
         x, y = low[piece, 0] + inside % extent[piece, 0], low[piece, 1] + inside // extent[piece, 0]
-        sheet = sheets.of_piece[piece]
-        u, v, scale = (to_uv[sheet, row, 0] * x + to_uv[sheet, row, 1] * y + to_uv[sheet, row, 2] for row in range(3))
+        sheet = of_piece[piece]
+        u, v, scale = (own_to_uv[sheet, row, 0] * x + own_to_uv[sheet, row, 1] * y + own_to_uv[sheet, row, 2] for row in range(3))
         u, v = u / scale, v / scale
-        depth = to_depth[sheet, 0] * u + to_depth[sheet, 1] * v + to_depth[sheet, 2]
+        depth = own_to_depth[sheet, 0] * u + own_to_depth[sheet, 1] * v + own_to_depth[sheet, 2]
         met = (depth > 0) & depth.isfinite()
+        polygon = piece % max(1, len(sheets.of_piece))
         for along_u, along_v, offset in sheets.sides.permute(1, 2, 0):
-            met &= u * along_u[piece] + v * along_v[piece] <= offset[piece] + _SLACK
+            met &= u * along_u[polygon] + v * along_v[polygon] <= offset[polygon] + _SLACK
         found.append(tuple(values[met] for values in (sheet, x, y, u, v, scale, depth)))
     sheet, x, y, u, v, scale, depth = (torch.cat(values) for values in zip(*found, strict=True))
     # Where pieces of a sheet overlap, the first one shows.
@@ -271,8 +283,10 @@ def hits(cards: Cards, sheets: Sheets, camera: Camera) -> Hits:
     uv = torch.stack([u, v], -1)
     # d(a / c) = (da - (a / c) dc) / c, in x and in y
     size = torch.tensor(cards.atlas.image.shape[1::-1], dtype=torch.float64)
-    rates = [((to_uv[sheet, :2, axis] - uv * to_uv[sheet, 2, axis, None]) * size).norm(dim=-1) for axis in (0, 1)]
-    return Hits(sheet, x, y, uv, (torch.maximum(*rates) / scale.abs()).log2(), depth, to_uv)
+    rates = [((own_to_uv[sheet, :2, axis] - uv * own_to_uv[sheet, 2, axis, None]) * size).norm(dim=-1) for axis in (0, 1)]
+    detail = (torch.maximum(*rates) / scale.abs()).log2()
+    count = max(1, len(sheets))
+    return Hits(sheet // count, sheet % count, x, y, uv, detail, depth, to_uv)
 
 
 def _lit(colors: Tensor, maps: Tensor, axes: Tensor, light: Light, *, traced: bool) -> Tensor:
@@ -293,7 +307,7 @@ def _lit(colors: Tensor, maps: Tensor, axes: Tensor, light: Light, *, traced: bo
 
 def _beside(met: Hits) -> list[Tensor]:
     """Texture coordinates, [M, 2], at the other pixel of each hit's row and at that of its column in its square of 2 x 2 pixels."""
-    rows = met.to_uv[met.sheet]
+    rows = met.to_uv[met.view, met.sheet]
     places = [torch.stack([x, y, torch.ones_like(x)], -1).double() for x, y in ((met.x ^ 1, met.y), (met.x, met.y ^ 1))]
     found = [(rows @ place[:, :, None])[..., 0] for place in places]
     return [place[:, :2] / place[:, 2:] for place in found]

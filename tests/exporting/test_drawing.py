@@ -94,6 +94,22 @@ def test_antialiased_masks_are_those_of_the_reference(clouds: dict[str, Billboar
         assert float(((image - expected).abs().amax(-1) > 1e-3).float().mean()) <= 5e-4
 
 
+@pytest.mark.parametrize("mode", [AlphaMode("blend"), AlphaMode("hash"), AlphaMode("mask", antialiased=True)], ids=str)
+def test_cameras_that_are_drawn_together_see_what_each_sees_alone(
+    mode: AlphaMode, clouds: dict[str, BillboardCloud], orbit: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bit by bit, in groups of any size; one of the cameras sees nothing."""
+    back = torch.diag(torch.tensor([-1.0, 1, -1, 1])).to(orbit.world_to_camera)
+    poses = torch.cat([orbit.world_to_camera, back @ orbit.world_to_camera[:1], orbit.world_to_camera])
+    cameras = Camera(poses, orbit.intrinsics[:1].expand(len(poses), 3, 3), orbit.width, orbit.height)
+    drawn = cloud_cards(replace(clouds["two"], alpha=mode), 4)
+    alone = torch.stack([draw_cards(drawn, cameras[index]) for index in range(len(cameras))])
+    assert not alone[len(orbit)].any() and alone[0].any()
+    assert torch.equal(draw_cards(drawn, cameras), alone)
+    monkeypatch.setattr("bbfit.rendering.cards._TOGETHER", 2 * cameras.width * cameras.height)
+    assert torch.equal(draw_cards(drawn, cameras), alone)
+
+
 def test_polygons_and_pieces_show_what_the_rectangles_do(crossed: BillboardCloud, orbit: Camera) -> None:
     """Hulls leave out what is transparent; halves that share an edge, which runs through pixels' centers, show each pixel once."""
     cards = cloud_cards(crossed, 4)
