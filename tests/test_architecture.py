@@ -191,6 +191,25 @@ print(json.dumps([bare, [name for name in heavy if name in sys.modules]]))
     assert json.loads(result.stdout) == [[], []]
 
 
+def test_the_command_line_starts_without_numpy_and_makes_no_options_for_its_help() -> None:
+    script = """
+import json, sys
+import bbfit.cli.options as options
+made = []
+options.deferred = lambda command, own=options.deferred: made.append(command.__name__) or own(command)
+from bbfit.cli.program import execute
+for arguments in (["--help"], ["grow", "--help"]):
+    try:
+        execute(arguments, program=False)
+    except SystemExit:
+        made.append("end")
+loaded = [name for name in ("numpy", "torch", "scipy", "cv2") if name in sys.modules]
+print(json.dumps([made, loaded]))
+"""
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert json.loads(result.stdout.splitlines()[-1]) == [["end", "grow_command", "end"], []]
+
+
 def test_every_package_is_installed() -> None:
     settings = configparser.ConfigParser()
     settings.read(ROOT / "setup.cfg", encoding="utf-8")

@@ -44,9 +44,9 @@ class ViewsConfig:
     orthographic: bool = False
     """Parallel projection instead of a field of view."""
     samples: Count = 16
-    """Light paths per pixel of held-out views: more are slower and less noisy."""
+    """Light paths per pixel: more are slower and less noisy; training views have half of them."""
     training_samples: Count | None = None
-    """Light paths per pixel of training views, whose noise averages out in a fit. Default: half of --samples; with suns, all of them."""
+    """The same for training views, whose noise averages out in a fit. Default: half of --samples; with --suns, all of them."""
     denoise: bool = True
     """Denoise the pictures with Open Image Denoise, which makes a few samples look like many."""
     sun_strength: _Strength = 2.5

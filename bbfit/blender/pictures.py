@@ -29,6 +29,8 @@ PICTURES_FILE = "pictures.json"
 """The file in which :func:`render_pictures` records its request: the tree, the light, the cameras and the clip distances."""
 FILTER_REACH = 2.0
 """How far, in pixels, the filter of Cycles spreads a surface beyond its outline. The Blackman-Harris filter reaches 1.5 pixels."""
+# Formats of trees whose vertices bound what is seen. Others may have hair of particles or displaced surfaces.
+_BOUNDED = (".glb", ".gltf", ".obj", ".ply", ".stl", ".fbx")
 # The options of views that explicit cameras replace.
 _UNUSED = ("count", "size", "training_samples", "elevations", "fov_degrees", "orthographic", "axis", "turned", "suns")
 # The largest difference in pixels between a camera's intrinsics and those that Blender can represent.
@@ -110,7 +112,7 @@ def render_pictures(
         request.save(out / PICTURES_FILE)
         visible = clips or [clip_distances(points, position) for position in cameras.position]
         report, finished = on_progress, count - len(missing)
-        requests = frames(cameras, paths, missing, visible, config, None if depth else points)
+        requests = frames(cameras, paths, missing, visible, config, None if depth else visible_hull(tree, points))
         if depth:  # which is 0, as at the nearest distance, outside the part that is rendered
             requests = [request | {"depth": str(depth_path(paths[request["frame"]]).resolve())} for request in requests]
         pool.render(requests, config.render_workers, finished, lambda done: report(done, count))
@@ -174,6 +176,11 @@ def clip_distances(points: NDArray[np.float64], position: Tensor) -> tuple[float
     """Clip distances in meters of a camera at ``position``, [3], that contain every point, [P, 3], in front of the camera."""
     reach = float(np.linalg.norm(points - position.numpy(), axis=-1).max() + 2 * np.ptp(points, axis=0).sum())
     return reach * 1e-5, reach
+
+
+def visible_hull(tree: TreeFile, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """The vertices of a convex hull around all that is seen of a tree, given those of its vertices' hull; ``None`` if more may be seen."""
+    return points if tree.path.suffix.lower() in _BOUNDED else None
 
 
 def frames(

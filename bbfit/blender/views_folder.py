@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.lit_pictures import LitPictures, light_request, lit_pictures, own_suns, spread
-from bbfit.blender.pictures import FILTER_REACH, clip_distances, frames, is_intact, to_y_up, vertical_axis, worker_settings
+from bbfit.blender.pictures import FILTER_REACH, clip_distances, frames, is_intact, to_y_up, vertical_axis, visible_hull, worker_settings
 from bbfit.blender.processes import BlenderError, BlenderPool, require_bpy
 from bbfit.blender.request import ViewsRequest
 from bbfit.checks import fail
@@ -146,8 +146,9 @@ def _render(tree: TreeFile, out: Path, config: ViewsConfig, request: ViewsReques
         on_done(finished)
         clips = [clip_distances(points, camera.position[0])] * config.count
         neighbors = camera.turned(_TURN, target)
-        own = frames(camera, paths, missing, clips, config, points)
-        second = frames(neighbors, turned_paths, missing_turned, clips, config, points)
+        hull = visible_hull(tree, points)
+        own = frames(camera, paths, missing, clips, config, hull)
+        second = frames(neighbors, turned_paths, missing_turned, clips, config, hull)
         training = set(train)
         own = [frame | {"samples": config.samples_of_training} if frame["frame"] in training else frame for frame in own]
         if lit:

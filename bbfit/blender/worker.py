@@ -252,10 +252,9 @@ def render(frame: dict[str, Any], settings: dict[str, Any]) -> None:
         lens.type, lens.ortho_scale = "ORTHO", frame["extent"]
     lens.clip_start, lens.clip_end = frame["clip"]
     scene.camera.matrix_world = Matrix(frame["camera_to_world"])
-    border = frame["border"]
-    scene.render.use_border = border is not None
-    if border is not None:
-        scene.render.border_min_x, scene.render.border_min_y, scene.render.border_max_x, scene.render.border_max_y = border
+    scene.render.use_border = frame["border"] is not None
+    for edge, place in zip(("min_x", "min_y", "max_x", "max_y"), frame["border"] or (), strict=False):
+        setattr(scene.render, f"border_{edge}", place)
     scene.cycles.seed, scene.cycles.samples = frame["seed"], frame["samples"]
     part = path.with_name(f".bbfit-{path.stem}.part")
     scene.render.filepath = str(part).replace("{", "{{").replace("}", "}}")  # Blender would replace {names}

@@ -66,8 +66,7 @@ def load(path: str) -> None:
         raise InputRefused("tree", f"{path} cannot be read as {suffix} ({reason})", "get or export the file again") from error
     for mesh in bpy.data.meshes:
         check_finite(path, coordinates(mesh))
-        if suffix not in (".glb", ".gltf"):  # whose importer has done it
-            mesh.validate()  # only now, because it replaces NaN by 0
+        mesh.validate()  # only now, because it replaces NaN by 0
 
 
 def check_files(path: str, files: list[str]) -> None:

@@ -148,7 +148,7 @@ class CardRenderer:
                     own, axes = light[[index if len(light) > 1 else 0]], _axes(self._sheets, some[0])[met.sheet]
                     colors = _lit(colors, straight[:, 4:], axes, own, traced=self._cards.traced)
                 pictures.append(self._composited(colors, straight[:, 3], met, some))
-            image = torch.cat(pictures) if pictures else torch.zeros(0, cameras.height, cameras.width, 4)
+            image = torch.cat(pictures)
         return image if camera.batched else image[0]
 
     def surfaces(self, camera: Camera) -> Tensor:
@@ -249,10 +249,8 @@ def _padded(arrays: list[NDArray[np.float64]], width: int) -> Tensor:
 def hits(cards: Cards, sheets: Sheets, camera: Camera) -> Hits:
     """The pixels in which one camera or V cameras meet the cards' sheets, whatever their alpha."""
     camera = camera.batch().to("cpu").to(torch.float64)
-    to_pixel, to_depth = (
-        camera.world_to_pixel[:, None] @ sheets.to_world,
-        (camera.world_to_camera[:, None, 2:3] @ sheets.to_world)[..., 0, :],
-    )
+    to_pixel = camera.world_to_pixel[:, None] @ sheets.to_world
+    to_depth = (camera.world_to_camera[:, None, 2:3] @ sheets.to_world)[..., 0, :]
     shown = torch.stack([_faced(sheets, camera[view]) for view in range(len(camera))])
     # [u, v, 1] / depth for a pinhole, [u, v, 1] for parallel projection, from a pixel [x, y, 1]
     to_uv = torch.linalg.inv(torch.where(shown[..., None, None], to_pixel, torch.eye(3).double()))

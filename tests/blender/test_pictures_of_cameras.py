@@ -20,7 +20,7 @@ from bbfit.geometry.orbit import hull_vertices
 from bbfit.images import read_rgba
 from bbfit.views.dataset import ViewDataset
 
-from .conftest import SMALL, box
+from .conftest import SMALL, box, run_in_blender
 
 CONFIG = ViewsConfig(**SMALL)
 
@@ -95,6 +95,25 @@ def test_only_the_part_of_a_picture_with_the_tree_is_rendered(thing_glb: Path, t
     np.testing.assert_array_equal(read_rgba(whole), read_rgba(path))
     inside = Camera(look_at(torch.zeros(1, 3).double(), torch.tensor([0.0, 0, 1]).double()), pinhole_intrinsics(40, 32, 32)[None], 32, 32)
     assert frames(inside, [path], [0], clips, CONFIG, np.asarray(corners))[0]["border"] is None
+
+
+def test_hair_beyond_the_vertices_is_rendered(tmp_path: Path) -> None:
+    """The needles of a cube of one meter, which are no vertices."""
+    script = """
+import bpy, os, sys
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.mesh.primitive_cube_add(size=1, location=(0, 0, 1))
+bpy.context.object.modifiers.new("needles", "PARTICLE_SYSTEM")
+needles = bpy.context.object.particle_systems[0].settings
+needles.type, needles.count, needles.hair_length, needles.render_type = "HAIR", 500, 2.0, "PATH"
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
+sys.stdout.flush()
+os._exit(0)
+"""
+    run_in_blender(script, str(tmp_path / "tree.blend"))
+    (path,) = render_pictures(tmp_path / "tree.blend", front(), tmp_path / "out", replace(CONFIG, samples=32))
+    rows, columns = np.nonzero(read_rgba(path)[..., 3])
+    assert columns.max() > 19 and rows.min() < 6, "the cube itself ends in column 16, and begins in row 10"
 
 
 def test_clip_distances_show_a_slab(thing_glb: Path, tmp_path: Path) -> None:

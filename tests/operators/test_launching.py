@@ -194,6 +194,20 @@ def test_pieces_are_about_equal_parts_of_the_whole(threads: Callable[[int], None
     assert not lengths or (max(lengths) - min(lengths) <= 1 and (len(lengths) == 1 or min(lengths) >= least))
 
 
+def test_kernels_are_compiled_once(tmp_path: Path) -> None:
+    """Not also for blocks of more than one thread, which no launch on a CPU has."""
+    script = """
+import torch
+from bbfit.operators.sharpness.fused import sharpness_fused
+pictures = torch.rand(2, 1, 16, 16, 4)
+sharpness_fused(*pictures)
+"""
+    cache = tmp_path / "cache"
+    subprocess.run([sys.executable, "-c", script], check=True, env={**os.environ, "WARP_CACHE_PATH": str(cache)})
+    modules = [path.parent.name.rpartition("_")[0] for path in cache.rglob("*.o")]
+    assert modules and len(modules) == len(set(modules))
+
+
 def test_a_cache_that_cannot_be_written_is_named_with_its_variable(tmp_path: Path) -> None:
     """When Warp starts, and when a kernel is compiled."""
     with pytest.raises(CacheError, match=r"^Warp: /there cannot be written to \(Read-only file system\).*WARP_CACHE_PATH"):
