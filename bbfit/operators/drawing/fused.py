@@ -15,9 +15,9 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.drawing.compositing import STEEPEST
-from bbfit.operators.drawing.kernels import Plane, kernels
+from bbfit.operators.drawing.kernels import kernels
 from bbfit.operators.drawing.projection import Projection, project
-from bbfit.operators.drawing.sampling_kernels import BLOCK, COVERAGE, SMOOTH
+from bbfit.operators.drawing.tile_kernels import BLENDED, BLOCK, COVERAGE, HASHED, SMOOTH, Plane
 from bbfit.operators.image_loss.fused import PixelLoss
 from bbfit.operators.image_loss.kernels import LOSSES
 from bbfit.operators.launching import compile_for, in_parallel, pieces_of, struct_array, warp_array
@@ -84,7 +84,9 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None,
     def launch(begin: int, end: int) -> None:
         wp.launch(compiled.draw, (views, end - begin, runs), [begin, *arguments], outputs, device=device)
 
-    in_parallel(launch, [(0, height)] if texels.is_cuda else pieces_of(height, -(-projection.least_pixels // (width * views)), MOST_BANDS))
+    lines = -(-height // compiled.rows)
+    least = -(-projection.least_pixels // (width * views * compiled.rows))
+    in_parallel(launch, [(0, lines)] if texels.is_cuda else pieces_of(lines, least, MOST_BANDS))
     return image
 
 
@@ -109,17 +111,19 @@ def differentiate(
         The sum of ``loss`` over each view's pixels, float64 [V], if there is a loss; the gradient in ``projection.to_texel``, float64
         [V, N, 3, 3], if ``placement``.
     """
-    views, height, count, device = len(projection), projection.height, projection.count, texels.device
-    sums = torch.zeros(views if loss else 0, height, dtype=torch.float32, device=device)
-    matrices = torch.zeros(views if placement else 0, height, count, 3, 3, dtype=torch.float64, device=device)
+    views, count, device = len(projection), projection.count, texels.device
+    lines = -(-projection.height // tile_rows(projection, device))
+    sums = torch.zeros(views if loss else 0, lines, dtype=torch.float32, device=device)
+    matrices = torch.zeros(views if placement else 0, lines, count, 3, 3, dtype=torch.float64, device=device)
     if views and (len(texels) or loss):
         nothing = torch.zeros(0, 0, 0, 4, dtype=torch.float32, device=device)
         target = loss.target if loss else nothing.to(torch.uint8)
         compiled, runs, arguments = _prepared(texels, projection, occupied)
+        arguments += [projection.width, projection.height]
         arguments.append(warp_array(nothing if image_gradient is None else image_gradient, wp.vec4))
         arguments.append(warp_array(target.view(torch.int32).squeeze(-1), wp.int32))
         arguments += [int(loss.straight), LOSSES[loss.kind], loss.weight, int(loss.own_colors)] if loss else [0, 0, 0.0, 0]
-        outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices, wp.vec3d)]
+        outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices.view(-1, 3, 3), wp.mat33d)]
         on = wp.device_from_torch(device)
         compile_for(compiled.differentiate, on)
 
@@ -132,46 +136,52 @@ def differentiate(
 
 
 def schedule(projection: Projection, device: torch.device) -> list[list[tuple[int, int, int, int]]]:
-    """Phases of a backward pass, whose pieces run at the same time; a piece is a first view, a number of views, and a band of rows.
+    """Phases of a backward pass, whose pieces run at the same time; a piece is a first view, a number of views, and a band of rows of tiles.
 
     On a CPU bands of equal parity touch different texels: no two threads add to the same texel, and every sum has one order. CUDA adds
     atomically. Pictures are not cut into bands of fewer than ``projection.least_pixels``.
     """
-    views, height, width = len(projection), projection.height, projection.width
+    rows = tile_rows(projection, device)
+    views, lines, width = len(projection), -(-projection.height // rows), projection.width
     if device.type == "cuda":
-        return [[(0, views, 0, height)]]
+        return [[(0, views, 0, lines)]]
     if projection.groups > 1:
         share = views // projection.groups
-        return [[(group * share, share, 0, height) for group in range(projection.groups)]]
+        return [[(group * share, share, 0, lines) for group in range(projection.groups)]]
     phases = list[list[tuple[int, int, int, int]]]()
     for view, apart in enumerate(projection.rows_apart.tolist()):
-        bands = pieces_of(height, max(apart, -(-projection.least_pixels // width)), MOST_BANDS)
+        bands = pieces_of(lines, -(-max(apart, -(-projection.least_pixels // width)) // rows), MOST_BANDS)
         if len(bands) > 3:
             phases += [[(view, 1, *band) for band in bands[parity::2]] for parity in (0, 1)]
         elif phases and len(phases[-1]) == 1:  # views that are not cut form one piece
-            phases[-1] = [(phases[-1][0][0], phases[-1][0][1] + 1, 0, height)]
+            phases[-1] = [(phases[-1][0][0], phases[-1][0][1] + 1, 0, lines)]
         else:
-            phases.append([(view, 1, 0, height)])
+            phases.append([(view, 1, 0, lines)])
     return phases
 
 
+def tile_rows(projection: Projection, device: torch.device) -> int:
+    """Rows of pixels in a tile."""
+    return 1 if device.type == "cuda" or projection.lanes == 1 else 2
+
+
 def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -> tuple[SimpleNamespace, int, list[Any]]:
-    """Compiled kernels, the number of threads for a row of pixels, and the arguments that both kernels begin with after their offsets."""
+    """Compiled kernels, the number of threads for a row of tiles, and the arguments that both kernels begin with after their offsets."""
     lanes = 1 if texels.is_cuda else projection.lanes
     run = 1 if lanes == 1 else projection.width
     compiled = kernels(max(4, 1 << (projection.count - 1).bit_length()), lanes)  # for the next power of two of billboards
     numbers = [projection.to_texel.detach().flatten(2), projection.nearness]
     planes = torch.cat([*(part.contiguous().view(torch.int32) for part in numbers), projection.textures, projection.boxes], -1)
     occupied = occupancy(texels.detach()) if occupied is None else occupied
-    arguments = [run, projection.width, int(projection.orthographic), projection.count, _test(projection.alpha)]
+    arguments = [run, int(projection.orthographic), projection.count, _test(projection.alpha)]
     arguments += [struct_array(planes.flatten(0, 1), Plane), warp_array(texels, wp.vec4), warp_array(occupied, wp.uint8)]
     return compiled, -(-projection.width // run), arguments
 
 
 def _test(mode: AlphaMode) -> Any:
-    """An alpha mode as :func:`~bbfit.operators.drawing.sampling_kernels.opacity` expects it."""
+    """An alpha mode as :func:`~bbfit.operators.drawing.tile_kernels.tiles` expects it."""
     if not mode.tested:
-        return wp.vec4(0.0 if mode.kind == "blend" else -1.0, 0.0, 0.0, 0.0)
+        return wp.vec4(BLENDED if mode.kind == "blend" else HASHED, 0.0, 0.0, 0.0)
     if mode.kind == "coverage":
         return wp.vec4(mode.cutoff, float(mode.samples), 0.0, COVERAGE)
     hardness = 0.0 if math.isinf(mode.hardness) else mode.hardness

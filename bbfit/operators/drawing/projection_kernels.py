@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from bbfit.operators.drawing.kernels import Plane
+from bbfit.operators.drawing.tile_kernels import Plane
 from bbfit.operators.drawing.projection import SLACK as SLACK_VALUE
 from bbfit.operators.drawing.reference import EDGE_ON as EDGE_ON_VALUE
 from bbfit.operators.launching import FLAGS
