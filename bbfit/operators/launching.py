@@ -20,6 +20,22 @@ from bbfit.checks import InputError
 
 FLAGS = "-march=native -ffp-contract=fast"
 """Clang's flags for CPU kernels; they enable the host's vector instructions and fused multiply-add."""
+PIXEL = """
+#if defined(__CUDA_ARCH__)
+    struct pixel {
+        float c[4];
+        CUDA_CALLABLE float& operator[](int i) { return c[i]; }
+        CUDA_CALLABLE float operator[](int i) const { return c[i]; }
+        CUDA_CALLABLE pixel operator+(pixel o) const { return {c[0] + o.c[0], c[1] + o.c[1], c[2] + o.c[2], c[3] + o.c[3]}; }
+        CUDA_CALLABLE pixel operator-(pixel o) const { return {c[0] - o.c[0], c[1] - o.c[1], c[2] - o.c[2], c[3] - o.c[3]}; }
+        CUDA_CALLABLE pixel operator*(pixel o) const { return {c[0] * o.c[0], c[1] * o.c[1], c[2] * o.c[2], c[3] * o.c[3]}; }
+        CUDA_CALLABLE pixel operator*(float s) const { return {c[0] * s, c[1] * s, c[2] * s, c[3] * s}; }
+    };
+#else
+    typedef float pixel __attribute__((vector_size(16), aligned(4), may_alias));
+#endif
+"""
+"""C++ of native functions: the type of a pixel or texel in a register. Without it clang splits sums of pixels into single floats."""
 LEAST_PIXELS = 1 << 14
 """Least pixels in a piece for a CPU thread."""
 

@@ -25,6 +25,65 @@ texel_block = wp.types.vector(length=4 * BLOCK, dtype=wp.float32)
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
 
+@wp.func_native(f"""
+    constexpr int SIZE = {4 * BLOCK};
+    float *g = gradient.data[i].c, *p = texels.data[i].c, *m = first_moment.data[i].c, *v = second_moment.data[i].c;
+    float slope[SIZE], texel[SIZE], first[SIZE], second[SIZE];
+    int bits = 0, opaque = 0;
+    for (int c = 0; c < SIZE; ++c) {{
+        slope[c] = g[c];
+        bits |= ((const int*)g)[c] & 0x7fffffff;
+    }}
+    const int idle = step - last.data[i];
+    if (!bits && idle > rest_after) return;
+    float decay1 = beta1, decay2 = beta2;
+    if (bits) {{
+        last.data[i] = step;
+        for (int c = 0; c < SIZE; ++c) g[c] = 0.0f;
+        if (idle > rest_after) {{
+            decay1 = powf(beta1, idle - rest_after);
+            decay2 = powf(beta2, idle - rest_after);
+        }}
+    }}
+    for (int c = 0; c < SIZE; ++c) {{
+        const bool alpha = (c & 3) == 3;
+        const float ambiguous = binarization * (1.0f - 2.0f * p[c]);
+        slope[c] += (alpha & (p[c] > 0.0f)) ? ambiguous : 0.0f;
+        first[c] = m[c] * decay1 + slope[c] * (1.0f - beta1);
+        second[c] = v[c] * decay2 + slope[c] * slope[c] * (1.0f - beta2);
+        const float moved = p[c] - (alpha ? rate * alpha_rate : rate) * first[c] / (sqrtf(second[c]) * correction + epsilon);
+        const float least = moved > 0.0f ? moved : 0.0f;
+        texel[c] = least < 1.0f ? least : 1.0f;
+        opaque |= alpha & (texel[c] > 0.0f);
+    }}
+    for (int c = 0; c < SIZE; ++c) {{
+        p[c] = texel[c];
+        m[c] = first[c];
+        v[c] = second[c];
+    }}
+    occupied.data[i] = opaque;
+""")
+def update_block(
+    i: int,
+    step: int,
+    rate: float,
+    beta1: float,
+    beta2: float,
+    correction: float,
+    epsilon: float,
+    rest_after: int,
+    binarization: float,
+    alpha_rate: float,
+    texels: wp.array(dtype=texel_block),
+    gradient: wp.array(dtype=texel_block),
+    first_moment: wp.array(dtype=texel_block),
+    second_moment: wp.array(dtype=texel_block),
+    last: wp.array(dtype=wp.int32),
+    occupied: wp.array(dtype=wp.uint8),
+):
+    """Take a step for block ``i``, whose numbers stay in registers."""
+
+
 @wp.kernel
 def update_blocks(
     first: int,
@@ -49,31 +108,7 @@ def update_blocks(
     tid, _ = wp.tid()
     begin = (first + tid) * run
     for i in range(begin, wp.min(begin + run, texels.shape[0])):
-        g = gradient[i]
-        idle = step - last[i]
-        moved = wp.dot(g, g) != 0.0
-        if moved or idle <= rest_after:
-            decay1 = beta1
-            decay2 = beta2
-            if moved:
-                gradient[i] = texel_block()
-                last[i] = step
-                if idle > rest_after:
-                    decay1 = wp.pow(beta1, float(idle - rest_after))
-                    decay2 = wp.pow(beta2, float(idle - rest_after))
-            p = texels[i]
-            if binarization != 0.0:
-                for t in range(wp.static(BLOCK)):
-                    alpha = p[4 * t + 3]
-                    if alpha > 0.0:
-                        g[4 * t + 3] += binarization * (1.0 - 2.0 * alpha)
-            m = first_moment[i] * decay1 + g * (1.0 - beta1)
-            v = second_moment[i] * decay2 + wp.cw_mul(g, g) * (1.0 - beta2)
-            first_moment[i] = m
-            second_moment[i] = v
-            for c in range(wp.static(4 * BLOCK)):
-                of_channel = wp.where((c & 3) == 3, rate * alpha_rate, rate)
-                p[c] = wp.clamp(p[c] - of_channel * m[c] / (wp.sqrt(v[c]) * correction + epsilon), 0.0, 1.0)
-            texels[i] = p
-            opaque = p[3] + p[7] + p[11] + p[15]
-            occupied[i] = wp.where(opaque > 0.0, wp.uint8(1), wp.uint8(0))
+        update_block(
+            i, step, rate, beta1, beta2, correction, epsilon, rest_after, binarization, alpha_rate,
+            texels, gradient, first_moment, second_moment, last, occupied,
+        )  # fmt: skip

@@ -29,7 +29,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from bbfit.operators.drawing.compositing import HASH, LEAST_CONTRAST, STEEPEST, TIE
-from bbfit.operators.launching import FLAGS
+from bbfit.operators.launching import FLAGS, PIXEL
 
 BLOCK = 4
 """Consecutive texels that share one byte of occupancy and that Adam updates together."""
@@ -59,22 +59,12 @@ _CONSTANTS = f"""
     constexpr float TIE = {TIE!r}f, STEEPEST = {STEEPEST!r}f, LEAST_CONTRAST = {LEAST_CONTRAST!r}f;
     constexpr float HASHED = {HASHED!r}f, BLENDED = {BLENDED!r}f, SMOOTH = {SMOOTH!r}f, COVERAGE = {COVERAGE!r}f;
 """
-# A texel in a register. Without this type clang splits sums of texels into single floats.
-_ROW = """
+# Adds to a texel's gradient.
+_ADD = """
 #if defined(__CUDA_ARCH__)
-    struct row {
-        float c[4];
-        CUDA_CALLABLE float& operator[](int i) { return c[i]; }
-        CUDA_CALLABLE float operator[](int i) const { return c[i]; }
-        CUDA_CALLABLE row operator+(row o) const { return {c[0] + o.c[0], c[1] + o.c[1], c[2] + o.c[2], c[3] + o.c[3]}; }
-        CUDA_CALLABLE row operator-(row o) const { return {c[0] - o.c[0], c[1] - o.c[1], c[2] - o.c[2], c[3] - o.c[3]}; }
-        CUDA_CALLABLE row operator*(row o) const { return {c[0] * o.c[0], c[1] * o.c[1], c[2] * o.c[2], c[3] * o.c[3]}; }
-        CUDA_CALLABLE row operator*(float s) const { return {c[0] * s, c[1] * s, c[2] * s, c[3] * s}; }
-    };
-    #define ADD(index, value) wp::atomic_add(gradient.data + (index), wp::vec_t<4, wp::float32>((value)[0], (value)[1], (value)[2], (value)[3]))
+    auto add = [&](int i, pixel by) { wp::atomic_add(gradient.data + i, wp::vec_t<4, wp::float32>(by[0], by[1], by[2], by[3])); };
 #else
-    typedef float row __attribute__((vector_size(16), aligned(4), may_alias));
-    #define ADD(index, value) *(row*)(gradient.data + (index)) += (value)
+    auto add = [&](int i, pixel by) { ((pixel*)gradient.data)[i] += by; };
 #endif
 """
 # The four texels around a sample at texel coordinates (u, v) that may lie beyond the border, clamped to it, and their weights.
@@ -221,13 +211,13 @@ _SAMPLE = """
         const int first = tile.firsts.c[k], height = tile.heights.c[k], width = tile.widths.c[k];
         const int* place = tile.place.data[k];
         const float *fx = tile.fx.data[k], *fy = tile.fy.data[k];
-        row* samples = (row*)tile.samples.data[k * LANES];
+        pixel* samples = (pixel*)tile.samples.data[k * LANES];
         float *alpha = tile.opacities.data[k], *slopes = tile.slopes.data[k];
-        auto beyond = [&](float u, float v) -> row {
+        auto beyond = [&](float u, float v) -> pixel {
             const corners near = around(u, v, first, height, width);
-            row sum = {0.0f, 0.0f, 0.0f, 0.0f};
+            pixel sum = {0.0f, 0.0f, 0.0f, 0.0f};
             for (int c = 0; c < 4; ++c) {
-                row t = *(const row*)(texels.data + near.at[c]);
+                pixel t = *(const pixel*)(texels.data + near.at[c]);
                 if (!near.there[c]) t[3] = 0.0f;
                 sum = sum + t * near.weights[c];
             }
@@ -247,16 +237,16 @@ _SAMPLE = """
             }
             if (empty) {
                 for (int l = begin; l < begin + COLUMNS; ++l) {
-                    samples[l] = row{0.0f, 0.0f, 0.0f, 1.0f};
+                    samples[l] = pixel{0.0f, 0.0f, 0.0f, 1.0f};
                     alpha[l] = 0.0f;
                 }
                 continue;
             }
             for (int l = begin; l < begin + COLUMNS; ++l) {
-                row s = {0.0f, 0.0f, 0.0f, 0.0f};
+                pixel s = {0.0f, 0.0f, 0.0f, 0.0f};
                 if (inside || place[l] >= 0) {
-                    const row *p = (const row*)(texels.data + place[l]), *q = p + width;
-                    const row upper = p[0] + (p[1] - p[0]) * fx[l], lower = q[0] + (q[1] - q[0]) * fx[l];
+                    const pixel *p = (const pixel*)(texels.data + place[l]), *q = p + width;
+                    const pixel upper = p[0] + (p[1] - p[0]) * fx[l], lower = q[0] + (q[1] - q[0]) * fx[l];
                     s = upper + (lower - upper) * fy[l];
                 } else if (place[l] == BORDER) {
                     s = beyond(fx[l], fy[l]);
@@ -273,7 +263,7 @@ _SAMPLE = """
             }
         } else if (test.c[0] == HASHED) {
             for (int l = 0; l < LANES; ++l) {  // bbfit.operators.drawing.compositing.thresholds
-                unsigned h = unsigned(column + l % COLUMNS) * HASH[0] ^ unsigned(row_ + l / COLUMNS) * HASH[1] ^ unsigned(first) * HASH[2];
+                unsigned h = unsigned(column + l % COLUMNS) * HASH[0] ^ unsigned(row + l / COLUMNS) * HASH[1] ^ unsigned(first) * HASH[2];
                 h = (h ^ h >> 16) * HASH[3];
                 h = (h ^ h >> 15) * HASH[4];
                 h = h ^ h >> 16;
@@ -293,8 +283,8 @@ _SAMPLE = """
                     return w > 0.0f && u > -1.0f && u < (float)width && v > -1.0f && v < (float)height ? beyond(u, v)[3] : 0.0f;
                 };
                 for (int l = 0; l < LANES; ++l) {
-                    const float across = LANES > 1 ? alpha[l ^ 1] : alpha_at(column ^ 1, row_);
-                    const float down = LANES > 1 ? alpha[l ^ COLUMNS] : alpha_at(column, row_ ^ 1);
+                    const float across = LANES > 1 ? alpha[l ^ 1] : alpha_at(column ^ 1, row);
+                    const float down = LANES > 1 ? alpha[l ^ COLUMNS] : alpha_at(column, row ^ 1);
                     const float contrast = fabsf(across - alpha[l]) + fabsf(down - alpha[l]);
                     const float steep = 1.0f / (contrast > LEAST_CONTRAST ? contrast : LEAST_CONTRAST);
                     const float rate = ((rates[l] == 0.0f) | (steep < rates[l])) ? steep : rates[l];
@@ -317,14 +307,14 @@ _SAMPLE = """
     }
 """
 _BLEND = """
-    const row* samples = (const row*)tile.samples.data[tile.order.data[position][0] * LANES];
+    const pixel* samples = (const pixel*)tile.samples.data[tile.order.data[position][0] * LANES];
     const float* opacities = tile.opacities.data[tile.order.data[position][0]];
-    row gathered[LANES];
+    pixel gathered[LANES];
     float of_gathered[LANES];
     if (!tile.same.c[position]) {
         for (int l = 0; l < LANES; ++l) {
             const int k = tile.order.data[position][l];
-            gathered[l] = *(const row*)tile.samples.data[k * LANES + l];
+            gathered[l] = *(const pixel*)tile.samples.data[k * LANES + l];
             of_gathered[l] = tile.opacities.data[k][l];
         }
         samples = gathered;
@@ -345,7 +335,7 @@ _BLEND = """
         through[l] -= shares[l];
         open |= through[l] > 0.0f;
     }
-    row* color = (row*)tile.color.data[0];
+    pixel* color = (pixel*)tile.color.data[0];
     for (int l = 0; l < LANES; ++l) color[l] = color[l] + samples[l] * shares[l];
     return open;
 """
@@ -367,13 +357,13 @@ _COMPARED = """
     }
 """
 _PULL_BACK = """
-    const row* g = (const row*)tile.slope.data[0];
+    const pixel* g = (const pixel*)tile.slope.data[0];
     float values[CAPACITY][LANES], behind[LANES] = {};  // v_k and s_k of kernels.py
     for (int p = tile.active - 1; p >= 0; --p) {
         float parts[LANES];
         for (int l = 0; l < LANES; ++l) {
             const int k = tile.order.data[p][l];
-            const row products = *(const row*)tile.samples.data[k * LANES + l] * g[l];
+            const pixel products = *(const pixel*)tile.samples.data[k * LANES + l] * g[l];
             values[p][l] = (products[0] + products[1]) + (products[2] + products[3]);
             parts[l] = tile.opacities.data[k][l];
         }
@@ -393,13 +383,13 @@ _PULL_BACK = """
         }
         for (int l = 0; l < LANES; ++l) {
             const int k = tile.order.data[p][l];
-            row* s = (row*)tile.samples.data[k * LANES + l];
-            row of_color = g[l];
+            pixel* s = (pixel*)tile.samples.data[k * LANES + l];
+            pixel of_color = g[l];
             if (own_colors) {
-                const row seen = *(const row*)tile.seen.data[l];
-                of_color = *(const row*)tile.linear.data[l] + (*s * seen[3] - seen) * (2.0f * weight);
+                const pixel seen = *(const pixel*)tile.seen.data[l];
+                of_color = *(const pixel*)tile.linear.data[l] + (*s * seen[3] - seen) * (2.0f * weight);
             }
-            row of_sample = of_color * shares[l];
+            pixel of_sample = of_color * shares[l];
             of_sample[3] = values[p][l] * tile.slopes.data[k][l];
             *s = of_sample;
         }
@@ -411,21 +401,21 @@ _SCATTER = """
         const auto& m = planes.data[base + id].to_texel.data;
         float of_u[LANES], of_v[LANES];
         for (int l = 0; l < LANES; ++l) {
-            const row g = *(const row*)tile.samples.data[k * LANES + l];
+            const pixel g = *(const pixel*)tile.samples.data[k * LANES + l];
             const int i = tile.place.data[k][l], j = i + width;
             float fx = tile.fx.data[k][l], fy = tile.fy.data[k][l];
             of_u[l] = of_v[l] = 0.0f;
             if (i == MISS || (g[3] == 0.0f && g[0] == 0.0f && g[1] == 0.0f && g[2] == 0.0f)) continue;
             if (i >= 0) {
-                const row right = g * fx, left = g - right, lower_right = right * fy, lower_left = left * fy;
-                ADD(i, left - lower_left);
-                ADD(i + 1, right - lower_right);
-                ADD(j, lower_left);
-                ADD(j + 1, lower_right);
+                const pixel right = g * fx, left = g - right, lower_right = right * fy, lower_left = left * fy;
+                add(i, left - lower_left);
+                add(i + 1, right - lower_right);
+                add(j, lower_left);
+                add(j + 1, lower_right);
                 if (moving) {
-                    const row *p = (const row*)(texels.data + i), *q = (const row*)(texels.data + j);
-                    const row by_u = ((p[1] - p[0]) * (1.0f - fy) + (q[1] - q[0]) * fy) * g;
-                    const row by_v = ((q[0] - p[0]) * (1.0f - fx) + (q[1] - p[1]) * fx) * g;
+                    const pixel *p = (const pixel*)(texels.data + i), *q = (const pixel*)(texels.data + j);
+                    const pixel by_u = ((p[1] - p[0]) * (1.0f - fy) + (q[1] - q[0]) * fy) * g;
+                    const pixel by_v = ((q[0] - p[0]) * (1.0f - fx) + (q[1] - p[1]) * fx) * g;
                     of_u[l] = (by_u[0] + by_u[1]) + (by_u[2] + by_u[3]);
                     of_v[l] = (by_v[0] + by_v[1]) + (by_v[2] + by_v[3]);
                 }
@@ -433,10 +423,10 @@ _SCATTER = """
                 const corners near = around(fx, fy, first, height, width);
                 float gains[4];
                 for (int c = 0; c < 4; ++c) {
-                    row part = g;
+                    pixel part = g;
                     if (!near.there[c]) part[3] = 0.0f;
-                    ADD(near.at[c], part * near.weights[c]);
-                    const row gain = *(const row*)(texels.data + near.at[c]) * part;
+                    add(near.at[c], part * near.weights[c]);
+                    const pixel gain = *(const pixel*)(texels.data + near.at[c]) * part;
                     gains[c] = (gain[0] + gain[1]) + (gain[2] + gain[3]);
                 }
                 fx -= floorf(fx);
@@ -448,7 +438,7 @@ _SCATTER = """
         if (!moving) continue;
         float sums[3][3] = {};  // of the derivatives by u / w, v / w and 1 / w, times the pixel's place in the tile
         for (int l = 0; l < LANES; ++l) {
-            const float right = (float)(l % COLUMNS), down = (float)(l / COLUMNS), x = (float)column + right, y = (float)row_ + down;
+            const float right = (float)(l % COLUMNS), down = (float)(l / COLUMNS), x = (float)column + right, y = (float)row + down;
             const float scale = ((of_u[l] == 0.0f) & (of_v[l] == 0.0f)) ? 0.0f : 1.0f / (m[2][0] * x + (m[2][1] * y + m[2][2]));
             const float u = (m[0][0] * x + (m[0][1] * y + m[0][2])) * scale, v = (m[1][0] * x + (m[1][1] * y + m[1][2])) * scale;
             const float by_u = of_u[l] * scale, by_v = of_v[l] * scale, by_w = -(u * by_u + v * by_v);
@@ -462,11 +452,10 @@ _SCATTER = """
             sums[2][1] += by_w * down;
             sums[2][2] += by_w;
         }
-        const double place[3] = {double(column), double(row_), 0.0};
+        const double place[3] = {double(column), double(row), 0.0};
         double* matrix = (double*)matrices.data + 9 * ((long long)line * count + id);
         for (int e = 0; e < 9; ++e) wp::atomic_add(matrix + e, double(sums[e / 3][e % 3]) + place[e % 3] * double(sums[e / 3][2]));
     }
-    #undef ADD
 """
 
 
@@ -530,14 +519,14 @@ def tiles(capacity: int, lanes: int) -> SimpleNamespace:
     def arrange(tile: wp.ref[Tile]):
         """Sort the layers of each pixel, front to back."""
 
-    @wp.func_native(prefix + _ROW + _CORNERS + _SAMPLE)
+    @wp.func_native(prefix + PIXEL + _CORNERS + _SAMPLE)
     def sample(
-        tile: wp.ref[Tile], position: int, shown: int, test: wp.vec4, planes: wp.array(dtype=Plane), base: int, column: int, row_: int,
+        tile: wp.ref[Tile], position: int, shown: int, test: wp.vec4, planes: wp.array(dtype=Plane), base: int, column: int, row: int,
         texels: wp.array(dtype=wp.vec4), occupied: wp.array(dtype=wp.uint8),
     ):  # fmt: skip
         """Filter the textures of the layers at a position, unless done before; with ``shown`` only of those that something shows of."""
 
-    @wp.func_native(prefix + _ROW + _BLEND)
+    @wp.func_native(prefix + PIXEL + _BLEND)
     def blend(tile: wp.ref[Tile], position: int, nested: int) -> bool:
         """Composite the layers at a position. Returns whether anything behind them can show."""
 
@@ -553,13 +542,13 @@ def tiles(capacity: int, lanes: int) -> SimpleNamespace:
     def compared(tile: wp.ref[Tile], lane: int, linear: wp.vec4, slope: wp.vec4, seen: wp.vec4):
         """Set the derivatives in a pixel and what the view has there."""
 
-    @wp.func_native(prefix + _ROW + _PULL_BACK)
+    @wp.func_native(prefix + PIXEL + _PULL_BACK)
     def pull_back(tile: wp.ref[Tile], nested: int, own_colors: int, weight: float):
         """Replace samples by the derivatives in them."""
 
-    @wp.func_native(prefix + _ROW + _CORNERS + _SCATTER)
+    @wp.func_native(prefix + PIXEL + _ADD + _CORNERS + _SCATTER)
     def scatter(
-        tile: wp.ref[Tile], planes: wp.array(dtype=Plane), base: int, column: int, row_: int, texels: wp.array(dtype=wp.vec4),
+        tile: wp.ref[Tile], planes: wp.array(dtype=Plane), base: int, column: int, row: int, texels: wp.array(dtype=wp.vec4),
         gradient: wp.array(dtype=wp.vec4), moving: bool, matrices: wp.array(dtype=wp.mat33d), line: int, count: int,
     ):  # fmt: skip
         """Add the derivatives in the samples to ``gradient`` and, if the planes are ``moving``, to ``matrices`` [lines, ``count``]."""

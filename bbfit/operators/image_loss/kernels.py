@@ -23,7 +23,7 @@ from bbfit.operators.launching import FLAGS
 LOSSES = {"l1": 1, "l2": 2, "backgrounds": 3}
 """Numbers of the losses in kernels; 0 is none."""
 L1, BACKGROUNDS = wp.constant(LOSSES["l1"]), wp.constant(LOSSES["backgrounds"])
-ROUNDING = wp.constant(5e-7)
+ROUNDING = 5e-7
 Pixels = wp.array(dtype=wp.vec4)
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
@@ -43,7 +43,7 @@ def premultiplied(packed: int, straight: int) -> wp.vec4:
 @wp.func
 def sign(x: float) -> float:
     """-1, 0 or 1; 0 for what may be the rounding error of a difference of values in [0, 1]. Warp's own sign of zero is 1."""
-    return wp.where(x > ROUNDING, 1.0, wp.where(x < -ROUNDING, -1.0, 0.0))
+    return wp.where(x > wp.static(ROUNDING), 1.0, wp.where(x < wp.static(-ROUNDING), -1.0, 0.0))
 
 
 @wp.func

@@ -26,10 +26,10 @@ def add_sharpness_gradient(render: Tensor, target: Tensor, weight: float, gradie
     views, height, width, _ = render.shape
     rows, columns = -(-height // BLOCK), -(-width // BLOCK)
     on = wp.device_from_torch(render.device)
-    excess = torch.empty(views, rows, columns, 2, 3, dtype=torch.float32, device=render.device)
+    excess = torch.empty(views, rows, columns, 2, 4, dtype=torch.float32, device=render.device)
     sums = torch.zeros(views, rows, dtype=torch.float32, device=render.device)
     pictures = [warp_array(picture, wp.vec4) for picture in (render, target, gradient)]
-    blocks, totals = warp_array(excess, wp.vec3), warp_array(sums, wp.float32)
+    blocks, totals = warp_array(excess, wp.vec4), warp_array(sums, wp.float32)
     terms = views * rows * columns * 3
     factor = weight * 2 / terms / BLOCK**2
     for kernel, (down, along, pixels), inputs, written in (

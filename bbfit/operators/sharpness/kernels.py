@@ -15,33 +15,80 @@ where B(i) is the block of pixel i. Over white dx/dc = 1 and dx/da = -1, so the 
 """
 
 # mypy: ignore-errors
-# ruff: noqa: UP018 - int(0) declares a variable of a kernel, 0 a constant.
 
 from __future__ import annotations
 
 import warp as wp
 
-from bbfit.operators.image_loss.kernels import sign
-from bbfit.operators.launching import FLAGS
-from bbfit.operators.sharpness.reference import BLOCK as BLOCK_VALUE
+from bbfit.operators.image_loss.kernels import ROUNDING
+from bbfit.operators.launching import FLAGS, PIXEL
+from bbfit.operators.sharpness.reference import BLOCK
 
-BLOCK = wp.constant(BLOCK_VALUE)
-Pictures, Excess = wp.array3d(dtype=wp.vec4), wp.array4d(dtype=wp.vec3)
+Pictures, Excess = wp.array3d(dtype=wp.vec4), wp.array4d(dtype=wp.vec4)
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
+_CODE = f"""{PIXEL}
+    constexpr int BLOCK = {BLOCK};
+    constexpr float ROUNDING = {ROUNDING!r}f;
+    const int height = render.shape[1], width = render.shape[2];
+    auto over_white = [](pixel d) {{ return d - pixel{{d[3], d[3], d[3], d[3]}}; }};  // of a difference; 0 in alpha
+    auto contrast = [&](pixel d) {{
+        pixel w = over_white(d);
+        for (int c = 0; c < 4; ++c) w[c] = fabsf(w[c]);
+        return w;
+    }};
+    auto signs = [&](pixel d) {{  // 0 for what may be rounding
+        pixel w = over_white(d);
+        for (int c = 0; c < 4; ++c) w[c] = w[c] > ROUNDING ? 1.0f : w[c] < -ROUNDING ? -1.0f : 0.0f;
+        return w;
+    }};
+"""
 
-@wp.func
-def over_white(c: wp.vec4) -> wp.vec3:
-    """A premultiplied color over white."""
-    through = 1.0 - c[3]
-    return wp.vec3(c[0] + through, c[1] + through, c[2] + through)
+
+@wp.func_native(f"""{_CODE}
+    const pixel none = {{0.0f, 0.0f, 0.0f, 0.0f}};
+    pixel across = none, down = none;
+    const int right = width < block * BLOCK + BLOCK ? width : block * BLOCK + BLOCK;
+    const int bottom = height < row * BLOCK + BLOCK ? height : row * BLOCK + BLOCK;
+    for (int y = row * BLOCK; y < bottom; ++y) {{
+        const long long start = (long long)(view * height + y) * width;
+        const pixel *a = (const pixel*)render.data + start, *b = (const pixel*)target.data + start;
+        const int below = y + 1 < height ? width : 0;  // 0: no difference
+        for (int x = block * BLOCK; x < right; ++x) {{
+            const int next = x + 1 < width;
+            across = across + (contrast(a[x + next] - a[x]) - contrast(b[x + next] - b[x]));
+            down = down + (contrast(a[x + below] - a[x]) - contrast(b[x + below] - b[x]));
+        }}
+    }}
+    pixel* to = (pixel*)excess.data + 2 * ((view * excess.shape[1] + row) * excess.shape[2] + block);
+    across = across * (1.0f / (BLOCK * BLOCK));
+    down = down * (1.0f / (BLOCK * BLOCK));
+    to[0] = across;
+    to[1] = down;
+    const pixel squares = across * across + down * down;
+    return squares[0] + squares[1] + squares[2];
+""")
+def measure_block(render: Pictures, target: Pictures, excess: Excess, view: int, row: int, block: int) -> float:
+    """Write e_B for rows and columns of a block; return the sum of their squares."""
 
 
-@wp.func
-def signs(d: wp.vec3) -> wp.vec3:
-    """Sign of every channel; 0 for what may be rounding."""
-    return wp.vec3(sign(d[0]), sign(d[1]), sign(d[2]))
+@wp.func_native(f"""{_CODE}
+    const pixel* a = (const pixel*)render.data + (long long)(view * height + y) * width;
+    pixel* to = (pixel*)gradient.data + (long long)(view * height + y) * width;
+    const pixel* blocks = (const pixel*)excess.data + 2LL * (view * excess.shape[1] + y / BLOCK) * excess.shape[2];
+    const pixel* upper = y % BLOCK || !y ? blocks : blocks - 2 * excess.shape[2];
+    const int below = y + 1 < height ? width : 0, above = y > 0 ? width : 0;  // 0: no difference
+    for (int x = begin; x < end; ++x) {{
+        const int block = 2 * (x / BLOCK), before = x > 0, left = 2 * ((x - before) / BLOCK), next = x + 1 < width;
+        pixel g = blocks[left] * signs(a[x] - a[x - before]) - blocks[block] * signs(a[x + next] - a[x]);
+        g = (g + upper[block + 1] * signs(a[x] - a[x - above]) - blocks[block + 1] * signs(a[x + below] - a[x])) * weight;
+        g[3] = -(g[0] + g[1] + g[2]);
+        to[x] = to[x] + g;
+    }}
+""")
+def add_gradient(render: Pictures, excess: Excess, gradient: Pictures, weight: float, view: int, y: int, begin: int, end: int):
+    """Add to the gradient of the pixels ``begin`` to ``end`` of a row."""
 
 
 @wp.kernel
@@ -51,31 +98,9 @@ def measure(first_row: int, run: int, rows: int, render: Pictures, target: Pictu
     tid, piece = wp.tid()
     view = (first_row + tid) // rows
     row = (first_row + tid) % rows
-    bottom = wp.min(row * BLOCK + BLOCK, render.shape[1])
-    total = float(0.0)
-    block = piece * run
-    while block < wp.min(piece * run + run, excess.shape[2]):
-        right = wp.min(block * BLOCK + BLOCK, render.shape[2])
-        across = wp.vec3()
-        down = wp.vec3()
-        y = row * BLOCK
-        while y < bottom:
-            x = block * BLOCK
-            while x < right:
-                a = over_white(render[view, y, x])
-                b = over_white(target[view, y, x])
-                if x + 1 < render.shape[2]:
-                    across += wp.abs(over_white(render[view, y, x + 1]) - a) - wp.abs(over_white(target[view, y, x + 1]) - b)
-                if y + 1 < render.shape[1]:
-                    down += wp.abs(over_white(render[view, y + 1, x]) - a) - wp.abs(over_white(target[view, y + 1, x]) - b)
-                x += 1
-            y += 1
-        across *= 1.0 / float(BLOCK * BLOCK)
-        down *= 1.0 / float(BLOCK * BLOCK)
-        excess[view, row, block, 0] = across
-        excess[view, row, block, 1] = down
-        total += wp.dot(across, across) + wp.dot(down, down)
-        block += 1
+    total = float(0.0)  # noqa: UP018 - declares a variable of the kernel
+    for block in range(piece * run, wp.min(piece * run + run, excess.shape[2])):
+        total += measure_block(render, target, excess, view, row, block)
     wp.atomic_add(sums, view, row, total)
 
 
@@ -86,18 +111,4 @@ def differentiate(first_row: int, run: int, height: int, weight: float, render: 
     tid, piece = wp.tid()
     view = (first_row + tid) // height
     y = (first_row + tid) % height
-    x = piece * run
-    while x < wp.min(piece * run + run, render.shape[2]):
-        here = over_white(render[view, y, x])
-        g = wp.vec3()
-        if x + 1 < render.shape[2]:
-            g -= wp.cw_mul(excess[view, y // BLOCK, x // BLOCK, 0], signs(over_white(render[view, y, x + 1]) - here))
-        if x > 0:
-            g += wp.cw_mul(excess[view, y // BLOCK, (x - 1) // BLOCK, 0], signs(here - over_white(render[view, y, x - 1])))
-        if y + 1 < height:
-            g -= wp.cw_mul(excess[view, y // BLOCK, x // BLOCK, 1], signs(over_white(render[view, y + 1, x]) - here))
-        if y > 0:
-            g += wp.cw_mul(excess[view, (y - 1) // BLOCK, x // BLOCK, 1], signs(here - over_white(render[view, y - 1, x])))
-        g *= weight
-        gradient[view, y, x] += wp.vec4(g[0], g[1], g[2], -(g[0] + g[1] + g[2]))
-        x += 1
+    add_gradient(render, excess, gradient, weight, view, y, piece * run, wp.min(piece * run + run, render.shape[2]))
