@@ -12,7 +12,7 @@ from torch import Tensor
 from bbfit.operators.adam.fused import AdamFused, rest_after
 from bbfit.operators.adam.reference import EPSILON
 from bbfit.operators.drawing.fused import occupancy
-from bbfit.operators.drawing.tile_kernels import BLOCK
+from bbfit.operators.drawing.tile_forward import BLOCK
 
 STEPS = 420
 BETAS = (0.9, 0.999)

@@ -12,7 +12,7 @@ from torch import Tensor
 from bbfit.operators.adam.kernels import texel_block, update_blocks
 from bbfit.operators.adam.reference import EPSILON, AdamReference
 from bbfit.operators.drawing.fused import occupancy
-from bbfit.operators.drawing.tile_kernels import BLOCK
+from bbfit.operators.drawing.tile_forward import BLOCK
 from bbfit.operators.launching import launch, warp_array
 
 # A first moment that has decayed to this share moves a texel by less than 1e-5 of a step in all.
@@ -29,7 +29,7 @@ def rest_after(beta1: float) -> int:
 @dataclass(frozen=True)
 class AdamFused(AdamReference):
     """As the reference, with all tensors in float32 and padded to P' texels, a multiple of
-    :data:`~bbfit.operators.drawing.tile_kernels.BLOCK`."""
+    :data:`~bbfit.operators.drawing.tile_forward.BLOCK`."""
 
     last: Tensor
     """Step in which each block last had a gradient, int32 [P' / BLOCK]."""

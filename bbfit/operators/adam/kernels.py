@@ -16,7 +16,7 @@ memory is read for blocks that some view shows, and not for all.
 
 import warp as wp
 
-from bbfit.operators.drawing.tile_kernels import BLOCK
+from bbfit.operators.drawing.tile_forward import BLOCK
 from bbfit.operators.launching import FLAGS
 
 texel_block = wp.types.vector(length=4 * BLOCK, dtype=wp.float32)

@@ -17,7 +17,8 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.drawing.compositing import STEEPEST
 from bbfit.operators.drawing.kernels import kernels
 from bbfit.operators.drawing.projection import Projection, project
-from bbfit.operators.drawing.tile_kernels import BLENDED, BLOCK, COVERAGE, HASHED, SMOOTH, Plane
+from bbfit.operators.drawing.tile_forward import BLENDED, BLOCK, COVERAGE, HASHED, SMOOTH
+from bbfit.operators.drawing.tile_kernels import Plane
 from bbfit.operators.image_loss.fused import PixelLoss
 from bbfit.operators.image_loss.kernels import LOSSES
 from bbfit.operators.launching import compile_for, in_parallel, pieces_of, struct_array, warp_array
@@ -128,7 +129,8 @@ def differentiate(
         compile_for(compiled.differentiate, on)
 
         def launch(view: int, number: int, begin: int, end: int) -> None:
-            wp.launch(compiled.differentiate, (number, end - begin, runs), [view, begin, *arguments], outputs, device=on)
+            lines = -(-(end - begin) // compiled.rows)
+            wp.launch(compiled.differentiate, (number, lines, runs), [view, begin // compiled.rows, *arguments], outputs, device=on)
 
         for phase in schedule(projection, device):
             in_parallel(launch, phase)
@@ -136,27 +138,28 @@ def differentiate(
 
 
 def schedule(projection: Projection, device: torch.device) -> list[list[tuple[int, int, int, int]]]:
-    """Phases of a backward pass, whose pieces run at the same time; a piece is a first view, a number of views, and a band of rows of tiles.
+    """Phases of a backward pass, whose pieces run at the same time; a piece is a first view, a number of views, and a band of rows,
+    which begins with a row of tiles.
 
     On a CPU bands of equal parity touch different texels: no two threads add to the same texel, and every sum has one order. CUDA adds
     atomically. Pictures are not cut into bands of fewer than ``projection.least_pixels``.
     """
-    rows = tile_rows(projection, device)
-    views, lines, width = len(projection), -(-projection.height // rows), projection.width
+    views, height, width, rows = len(projection), projection.height, projection.width, tile_rows(projection, device)
     if device.type == "cuda":
-        return [[(0, views, 0, lines)]]
+        return [[(0, views, 0, height)]]
     if projection.groups > 1:
         share = views // projection.groups
-        return [[(group * share, share, 0, lines) for group in range(projection.groups)]]
+        return [[(group * share, share, 0, height) for group in range(projection.groups)]]
     phases = list[list[tuple[int, int, int, int]]]()
     for view, apart in enumerate(projection.rows_apart.tolist()):
-        bands = pieces_of(lines, -(-max(apart, -(-projection.least_pixels // width)) // rows), MOST_BANDS)
+        lines = pieces_of(-(-height // rows), -(-max(apart, -(-projection.least_pixels // width)) // rows), MOST_BANDS)
+        bands = [(rows * begin, min(rows * end, height)) for begin, end in lines]
         if len(bands) > 3:
             phases += [[(view, 1, *band) for band in bands[parity::2]] for parity in (0, 1)]
         elif phases and len(phases[-1]) == 1:  # views that are not cut form one piece
-            phases[-1] = [(phases[-1][0][0], phases[-1][0][1] + 1, 0, lines)]
+            phases[-1] = [(phases[-1][0][0], phases[-1][0][1] + 1, 0, height)]
         else:
-            phases.append([(view, 1, 0, lines)])
+            phases.append([(view, 1, 0, height)])
     return phases
 
 

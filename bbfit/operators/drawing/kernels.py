@@ -34,7 +34,7 @@ CUDA. Layers are sorted per pixel. The backward kernel blends again instead of r
 """
 
 # mypy: ignore-errors
-# ruff: noqa: UP018 - bool(True) declares a variable of a kernel, True a constant.
+# ruff: noqa: UP018, RUF046 - int(0) declares a variable of a kernel, 0 a constant.
 
 from functools import cache
 from types import SimpleNamespace
@@ -42,10 +42,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from bbfit.operators.drawing.tile_kernels import Plane, tiles
-from bbfit.operators.image_loss.kernels import add_pixel_loss, premultiplied
 from bbfit.operators.launching import FLAGS
-
-OPAQUE = wp.constant(-(1 << 24))
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
@@ -56,7 +53,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
     even number on a CPU."""
     own = tiles(capacity, lanes)
     Tile, restart, meet, arrange, sample, blend = own.Tile, own.restart, own.meet, own.arrange, own.sample, own.blend
-    vacant, color_of, compared, pull_back, scatter = own.vacant, own.color_of, own.compared, own.pull_back, own.scatter
+    vacant, store, anything, compare, pull_back, scatter = own.vacant, own.store, own.anything, own.compare, own.pull_back, own.scatter
     columns, rows = own.columns, lanes // own.columns
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
@@ -86,13 +83,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
                 position += 1
                 if not blend(tile, position - 1, nested):
                     position = tile.active
-            lane = int(0)
-            while lane < lanes:
-                x = column + lane % columns
-                y = row + lane // columns
-                if x < image.shape[2] and y < image.shape[1]:
-                    image[view, y, x] = color_of(tile, lane)
-                lane += 1
+            store(tile, image, view, column, row)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
     def differentiate(
@@ -120,7 +111,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         """Add to ``texel_gradient`` [P] and, unless empty, to ``matrices`` [V * rows of tiles * N].
 
         The picture's gradient is ``image_gradient`` [V, H, W], unless empty, plus ``weight`` times that of the pixel loss against
-        ``target`` [V, H, W], unless empty. The loss is added to ``loss`` [V, rows of tiles]. ``own_colors`` fits colors to the target's own.
+        ``target`` [V, H, W], unless empty. The loss is added to ``loss`` [V, rows of tiles]. ``own_colors`` fits colors to the target's.
         """
         view, line, piece = wp.tid()
         view += first_view
@@ -128,57 +119,25 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         row = line * rows
         nested = int(test[3])
         total = float(0.0)
-        given_target = target.shape[0] != 0
-        given_gradient = image_gradient.shape[0] != 0
         tile = Tile()
         restart(tile, count)
         for column in range(piece * run, wp.min(piece * run + run, width), columns):
-            # Where picture and target are both empty there is neither a loss nor a gradient.
-            anything = bool(False)
-            lane = int(0)
-            while lane < lanes:
-                x = column + lane % columns
-                y = row + lane // columns
-                if x < width and y < height:
-                    if given_target:
-                        anything = anything or (target[view, y, x] & OPAQUE) != 0
-                    if given_gradient:
-                        g = image_gradient[view, y, x]
-                        anything = anything or g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0
-                lane += 1
             meet(tile, planes, view * count, column, row, orthographic, texels, texel_gradient)
-            if not anything:
-                anything = not vacant(tile, occupied)
-            if anything:
+            # Where picture and target are both empty there is neither a loss nor a gradient.
+            if anything(target, image_gradient, view, column, row, width, height) or not vacant(tile, occupied):
                 arrange(tile)
                 position = int(0)
                 while position < tile.active:
                     sample(tile, position, 0, test, planes, view * count, column, row, texels, occupied)
                     blend(tile, position, nested)
                     position += 1
-                lane = int(0)
-                while lane < lanes:
-                    x = column + lane % columns
-                    y = row + lane // columns
-                    linear = wp.vec4()
-                    slope = wp.vec4()
-                    seen = wp.vec4()
-                    if x < width and y < height:
-                        if given_gradient:
-                            linear = image_gradient[view, y, x]
-                            slope = linear
-                        if given_target:
-                            seen = premultiplied(target[view, y, x], straight)
-                            total, slope = add_pixel_loss(color_of(tile, lane) - seen, pixel_loss, weight, total, slope)
-                    linear[3] = 0.0
-                    compared(tile, lane, linear, slope, seen)
-                    lane += 1
+                total += compare(tile, target, image_gradient, view, column, row, width, height, straight, pixel_loss, weight)
                 pull_back(tile, nested, own_colors, weight)
                 scatter(
                     tile, planes, view * count, column, row, texels, texel_gradient,
                     matrices.shape[0] != 0, matrices, view * loss.shape[1] + line, count,
                 )  # fmt: skip
-        if given_target:
+        if target.shape[0] != 0:
             wp.atomic_add(loss, view, line, total)
 
     return SimpleNamespace(draw=draw, differentiate=differentiate, columns=columns, rows=rows)

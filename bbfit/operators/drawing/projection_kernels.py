@@ -23,9 +23,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from bbfit.operators.drawing.tile_kernels import Plane
 from bbfit.operators.drawing.projection import SLACK as SLACK_VALUE
 from bbfit.operators.drawing.reference import EDGE_ON as EDGE_ON_VALUE
+from bbfit.operators.drawing.tile_kernels import Plane
 from bbfit.operators.launching import FLAGS
 
 SLACK, EDGE_ON = wp.constant(wp.float64(SLACK_VALUE)), wp.constant(wp.float64(EDGE_ON_VALUE))

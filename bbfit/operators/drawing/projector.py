@@ -11,9 +11,9 @@ from torch import Tensor
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.operators.drawing.tile_kernels import Plane
 from bbfit.operators.drawing.projection import Projection, texture_table
 from bbfit.operators.drawing.projection_kernels import Lens, Rectangle, project_planes, pull_back
+from bbfit.operators.drawing.tile_kernels import Plane
 from bbfit.operators.launching import struct_array
 
 
