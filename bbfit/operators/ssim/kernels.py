@@ -37,15 +37,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from bbfit.operators.launching import FLAGS
+from bbfit.operators.launching import FLAGS, PIXEL
 from bbfit.operators.ssim.reference import RADIUS, SIGMA
 
 _WEIGHTS = [math.exp(-((tap - RADIUS) ** 2) / (2 * SIGMA**2)) for tap in range(2 * RADIUS + 1)]
 _WEIGHTS = [weight / sum(_WEIGHTS) for weight in _WEIGHTS]
-_taps = wp.types.vector(length=len(_WEIGHTS) + 1, dtype=wp.float32)
-TAPS = wp.constant(len(_WEIGHTS))
-UPPER, LOWER = wp.constant(_taps(*_WEIGHTS, 0.0)), wp.constant(_taps(0.0, *_WEIGHTS))
-"""Weights of the first and the second row of windows of a pair, over the twelve rows that the pair reads."""
 REACH = wp.constant(len(_WEIGHTS) - 1)
 """Number of pixels minus number of windows, along a row or a column."""
 PAIRS_REACH = len(_WEIGHTS) // 2
@@ -74,6 +70,74 @@ def within(extent: wp.vec2i, before: int, after: int, count: int, step: int):
     return wp.vec2i(begin - begin % step, wp.where(end > count - step, count, end))
 
 
+_CODE = f"""
+    constexpr int TAPS = {len(_WEIGHTS)};
+    constexpr float WEIGHTS[] = {{{", ".join(f"{weight!r}f" for weight in _WEIGHTS)}}};
+    auto at = [](const auto& array, int first, int second, int x) {{
+        return (pixel*)((char*)array.data + first * (long long)array.strides[0] + second * (long long)array.strides[1]) + x;
+    }};
+"""
+# Element x of a row begins at its pixel x, so the next vector of pixels is STEP elements further.
+_BLUR_COLUMNS = """
+    const int bottom = a.shape[1] - 1;
+    const float *p[TAPS + 1], *q[TAPS + 1];
+    for (int k = 0; k <= TAPS; ++k) {
+        p[k] = (const float*)at(a, view, y + k < bottom ? y + k : bottom, 0);
+        q[k] = (const float*)at(b, view, y + k < bottom ? y + k : bottom, 0);
+    }
+    for (int i = thread; i < (end - begin + STEP - 1) / STEP; i += threads) {
+        const int x = begin + STEP * i < end - STEP ? begin + STEP * i : end - STEP;
+        pixel upper[4] = {}, lower[4] = {};
+        for (int k = 0; k <= TAPS; ++k) {
+            const pixel u = *(const pixel*)(p[k] + 4 * x), v = *(const pixel*)(q[k] + 4 * x), s = u + v, d = u - v;
+            const pixel maps[4] = {s, d, s * s, d * d};
+            for (int m = 0; m < 4; ++m) {
+                if (k < TAPS) upper[m] = upper[m] + maps[m] * WEIGHTS[k];
+                if (k > 0) lower[m] = lower[m] + maps[m] * WEIGHTS[k - 1];
+            }
+        }
+        for (int m = 0; m < 4; ++m) {
+            *(pixel*)((float*)at(blurred, m, row, 0) + 4 * x) = upper[m];
+            *(pixel*)((float*)at(blurred, m, row + 1, 0) + 4 * x) = lower[m];
+        }
+    }
+"""
+_SPREAD_COLUMNS = """
+    const int below = y + 1 < a.shape[1] ? y + 1 : y, width = a.shape[2] + STEP - 1;
+    const float* maps[3][TAPS + 1];
+    for (int k = 0; k <= TAPS; ++k) {
+        for (int m = 0; m < 3; ++m) maps[m][k] = (const float*)at(spread, m, (y + k) % spread.shape[1], 0);
+    }
+    const float *p = (const float*)at(a, view, y, 0), *q = (const float*)at(b, view, y, 0);
+    const float *p_below = (const float*)at(a, view, below, 0), *q_below = (const float*)at(b, view, below, 0);
+    float *to = (float*)at(gradient, view, y, 0), *to_below = (float*)at(gradient, view, below, 0);
+    for (int i = thread; i < (end - begin + STEP - 1) / STEP; i += threads) {
+        const int x = 4 * (begin + STEP * i < end - STEP ? begin + STEP * i : end - STEP);
+        pixel upper[3] = {}, lower[3] = {};
+        for (int k = 0; k <= TAPS; ++k) {
+            for (int m = 0; m < 3; ++m) {
+                const pixel of = *(const pixel*)(maps[m][k] + x);
+                if (k < TAPS) upper[m] = upper[m] + of * WEIGHTS[k];
+                if (k > 0) lower[m] = lower[m] + of * WEIGHTS[k - 1];
+            }
+        }
+        const pixel u = *(const pixel*)(p + x), v = *(const pixel*)(q + x);
+        const pixel u_below = *(const pixel*)(p_below + x), v_below = *(const pixel*)(q_below + x);
+        if (below > y) {
+            const pixel sum = (u_below + v_below) * lower[1], difference = (u_below - v_below) * lower[2];
+            *(pixel*)(to_below + x) = (lower[0] + sum + difference) * scale;
+        }
+        *(pixel*)(to + x) = (upper[0] + (u + v) * upper[1] + (u - v) * upper[2]) * scale;
+    }
+    const pixel none = {};
+    for (int i = thread; i < begin / STEP; i += threads) *(pixel*)(to + 4 * STEP * i) = *(pixel*)(to_below + 4 * STEP * i) = none;
+    for (int i = thread; i < (width - end + STEP - 1) / STEP; i += threads) {
+        const int x = 4 * (end + STEP * i < width - STEP ? end + STEP * i : width - STEP);
+        *(pixel*)(to + x) = *(pixel*)(to_below + x) = none;
+    }
+"""
+
+
 @cache
 def kernels(pixels: int = 1) -> SimpleNamespace:
     """Kernels that process ``pixels`` pixels of a row at a time: 1 on CUDA, 4 on a CPU.
@@ -86,48 +150,35 @@ def kernels(pixels: int = 1) -> SimpleNamespace:
     bits = wp.types.vector(length=lanes, dtype=wp.int32)
     step = wp.constant(pixels)
     one, c1, c2 = (wp.constant(vector(value)) for value in (1.0, 2 * 0.01**2, 2 * 0.03**2))
+    code = (PIXEL if pixels == 1 else "typedef float pixel __attribute__((vector_size(64), aligned(4), may_alias));") + _CODE
+    code += f"constexpr int STEP = {pixels};"
+    # Aligned loads and shuffles: most loads that begin at any pixel would cross cache lines.
+    taps = range(len(_WEIGHTS))
+    moved = [
+        f"__builtin_shufflevector(v[{k // 4}], v[{k // 4 + 1}], {', '.join(str(k % 4 * 4 + c) for c in range(lanes))})"
+        if pixels > 1
+        else f"v[{k}]"
+        for k in taps
+    ]
+    blur_along = f"""
+    const pixel* v = (const pixel*)((const float*)at(rows, map, row, 0) + 4 * x);
+    pixel sum = {" + ".join(f"{moved[k]} * WEIGHTS[{k}]" for k in taps)};
+    wp::vec_t<{lanes}, wp::float32> blurred;
+    *(pixel*)blurred.c = sum;
+    return blurred;
+"""
     options = {"module": "unique", "enable_backward": False, "module_options": {"cpu_compiler_flags": FLAGS}}
 
-    @wp.func
+    @wp.func_native(code + blur_along)
+    def blur_row(rows: wp.array3d(dtype=vector), map: int, row: int, x: int) -> vector:
+        """Blur a map along a row, for the windows that begin at x and the pixels to its right."""
+
+    @wp.func_native(code + _BLUR_COLUMNS)
     def blur_columns(
         begin: int, end: int, thread: int, threads: int, view: int, y: int, row: int,
         a: wp.array3d(dtype=vector), b: wp.array3d(dtype=vector), blurred: wp.array3d(dtype=vector),
     ):  # fmt: skip
         """Blur s, d, s^2 and d^2 along columns, for the windows that begin in rows y and y + 1."""
-        bottom = a.shape[1] - 1
-        for i in range(thread, (end - begin + step - 1) // step, threads):
-            x = wp.min(begin + step * i, end - step)
-            upper_s = vector()
-            upper_d = vector()
-            upper_ss = vector()
-            upper_dd = vector()
-            lower_s = vector()
-            lower_d = vector()
-            lower_ss = vector()
-            lower_dd = vector()
-            for k in range(TAPS + 1):
-                p = a[view, wp.min(y + k, bottom), x]
-                q = b[view, wp.min(y + k, bottom), x]
-                s = p + q
-                d = p - q
-                ss = wp.cw_mul(s, s)
-                dd = wp.cw_mul(d, d)
-                upper_s += UPPER[k] * s
-                upper_d += UPPER[k] * d
-                upper_ss += UPPER[k] * ss
-                upper_dd += UPPER[k] * dd
-                lower_s += LOWER[k] * s
-                lower_d += LOWER[k] * d
-                lower_ss += LOWER[k] * ss
-                lower_dd += LOWER[k] * dd
-            blurred[0, row, x] = upper_s
-            blurred[1, row, x] = upper_d
-            blurred[2, row, x] = upper_ss
-            blurred[3, row, x] = upper_dd
-            blurred[0, row + 1, x] = lower_s
-            blurred[1, row + 1, x] = lower_d
-            blurred[2, row + 1, x] = lower_ss
-            blurred[3, row + 1, x] = lower_dd
 
     @wp.func
     def compare(
@@ -138,15 +189,10 @@ def kernels(pixels: int = 1) -> SimpleNamespace:
         total = vector()
         for i in range(thread, (end - begin + step - 1) // step, threads):
             x = wp.min(begin + step * i, end - step)
-            mean_s = vector()
-            mean_d = vector()
-            mean_ss = vector()
-            mean_dd = vector()
-            for k in range(TAPS):
-                mean_s += UPPER[k] * blurred[0, row, x + k]
-                mean_d += UPPER[k] * blurred[1, row, x + k]
-                mean_ss += UPPER[k] * blurred[2, row, x + k]
-                mean_dd += UPPER[k] * blurred[3, row, x + k]
+            mean_s = blur_row(blurred, 0, row, x)
+            mean_d = blur_row(blurred, 1, row, x)
+            mean_ss = blur_row(blurred, 2, row, x)
+            mean_dd = blur_row(blurred, 3, row, x)
             square_s = wp.cw_mul(mean_s, mean_s)
             square_d = wp.cw_mul(mean_d, mean_d)
             variance_s = mean_ss - square_s + c2
@@ -183,59 +229,18 @@ def kernels(pixels: int = 1) -> SimpleNamespace:
         """Adjoint of the blur along a row: a blur of the row with REACH zeros on both sides. Row -1 gives zero."""
         for i in range(thread, (end - begin + step - 1) // step, threads):
             x = wp.min(begin + step * i, end - step)
-            of_s = vector()
-            of_ss = vector()
-            of_dd = vector()
-            if row >= 0:
-                for k in range(TAPS):
-                    of_s += UPPER[k] * slopes[0, row, x + k]
-                    of_ss += UPPER[k] * slopes[1, row, x + k]
-                    of_dd += UPPER[k] * slopes[2, row, x + k]
-            spread[0, to_row, x] = of_s
-            spread[1, to_row, x] = of_ss
-            spread[2, to_row, x] = of_dd
+            for m in range(3):
+                if row >= 0:
+                    spread[m, to_row, x] = blur_row(slopes, m, row, x)
+                else:
+                    spread[m, to_row, x] = vector()
 
-    @wp.func
+    @wp.func_native(code + _SPREAD_COLUMNS)
     def spread_columns(
         begin: int, end: int, thread: int, threads: int, view: int, y: int, scale: float,
         a: wp.array3d(dtype=vector), b: wp.array3d(dtype=vector), spread: wp.array3d(dtype=vector), gradient: wp.array3d(dtype=vector),
     ):  # fmt: skip
         """Adjoint of the blur along columns; writes the gradient in rows y and y + 1 of ``a``, zero outside the range."""
-        below = wp.min(y + 1, a.shape[1] - 1)
-        for i in range(thread, (end - begin + step - 1) // step, threads):
-            x = wp.min(begin + step * i, end - step)
-            upper_s = vector()
-            upper_ss = vector()
-            upper_dd = vector()
-            lower_s = vector()
-            lower_ss = vector()
-            lower_dd = vector()
-            for k in range(TAPS + 1):
-                row = (y + k) % spread.shape[1]
-                of_s = spread[0, row, x]
-                of_ss = spread[1, row, x]
-                of_dd = spread[2, row, x]
-                upper_s += UPPER[k] * of_s
-                upper_ss += UPPER[k] * of_ss
-                upper_dd += UPPER[k] * of_dd
-                lower_s += LOWER[k] * of_s
-                lower_ss += LOWER[k] * of_ss
-                lower_dd += LOWER[k] * of_dd
-            if below > y:
-                p = a[view, below, x]
-                q = b[view, below, x]
-                gradient[view, below, x] = scale * (lower_s + wp.cw_mul(p + q, lower_ss) + wp.cw_mul(p - q, lower_dd))
-            p = a[view, y, x]
-            q = b[view, y, x]
-            gradient[view, y, x] = scale * (upper_s + wp.cw_mul(p + q, upper_ss) + wp.cw_mul(p - q, upper_dd))
-        width = a.shape[2] + step - 1
-        for i in range(thread, begin // step, threads):
-            gradient[view, y, step * i] = vector()
-            gradient[view, below, step * i] = vector()
-        for i in range(thread, (width - end + step - 1) // step, threads):
-            x = wp.min(end + step * i, width - step)
-            gradient[view, y, x] = vector()
-            gradient[view, below, x] = vector()
 
     @wp.kernel(**options)
     def sweep(
