@@ -31,11 +31,14 @@ PIXEL = """
         CUDA_CALLABLE pixel operator*(pixel o) const { return {c[0] * o.c[0], c[1] * o.c[1], c[2] * o.c[2], c[3] * o.c[3]}; }
         CUDA_CALLABLE pixel operator*(float s) const { return {c[0] * s, c[1] * s, c[2] * s, c[3] * s}; }
     };
+    #define ONE_BY_ONE
 #else
+    #define ONE_BY_ONE _Pragma("clang loop vectorize(disable)")
     typedef float pixel __attribute__((vector_size(16), aligned(4), may_alias));
 #endif
 """
-"""C++ of native functions: the type of a pixel or texel in a register. Without it clang splits sums of pixels into single floats."""
+"""C++ of native functions: the type of a pixel or texel in a register. Without it clang splits sums of pixels into single floats. Before loops
+over pixels, ``ONE_BY_ONE`` keeps clang from gathering the red of many."""
 LEAST_PIXELS = 1 << 14
 """Least pixels in a piece for a CPU thread."""
 

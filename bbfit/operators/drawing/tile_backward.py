@@ -21,68 +21,83 @@ VACANT = """
     return true;
 """
 ANYTHING = """
+    const int across = width - column < COLUMNS ? width - column : COLUMNS;
     int bits = 0;
-    for (int l = 0; l < LANES; ++l) {
-        const int x = column + l % COLUMNS, y = row + l / COLUMNS;
-        if (x >= width || y >= height) continue;
-        const long long i = ((long long)view * height + y) * width + x;
-        if (target.data) bits |= target.data[i] & 0xff000000;
-        for (int c = 0; c < 4 && gradient.data; ++c) bits |= ((const int*)gradient.data)[4 * i + c] & 0x7fffffff;
+    for (int y = row; y < row + LANES / COLUMNS && y < height; ++y) {
+        const long long start = ((long long)view * height + y) * width + column;
+        if (target.data) {
+            for (int x = 0; x < across; ++x) bits |= target.data[start + x] & 0xff000000;
+        }
+        if (gradient.data) {
+            const int* numbers = (const int*)(gradient.data + start);
+            for (int c = 0; c < 4 * across; ++c) bits |= numbers[c] & 0x7fffffff;
+        }
     }
     return bits;
 """
 COMPARE = """
+    const int across = width - column < COLUMNS ? width - column : COLUMNS;
+    const pixel none = {0.0f, 0.0f, 0.0f, 0.0f};
     float total = 0.0f;
-    for (int l = 0; l < LANES; ++l) {
-        const int x = column + l % COLUMNS, y = row + l / COLUMNS;
-        const long long i = ((long long)view * height + y) * width + x;
-        const bool inside = x < width && y < height;
-        pixel linear = {0.0f, 0.0f, 0.0f, 0.0f}, seen = linear;
-        if (inside && gradient.data) linear = ((const pixel*)gradient.data)[i];
-        pixel slope = linear;
-        if (inside && target.data) {
-            seen = premultiplied(target.data[i], straight);
-            total += pixel_loss(*(const pixel*)tile.color.data[l] - seen, loss, weight, slope);
+    for (int r = 0; r < LANES / COLUMNS; ++r) {
+        const int y = row + r, shown = y < height ? across : 0;
+        const long long start = ((long long)view * height + y) * width + column;
+        const pixel* color = (const pixel*)tile.color.data[r * COLUMNS];
+        pixel* linear = (pixel*)tile.linear.data[r * COLUMNS];
+        pixel* slope = (pixel*)tile.slope.data[r * COLUMNS];
+        pixel* seen = (pixel*)tile.seen.data[r * COLUMNS];
+        ONE_BY_ONE
+        for (int x = 0; x < COLUMNS; ++x) linear[x] = slope[x] = seen[x] = none;
+        if (gradient.data) {
+            ONE_BY_ONE
+            for (int x = 0; x < shown; ++x) linear[x] = slope[x] = ((const pixel*)gradient.data)[start + x];
         }
-        *(pixel*)tile.linear.data[l] = linear;
-        *(pixel*)tile.slope.data[l] = slope;
-        *(pixel*)tile.seen.data[l] = seen;
+        if (target.data) {
+            ONE_BY_ONE
+            for (int x = 0; x < shown; ++x) seen[x] = premultiplied(target.data[start + x], straight);
+            ONE_BY_ONE
+            for (int x = 0; x < shown; ++x) total += pixel_loss(color[x] - seen[x], loss, weight, slope[x]);
+        }
     }
     return total;
 """
 PULL_BACK = """
-    const pixel* g = (const pixel*)tile.slope.data[0];
+    const pixel *g = (const pixel*)tile.slope.data[0], *seen = (const pixel*)tile.seen.data[0], *linear = (const pixel*)tile.linear.data[0];
     float values[CAPACITY][LANES], behind[LANES] = {};  // v_k and s_k of kernels.py
     for (int p = tile.active - 1; p >= 0; --p) {
-        float parts[LANES];
-        for (int l = 0; l < LANES; ++l) {
-            const int k = tile.order.data[p][l];
-            const pixel products = *(const pixel*)tile.samples.data[k * LANES + l] * g[l];
-            values[p][l] = (products[0] + products[1]) + (products[2] + products[3]);
-            parts[l] = tile.opacities.data[k][l];
+        float parts[LANES], raw[LANES];
+        if (tile.same.c[p]) {
+            const int k = tile.order.data[p][0];
+            const pixel* samples = (const pixel*)tile.samples.data[k * LANES];
+            ONE_BY_ONE
+            for (int l = 0; l < LANES; ++l) {
+                const pixel products = samples[l] * g[l];
+                raw[l] = (products[0] + products[1]) + (products[2] + products[3]);
+            }
+            for (int l = 0; l < LANES; ++l) parts[l] = tile.opacities.data[k][l];
+        } else {
+            ONE_BY_ONE
+            for (int l = 0; l < LANES; ++l) {
+                const int k = tile.order.data[p][l];
+                const pixel products = *(const pixel*)tile.samples.data[k * LANES + l] * g[l];
+                raw[l] = (products[0] + products[1]) + (products[2] + products[3]);
+                parts[l] = tile.opacities.data[k][l];
+            }
         }
-        if (nested) {
-            for (int l = 0; l < LANES; ++l) parts[l] = tile.shares.data[p][l] > 0.0f ? 1.0f : 0.0f;
-        }
         for (int l = 0; l < LANES; ++l) {
-            values[p][l] -= behind[l];
-            behind[l] += parts[l] * values[p][l];
+            const float shown = tile.shares.data[p][l] > 0.0f ? 1.0f : 0.0f, value = raw[l] - behind[l];
+            values[p][l] = value * (nested ? shown : tile.exposed.data[p][l]);
+            behind[l] += (nested ? shown : parts[l]) * value;
         }
     }
     for (int p = 0; p < tile.active; ++p) {
-        const float *shares = tile.shares.data[p], *exposed = tile.exposed.data[p];
+        const float* shares = tile.shares.data[p];
+        ONE_BY_ONE
         for (int l = 0; l < LANES; ++l) {
-            const float in_front = nested ? (shares[l] > 0.0f ? 1.0f : 0.0f) : exposed[l];
-            values[p][l] *= in_front;
-        }
-        for (int l = 0; l < LANES; ++l) {
-            const int k = tile.order.data[p][l];
+            const int k = tile.order.data[p][tile.same.c[p] ? 0 : l];
             pixel* s = (pixel*)tile.samples.data[k * LANES + l];
             pixel of_color = g[l];
-            if (own_colors) {
-                const pixel seen = *(const pixel*)tile.seen.data[l];
-                of_color = *(const pixel*)tile.linear.data[l] + (*s * seen[3] - seen) * (2.0f * weight);
-            }
+            if (own_colors) of_color = linear[l] + (*s * seen[l][3] - seen[l]) * (2.0f * weight);
             pixel of_sample = of_color * shares[l];
             of_sample[3] = values[p][l] * tile.slopes.data[k][l];
             *s = of_sample;
@@ -94,6 +109,7 @@ SCATTER = """
         const int first = tile.firsts.c[k], height = tile.heights.c[k], width = tile.widths.c[k], id = tile.ids.c[k];
         const auto& m = planes.data[base + id].to_texel.data;
         float of_u[LANES], of_v[LANES];
+        ONE_BY_ONE
         for (int l = 0; l < LANES; ++l) {
             const pixel g = *(const pixel*)tile.samples.data[k * LANES + l];
             const int i = tile.place.data[k][l], j = i + width;

@@ -193,12 +193,14 @@ SAMPLE = """
                 }
             }
             if (empty) {
+                ONE_BY_ONE
                 for (int l = begin; l < begin + COLUMNS; ++l) {
                     samples[l] = pixel{0.0f, 0.0f, 0.0f, 1.0f};
                     alpha[l] = 0.0f;
                 }
                 continue;
             }
+            ONE_BY_ONE
             for (int l = begin; l < begin + COLUMNS; ++l) {
                 pixel s = {0.0f, 0.0f, 0.0f, 0.0f};
                 if (inside || place[l] >= 0) {
@@ -269,6 +271,7 @@ BLEND = """
     pixel gathered[LANES];
     float of_gathered[LANES];
     if (!tile.same.c[position]) {
+        ONE_BY_ONE
         for (int l = 0; l < LANES; ++l) {
             const int k = tile.order.data[position][l];
             gathered[l] = *(const pixel*)tile.samples.data[k * LANES + l];
@@ -293,10 +296,12 @@ BLEND = """
         open |= through[l] > 0.0f;
     }
     pixel* color = (pixel*)tile.color.data[0];
+    ONE_BY_ONE
     for (int l = 0; l < LANES; ++l) color[l] = color[l] + samples[l] * shares[l];
     return open;
 """
 STORE = """
+    ONE_BY_ONE
     for (int l = 0; l < LANES; ++l) {
         const int x = column + l % COLUMNS, y = row + l / COLUMNS;
         if (x >= image.shape[2] || y >= image.shape[1]) continue;

@@ -61,6 +61,7 @@ COMPARISON = f"""{PIXEL}
 
 
 @wp.func_native(f"""{COMPARISON}
+    ONE_BY_ONE
     for (int i = begin; i < end; ++i) ((pixel*)image.data)[i] = premultiplied(packed.data[i], straight);
 """)
 def unpack_run(packed: wp.array(dtype=wp.int32), straight: int, image: Pixels, begin: int, end: int):

@@ -79,6 +79,7 @@ def measure_block(render: Pictures, target: Pictures, excess: Excess, view: int,
     const pixel* blocks = (const pixel*)excess.data + 2LL * (view * excess.shape[1] + y / BLOCK) * excess.shape[2];
     const pixel* upper = y % BLOCK || !y ? blocks : blocks - 2 * excess.shape[2];
     const int below = y + 1 < height ? width : 0, above = y > 0 ? width : 0;  // 0: no difference
+    ONE_BY_ONE
     for (int x = begin; x < end; ++x) {{
         const int block = 2 * (x / BLOCK), before = x > 0, left = 2 * ((x - before) / BLOCK), next = x + 1 < width;
         pixel g = blocks[left] * signs(a[x] - a[x - before]) - blocks[block] * signs(a[x + next] - a[x]);
