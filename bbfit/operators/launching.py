@@ -37,8 +37,8 @@ PIXEL = """
     typedef float pixel __attribute__((vector_size(16), aligned(4), may_alias));
 #endif
 """
-"""C++ of native functions: the type of a pixel or texel in a register. Without it clang splits sums of pixels into single floats. Before loops
-over pixels, ``ONE_BY_ONE`` keeps clang from gathering the red of many."""
+"""C++ of native functions: the type of a pixel or texel in a register. Without it clang splits sums of pixels into single floats.
+``ONE_BY_ONE`` before a loop over pixels keeps clang from gathering one channel of many."""
 LEAST_PIXELS = 1 << 14
 """Least pixels in a piece for a CPU thread."""
 
