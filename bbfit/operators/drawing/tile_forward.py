@@ -241,10 +241,18 @@ SAMPLE = """
                     const float u = (m[0][0] * x + (m[0][1] * y + m[0][2])) / w, v = (m[1][0] * x + (m[1][1] * y + m[1][2])) / w;
                     return w > 0.0f && u > -1.0f && u < (float)width && v > -1.0f && v < (float)height ? beyond(u, v)[3] : 0.0f;
                 };
+                float contrasts[LANES];
+                if (LANES == 1) {
+                    contrasts[0] = fabsf(alpha_at(column ^ 1, row) - alpha[0]) + fabsf(alpha_at(column, row ^ 1) - alpha[0]);
+                }
+                for (int l = 0; l < LANES / 2; ++l) contrasts[2 * l] = contrasts[2 * l + 1] = fabsf(alpha[2 * l] - alpha[2 * l + 1]);
+                for (int l = 0; l < LANES / 2; ++l) {
+                    const float down = fabsf(alpha[l] - alpha[l + COLUMNS]);
+                    contrasts[l] += down;
+                    contrasts[l + COLUMNS] += down;
+                }
                 for (int l = 0; l < LANES; ++l) {
-                    const float across = LANES > 1 ? alpha[l ^ 1] : alpha_at(column ^ 1, row);
-                    const float down = LANES > 1 ? alpha[l ^ COLUMNS] : alpha_at(column, row ^ 1);
-                    const float contrast = fabsf(across - alpha[l]) + fabsf(down - alpha[l]);
+                    const float contrast = contrasts[l];
                     const float steep = 1.0f / (contrast > LEAST_CONTRAST ? contrast : LEAST_CONTRAST);
                     const float rate = ((rates[l] == 0.0f) | (steep < rates[l])) ? steep : rates[l];
                     rates[l] = rate;
