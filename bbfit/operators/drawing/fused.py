@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from queue import SimpleQueue
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,7 +25,7 @@ from bbfit.operators.drawing.tile_forward import BLENDED, BLOCK, COVERAGE, HASHE
 from bbfit.operators.drawing.tile_kernels import Plane
 from bbfit.operators.image_loss.fused import PixelLoss
 from bbfit.operators.image_loss.kernels import LOSSES
-from bbfit.operators.launching import compile_for, in_parallel, pieces_of, struct_array, warp_array
+from bbfit.operators.launching import compile_for, in_parallel, pieces_of, struct_array, warp_array, worker_count
 
 # Most bands of rows that a picture is cut into. Independent of the number of threads, which must not change the order of sums.
 MOST_BANDS = 32
@@ -82,8 +86,11 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None,
     device, outputs = wp.device_from_torch(texels.device), [warp_array(image, wp.vec4)]
     compile_for(compiled.draw, device)
 
+    with_tile = _scratch(compiled, texels.device)
+
     def launch(begin: int, end: int) -> None:
-        wp.launch(compiled.draw, (views, end - begin, runs), [begin, *arguments], outputs, device=device)
+        with with_tile() as tile:
+            wp.launch(compiled.draw, (views, end - begin, runs), [*tile, begin, *arguments], outputs, device=device)
 
     lines = -(-height // compiled.rows)
     least = -(-projection.least_pixels // (width * views * compiled.rows))
@@ -120,17 +127,20 @@ def differentiate(
         nothing = torch.zeros(0, 0, 0, 4, dtype=torch.float32, device=device)
         target = loss.target if loss else nothing.to(torch.uint8)
         compiled, runs, arguments = _prepared(texels, projection, occupied)
-        arguments += [projection.width, projection.height]
+        arguments += [projection.height]
         arguments.append(warp_array(nothing if image_gradient is None else image_gradient, wp.vec4))
         arguments.append(warp_array(target.view(torch.int32).squeeze(-1), wp.int32))
         arguments += [int(loss.straight), LOSSES[loss.kind], loss.weight, int(loss.own_colors)] if loss else [0, 0, 0.0, 0]
-        outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices.view(-1, 3, 3), wp.mat33d)]
+        outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices.view(-1, 3, 3), wp.mat33d), lines]
         on = wp.device_from_torch(device)
         compile_for(compiled.differentiate, on)
 
+        with_tile = _scratch(compiled, device)
+
         def launch(view: int, number: int, begin: int, end: int) -> None:
-            lines = -(-(end - begin) // compiled.rows)
-            wp.launch(compiled.differentiate, (number, lines, runs), [view, begin // compiled.rows, *arguments], outputs, device=on)
+            size, first = (number, -(-(end - begin) // compiled.rows), runs), begin // compiled.rows
+            with with_tile() as tile:
+                wp.launch(compiled.differentiate, size, [*tile, view, first, *arguments], outputs, device=on)
 
         for phase in schedule(projection, device):
             in_parallel(launch, phase)
@@ -168,6 +178,25 @@ def tile_rows(projection: Projection, device: torch.device) -> int:
     return 1 if device.type == "cuda" or projection.lanes == 1 else 2
 
 
+def _scratch(compiled: SimpleNamespace, device: torch.device) -> Callable[[], AbstractContextManager[list[Any]]]:
+    """A context that lends a tile's memory to a launch, as the first arguments of both kernels. On CUDA every thread has its own."""
+    workers, words = (0, 1) if device.type == "cuda" else (worker_count(), ctypes.sizeof(compiled.Tile.ctype) // 4)
+    memory = struct_array(torch.empty(workers, words, dtype=torch.int32, device=device), compiled.Tile)
+    spare: SimpleQueue[int] = SimpleQueue()
+    for worker in range(max(workers, 1)):
+        spare.put(worker)
+
+    @contextmanager
+    def lent() -> Iterator[list[Any]]:
+        worker = spare.get()
+        try:
+            yield [worker, memory]
+        finally:
+            spare.put(worker)
+
+    return lent
+
+
 def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -> tuple[SimpleNamespace, int, list[Any]]:
     """Compiled kernels, the number of threads for a row of tiles, and the arguments that both kernels begin with after their offsets."""
     lanes = 1 if texels.is_cuda else projection.lanes
@@ -176,7 +205,7 @@ def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -
     numbers = [projection.to_texel.detach().flatten(2), projection.nearness]
     planes = torch.cat([*(part.contiguous().view(torch.int32) for part in numbers), projection.textures, projection.boxes], -1)
     occupied = occupancy(texels.detach()) if occupied is None else occupied
-    arguments = [run, int(projection.orthographic), projection.count, _test(projection.alpha)]
+    arguments = [run, projection.width, int(projection.orthographic), projection.count, _test(projection.alpha)]
     arguments += [struct_array(planes.flatten(0, 1), Plane), warp_array(texels, wp.vec4), warp_array(occupied, wp.uint8)]
     return compiled, -(-projection.width // run), arguments
 

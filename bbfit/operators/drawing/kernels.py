@@ -41,8 +41,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from bbfit.operators.drawing.tile_forward import SPAN as SPAN_VALUE
 from bbfit.operators.drawing.tile_kernels import Plane, tiles
 from bbfit.operators.launching import FLAGS
+
+SPAN = wp.constant(SPAN_VALUE)
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
@@ -52,14 +55,72 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
     """The kernels ``draw`` and ``differentiate``, compiled for at most ``capacity`` billboards and tiles of ``lanes`` pixels: 1 on CUDA, an
     even number on a CPU."""
     own = tiles(capacity, lanes)
-    Tile, restart, meet, arrange, sample, blend = own.Tile, own.restart, own.meet, own.arrange, own.sample, own.blend
+    Tile, restart, narrow, meet, arrange, sample, blend = own.Tile, own.restart, own.narrow, own.meet, own.arrange, own.sample, own.blend
     vacant, store, anything, compare, pull_back, scatter = own.vacant, own.store, own.anything, own.compare, own.pull_back, own.scatter
     columns, rows = own.columns, lanes // own.columns
 
+    @wp.func
+    def draw_row(
+        tile: wp.ref[Tile], view: int, line: int, begin: int, end: int, orthographic: int, count: int, test: wp.vec4,
+        planes: wp.array(dtype=Plane), texels: wp.array(dtype=wp.vec4), occupied: wp.array(dtype=wp.uint8), image: wp.array3d(dtype=wp.vec4),
+    ):  # fmt: skip
+        """Draw a row of tiles from column ``begin`` to ``end``."""
+        row = line * rows
+        base = view * count
+        nested = int(test[3])
+        restart(tile, planes, base, count, row, begin, end)
+        for column in range(begin, end, columns):
+            if (column - begin) % SPAN == 0:
+                narrow(tile, planes, base, column)
+            meet(tile, planes, base, column, row, orthographic, texels, texels)
+            arrange(tile)
+            position = int(0)
+            while position < tile.active:
+                sample(tile, position, 1, test, planes, base, column, row, texels, occupied)
+                position += 1
+                if not blend(tile, position - 1, nested):
+                    position = tile.active
+            store(tile, image, view, column, row)
+
+    @wp.func
+    def differentiate_row(
+        tile: wp.ref[Tile], view: int, line: int, begin: int, end: int, orthographic: int, count: int, test: wp.vec4,
+        planes: wp.array(dtype=Plane), texels: wp.array(dtype=wp.vec4), occupied: wp.array(dtype=wp.uint8),
+        width: int, height: int, image_gradient: wp.array3d(dtype=wp.vec4), target: wp.array3d(dtype=wp.int32), straight: int,
+        pixel_loss: int, weight: float, own_colors: int, lines: int, texel_gradient: wp.array(dtype=wp.vec4),
+        matrices: wp.array(dtype=wp.mat33d),
+    ) -> float:  # fmt: skip
+        """Differentiate a row of tiles from column ``begin`` to ``end``. Returns the loss."""
+        row = line * rows
+        base = view * count
+        nested = int(test[3])
+        total = float(0.0)
+        restart(tile, planes, base, count, row, begin, end)
+        for column in range(begin, end, columns):
+            if (column - begin) % SPAN == 0:
+                narrow(tile, planes, base, column)
+            meet(tile, planes, base, column, row, orthographic, texels, texel_gradient)
+            # Where picture and target are both empty there is neither a loss nor a gradient.
+            if anything(target, image_gradient, view, column, row, width, height) or not vacant(tile, occupied):
+                arrange(tile)
+                position = int(0)
+                while position < tile.active:
+                    sample(tile, position, 0, test, planes, base, column, row, texels, occupied)
+                    blend(tile, position, nested)
+                    position += 1
+                total += compare(tile, target, image_gradient, view, column, row, width, height, straight, pixel_loss, weight)
+                pull_back(tile, nested, own_colors, weight)
+                moving = matrices.shape[0] != 0
+                scatter(tile, planes, base, column, row, texels, texel_gradient, moving, matrices, view * lines + line, count)
+        return total
+
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
     def draw(
+        slot: int,
+        scratch: wp.array(dtype=Tile),
         first_line: int,
         run: int,
+        width: int,
         orthographic: int,
         count: int,
         test: wp.vec4,
@@ -70,33 +131,29 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
     ):
         """Write ``image`` [V, H, W]; launched over views, rows of tiles from ``first_line`` on, and runs of pixels."""
         view, line, piece = wp.tid()
-        row = (first_line + line) * rows
-        nested = int(test[3])
-        tile = Tile()
-        restart(tile, count)
-        for column in range(piece * run, wp.min(piece * run + run, image.shape[2]), columns):
-            meet(tile, planes, view * count, column, row, orthographic, texels, texels)
-            arrange(tile)
-            position = int(0)
-            while position < tile.active:
-                sample(tile, position, 1, test, planes, view * count, column, row, texels, occupied)
-                position += 1
-                if not blend(tile, position - 1, nested):
-                    position = tile.active
-            store(tile, image, view, column, row)
+        line += first_line
+        begin = piece * run
+        end = wp.min(begin + run, width)
+        if wp.static(lanes > 1):
+            draw_row(scratch[slot], view, line, begin, end, orthographic, count, test, planes, texels, occupied, image)
+        else:
+            tile = Tile()
+            draw_row(tile, view, line, begin, end, orthographic, count, test, planes, texels, occupied, image)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
     def differentiate(
+        slot: int,
+        scratch: wp.array(dtype=Tile),
         first_view: int,
         first_line: int,
         run: int,
+        width: int,
         orthographic: int,
         count: int,
         test: wp.vec4,
         planes: wp.array(dtype=Plane),
         texels: wp.array(dtype=wp.vec4),
         occupied: wp.array(dtype=wp.uint8),
-        width: int,
         height: int,
         image_gradient: wp.array3d(dtype=wp.vec4),
         target: wp.array3d(dtype=wp.int32),
@@ -107,37 +164,31 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         loss: wp.array2d(dtype=wp.float32),
         texel_gradient: wp.array(dtype=wp.vec4),
         matrices: wp.array(dtype=wp.mat33d),
+        lines: int,
     ):
-        """Add to ``texel_gradient`` [P] and, unless empty, to ``matrices`` [V * rows of tiles * N].
+        """Add to ``texel_gradient`` [P] and, unless empty, to ``matrices`` [V * ``lines`` * N].
 
         The picture's gradient is ``image_gradient`` [V, H, W], unless empty, plus ``weight`` times that of the pixel loss against
-        ``target`` [V, H, W], unless empty. The loss is added to ``loss`` [V, rows of tiles]. ``own_colors`` fits colors to the target's.
+        ``target`` [V, H, W], unless empty. The loss is added to ``loss`` [V, ``lines``]. ``own_colors`` fits colors to the target's.
         """
         view, line, piece = wp.tid()
         view += first_view
         line += first_line
-        row = line * rows
-        nested = int(test[3])
+        begin = piece * run
+        end = wp.min(begin + run, width)
         total = float(0.0)
-        tile = Tile()
-        restart(tile, count)
-        for column in range(piece * run, wp.min(piece * run + run, width), columns):
-            meet(tile, planes, view * count, column, row, orthographic, texels, texel_gradient)
-            # Where picture and target are both empty there is neither a loss nor a gradient.
-            if anything(target, image_gradient, view, column, row, width, height) or not vacant(tile, occupied):
-                arrange(tile)
-                position = int(0)
-                while position < tile.active:
-                    sample(tile, position, 0, test, planes, view * count, column, row, texels, occupied)
-                    blend(tile, position, nested)
-                    position += 1
-                total += compare(tile, target, image_gradient, view, column, row, width, height, straight, pixel_loss, weight)
-                pull_back(tile, nested, own_colors, weight)
-                scatter(
-                    tile, planes, view * count, column, row, texels, texel_gradient,
-                    matrices.shape[0] != 0, matrices, view * loss.shape[1] + line, count,
-                )  # fmt: skip
+        if wp.static(lanes > 1):
+            total = differentiate_row(
+                scratch[slot], view, line, begin, end, orthographic, count, test, planes, texels, occupied, width, height,
+                image_gradient, target, straight, pixel_loss, weight, own_colors, lines, texel_gradient, matrices,
+            )  # fmt: skip
+        else:
+            tile = Tile()
+            total = differentiate_row(
+                tile, view, line, begin, end, orthographic, count, test, planes, texels, occupied, width, height,
+                image_gradient, target, straight, pixel_loss, weight, own_colors, lines, texel_gradient, matrices,
+            )  # fmt: skip
         if target.shape[0] != 0:
             wp.atomic_add(loss, view, line, total)
 
-    return SimpleNamespace(draw=draw, differentiate=differentiate, columns=columns, rows=rows)
+    return SimpleNamespace(draw=draw, differentiate=differentiate, Tile=Tile, rows=rows)

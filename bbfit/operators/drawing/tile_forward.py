@@ -12,6 +12,8 @@ BLOCK = 4
 """Consecutive texels that share one byte of occupancy and that Adam updates together."""
 REACH = 26
 """Largest distance of the texels that a row of pixels in a tile reads, for a test of occupancy."""
+SPAN = 64
+"""Pixels of a row whose tiles look for their planes together."""
 HASHED, BLENDED = -1.0, 0.0
 """Cutoffs of alpha modes that have none."""
 SMOOTH, COVERAGE = 1.0, 2.0
@@ -19,7 +21,7 @@ SMOOTH, COVERAGE = 1.0, 2.0
 
 # MISS: a pixel misses a plane. BORDER: some of a sample's four texels lie beyond the texture's border.
 CONSTANTS = f"""
-    constexpr int MISS = -1, BORDER = -2, BLOCK = {BLOCK}, REACH = {REACH};
+    constexpr int MISS = -1, BORDER = -2, BLOCK = {BLOCK}, REACH = {REACH}, SPAN = {SPAN};
     constexpr unsigned HASH[] = {{{", ".join(f"{factor}u" for factor in HASH)}}};
     constexpr float TIE = {TIE!r}f, STEEPEST = {STEEPEST!r}f, LEAST_CONTRAST = {LEAST_CONTRAST!r}f;
     constexpr float HASHED = {HASHED!r}f, BLENDED = {BLENDED!r}f, SMOOTH = {SMOOTH!r}f, COVERAGE = {COVERAGE!r}f;
@@ -43,8 +45,20 @@ CORNERS = """
 
 
 RESTART = """
-    tile.count = count;
-    for (int n = 0; n < count; ++n) tile.listed.c[n] = n;
+    tile.reaching = 0;
+    for (int n = 0; n < count; ++n) {
+        const int* box = planes.data[base + n].box.c;
+        const bool above = row + LANES / COLUMNS <= box[2], below = row > box[3];
+        if (above || below || end <= box[0] || begin > box[1] || box[0] > box[1]) continue;
+        tile.listed.c[tile.reaching++] = n;
+    }
+"""
+NARROW = """
+    tile.close = 0;
+    for (int slot = 0; slot < tile.reaching; ++slot) {
+        const int* box = planes.data[base + tile.listed.c[slot]].box.c;
+        if (column + SPAN > box[0] && column <= box[1]) tile.span.c[tile.close++] = slot;
+    }
 """
 MEET = """
     float xs[LANES], ys[LANES];
@@ -53,12 +67,10 @@ MEET = """
         ys[l] = (float)(row + l / COLUMNS);
     }
     int k = 0;
-    for (int slot = 0; slot < tile.count; ++slot) {
-        const int id = tile.listed.c[slot];
+    for (int c = 0; c < tile.close; ++c) {
+        const int slot = tile.span.c[c], id = tile.listed.c[slot];
+        if (column + COLUMNS <= planes.data[base + id].box.c[0] || column > planes.data[base + id].box.c[1]) continue;
         const auto plane = planes.data[base + id];
-        const int* box = plane.box.c;
-        const bool above = row + LANES / COLUMNS <= box[2], below = row > box[3];
-        if (above || below || column + COLUMNS <= box[0] || column > box[1] || box[0] > box[1]) continue;
         const auto& m = plane.to_texel.data;
         const int first = plane.texture.c[0], height = plane.texture.c[1], width = plane.texture.c[2];
         const float last_u = (float)width, last_v = (float)height;

@@ -66,8 +66,10 @@ def tiles(capacity: int, lanes: int) -> SimpleNamespace:
 
     @wp.struct
     class Tile:
-        count: int  # of planes
-        listed: each  # planes in the order of the last tile
+        reaching: int  # number of planes that reach the row of tiles
+        listed: each  # these planes, in the order of the last tile
+        close: int  # number of them that reach the next tiles
+        span: each  # their places in ``listed``
         active: int  # number of layers: planes that some pixel meets
         slots: each  # of each layer: its place in ``listed``
         ids: each  # its plane
@@ -93,8 +95,12 @@ def tiles(capacity: int, lanes: int) -> SimpleNamespace:
         seen: colors  # the view
 
     @wp.func_native(prefix + forward.RESTART)
-    def restart(tile: wp.ref[Tile], count: int):
-        """Begin a row of tiles that meet ``count`` planes."""
+    def restart(tile: wp.ref[Tile], planes: wp.array(dtype=Plane), base: int, count: int, row: int, begin: int, end: int):
+        """Find the planes that reach a row of tiles between two columns."""
+
+    @wp.func_native(prefix + forward.NARROW)
+    def narrow(tile: wp.ref[Tile], planes: wp.array(dtype=Plane), base: int, column: int):
+        """Find those of them that reach the next ``SPAN`` columns."""
 
     @wp.func_native(prefix + forward.MEET)
     def meet(
