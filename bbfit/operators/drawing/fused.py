@@ -19,7 +19,7 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.drawing.compositing import STEEPEST
-from bbfit.operators.drawing.kernels import kernels
+from bbfit.operators.drawing.kernels import STRIP, kernels
 from bbfit.operators.drawing.projection import Projection, project
 from bbfit.operators.drawing.tile_forward import BLENDED, BLOCK, COVERAGE, HASHED, SMOOTH
 from bbfit.operators.drawing.tile_kernels import Plane
@@ -120,9 +120,9 @@ def differentiate(
         [V, N, 3, 3], if ``placement``.
     """
     views, count, device = len(projection), projection.count, texels.device
-    lines = -(-projection.height // tile_rows(projection, device))
-    sums = torch.zeros(views if loss else 0, lines, dtype=torch.float32, device=device)
-    matrices = torch.zeros(views if placement else 0, lines, count, 3, 3, dtype=torch.float64, device=device)
+    strips = -(-projection.height // STRIP)
+    sums = torch.zeros(views if loss else 0, strips, dtype=torch.float32, device=device)
+    matrices = torch.zeros(views if placement else 0, strips, count, 3, 3, dtype=torch.float64, device=device)
     if views and (len(texels) or loss):
         nothing = torch.zeros(0, 0, 0, 4, dtype=torch.float32, device=device)
         target = loss.target if loss else nothing.to(torch.uint8)
@@ -131,7 +131,7 @@ def differentiate(
         arguments.append(warp_array(nothing if image_gradient is None else image_gradient, wp.vec4))
         arguments.append(warp_array(target.view(torch.int32).squeeze(-1), wp.int32))
         arguments += [int(loss.straight), LOSSES[loss.kind], loss.weight, int(loss.own_colors)] if loss else [0, 0, 0.0, 0]
-        outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices.view(-1, 3, 3), wp.mat33d), lines]
+        outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices.view(-1, 3, 3), wp.mat33d), strips]
         on = wp.device_from_torch(device)
         compile_for(compiled.differentiate, on)
 
@@ -148,13 +148,13 @@ def differentiate(
 
 
 def schedule(projection: Projection, device: torch.device) -> list[list[tuple[int, int, int, int]]]:
-    """Phases of a backward pass, whose pieces run at the same time; a piece is a first view, a number of views, and a band of rows,
-    which begins with a row of tiles.
+    """Phases of a backward pass, whose pieces run at the same time; a piece is a first view, a number of views, and a band of rows
+    that begins with a strip.
 
     On a CPU bands of equal parity touch different texels: no two threads add to the same texel, and every sum has one order. CUDA adds
     atomically. Pictures are not cut into bands of fewer than ``projection.least_pixels``.
     """
-    views, height, width, rows = len(projection), projection.height, projection.width, tile_rows(projection, device)
+    views, height, width = len(projection), projection.height, projection.width
     if device.type == "cuda":
         return [[(0, views, 0, height)]]
     if projection.groups > 1:
@@ -162,8 +162,8 @@ def schedule(projection: Projection, device: torch.device) -> list[list[tuple[in
         return [[(group * share, share, 0, height) for group in range(projection.groups)]]
     phases = list[list[tuple[int, int, int, int]]]()
     for view, apart in enumerate(projection.rows_apart.tolist()):
-        lines = pieces_of(-(-height // rows), -(-max(apart, -(-projection.least_pixels // width)) // rows), MOST_BANDS)
-        bands = [(rows * begin, min(rows * end, height)) for begin, end in lines]
+        strips = pieces_of(-(-height // STRIP), -(-max(apart, -(-projection.least_pixels // width)) // STRIP), MOST_BANDS)
+        bands = [(STRIP * begin, min(STRIP * end, height)) for begin, end in strips]
         if len(bands) > 3:
             phases += [[(view, 1, *band) for band in bands[parity::2]] for parity in (0, 1)]
         elif phases and len(phases[-1]) == 1:  # views that are not cut form one piece
@@ -171,11 +171,6 @@ def schedule(projection: Projection, device: torch.device) -> list[list[tuple[in
         else:
             phases.append([(view, 1, 0, height)])
     return phases
-
-
-def tile_rows(projection: Projection, device: torch.device) -> int:
-    """Rows of pixels in a tile."""
-    return 1 if device.type == "cuda" or projection.lanes == 1 else 2
 
 
 def _scratch(compiled: SimpleNamespace, device: torch.device) -> Callable[[], AbstractContextManager[list[Any]]]:

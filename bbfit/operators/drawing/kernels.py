@@ -46,6 +46,8 @@ from bbfit.operators.drawing.tile_kernels import Plane, tiles
 from bbfit.operators.launching import FLAGS
 
 SPAN = wp.constant(SPAN_VALUE)
+STRIP = wp.constant(8)
+"""Rows of pixels whose losses and derivatives in the placement are added up. A row of tiles is in one strip."""
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
@@ -87,7 +89,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         tile: wp.ref[Tile], view: int, line: int, begin: int, end: int, orthographic: int, count: int, test: wp.vec4,
         planes: wp.array(dtype=Plane), texels: wp.array(dtype=wp.vec4), occupied: wp.array(dtype=wp.uint8),
         width: int, height: int, image_gradient: wp.array3d(dtype=wp.vec4), target: wp.array3d(dtype=wp.int32), straight: int,
-        pixel_loss: int, weight: float, own_colors: int, lines: int, texel_gradient: wp.array(dtype=wp.vec4),
+        pixel_loss: int, weight: float, own_colors: int, strips: int, texel_gradient: wp.array(dtype=wp.vec4),
         matrices: wp.array(dtype=wp.mat33d),
     ) -> float:  # fmt: skip
         """Differentiate a row of tiles from column ``begin`` to ``end``. Returns the loss."""
@@ -111,7 +113,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
                 total += compare(tile, target, image_gradient, view, column, row, width, height, straight, pixel_loss, weight)
                 pull_back(tile, nested, own_colors, weight)
                 moving = matrices.shape[0] != 0
-                scatter(tile, planes, base, column, row, texels, texel_gradient, moving, matrices, view * lines + line, count)
+                scatter(tile, planes, base, column, row, texels, texel_gradient, moving, matrices, view * strips + row // STRIP, count)
         return total
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
@@ -164,12 +166,12 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         loss: wp.array2d(dtype=wp.float32),
         texel_gradient: wp.array(dtype=wp.vec4),
         matrices: wp.array(dtype=wp.mat33d),
-        lines: int,
+        strips: int,
     ):
-        """Add to ``texel_gradient`` [P] and, unless empty, to ``matrices`` [V * ``lines`` * N].
+        """Add to ``texel_gradient`` [P] and, unless empty, to ``matrices`` [V * ``strips`` * N].
 
         The picture's gradient is ``image_gradient`` [V, H, W], unless empty, plus ``weight`` times that of the pixel loss against
-        ``target`` [V, H, W], unless empty. The loss is added to ``loss`` [V, ``lines``]. ``own_colors`` fits colors to the target's.
+        ``target`` [V, H, W], unless empty. The loss is added to ``loss`` [V, ``strips``]. ``own_colors`` fits colors to the target's.
         """
         view, line, piece = wp.tid()
         view += first_view
@@ -180,15 +182,15 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         if wp.static(lanes > 1):
             total = differentiate_row(
                 scratch[slot], view, line, begin, end, orthographic, count, test, planes, texels, occupied, width, height,
-                image_gradient, target, straight, pixel_loss, weight, own_colors, lines, texel_gradient, matrices,
+                image_gradient, target, straight, pixel_loss, weight, own_colors, strips, texel_gradient, matrices,
             )  # fmt: skip
         else:
             tile = Tile()
             total = differentiate_row(
                 tile, view, line, begin, end, orthographic, count, test, planes, texels, occupied, width, height,
-                image_gradient, target, straight, pixel_loss, weight, own_colors, lines, texel_gradient, matrices,
+                image_gradient, target, straight, pixel_loss, weight, own_colors, strips, texel_gradient, matrices,
             )  # fmt: skip
         if target.shape[0] != 0:
-            wp.atomic_add(loss, view, line, total)
+            wp.atomic_add(loss, view, line * rows // STRIP, total)
 
     return SimpleNamespace(draw=draw, differentiate=differentiate, Tile=Tile, rows=rows)

@@ -163,7 +163,7 @@ SCATTER = """
             sums[2][2] += by_w;
         }
         const double place[3] = {double(column), double(row), 0.0};
-        double* matrix = (double*)matrices.data + 9 * ((long long)line * count + id);
+        double* matrix = (double*)matrices.data + 9 * ((long long)strip * count + id);
         for (int e = 0; e < 9; ++e) wp::atomic_add(matrix + e, double(sums[e / 3][e % 3]) + place[e % 3] * double(sums[e / 3][2]));
     }
 """

@@ -152,8 +152,8 @@ def tiles(capacity: int, lanes: int) -> SimpleNamespace:
     @wp.func_native(prefix + PIXEL + backward.ADD + forward.CORNERS + backward.SCATTER)
     def scatter(
         tile: wp.ref[Tile], planes: wp.array(dtype=Plane), base: int, column: int, row: int, texels: wp.array(dtype=wp.vec4),
-        gradient: wp.array(dtype=wp.vec4), moving: bool, matrices: wp.array(dtype=wp.mat33d), line: int, count: int,
+        gradient: wp.array(dtype=wp.vec4), moving: bool, matrices: wp.array(dtype=wp.mat33d), strip: int, count: int,
     ):  # fmt: skip
-        """Add the derivatives in the samples to ``gradient`` and, if the planes are ``moving``, to ``matrices`` [lines, ``count``]."""
+        """Add the derivatives in the samples to ``gradient`` and, if the planes are ``moving``, to ``matrices`` [strips, ``count``]."""
 
     return SimpleNamespace(**{name: value for name, value in locals().items() if not name.startswith("_")})
