@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-# Adds to a texel's gradient.
+# Adding to a texel's gradient, and to a sum. On a CPU no two threads add to the same.
 ADD = """
 #if defined(__CUDA_ARCH__)
     auto add = [&](int i, pixel by) { wp::atomic_add(gradient.data + i, wp::vec_t<4, wp::float32>(by[0], by[1], by[2], by[3])); };
+    auto accumulate = [](double* sum, double by) { wp::atomic_add(sum, by); };
 #else
     auto add = [&](int i, pixel by) { ((pixel*)gradient.data)[i] += by; };
+    auto accumulate = [](double* sum, double by) { *sum += by; };
 #endif
 """
 VACANT = """
@@ -164,6 +166,6 @@ SCATTER = """
         }
         const double place[3] = {double(column), double(row), 0.0};
         double* matrix = (double*)matrices.data + 9 * ((long long)strip * count + id);
-        for (int e = 0; e < 9; ++e) wp::atomic_add(matrix + e, double(sums[e / 3][e % 3]) + place[e % 3] * double(sums[e / 3][2]));
+        for (int e = 0; e < 9; ++e) accumulate(matrix + e, double(sums[e / 3][e % 3]) + place[e % 3] * double(sums[e / 3][2]));
     }
 """
