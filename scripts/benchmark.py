@@ -45,11 +45,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import bbfit  # before torch, for which it sets environment variables
+
+# isort: split
 import numpy as np
 import torch
 from torch.nn.functional import interpolate
 
-import bbfit
 from bbfit.fitting.initialize import random_textures, start_cloud
 from bbfit.fitting.levels import Targets, resize_textures, shrunk_sizes
 from bbfit.fitting.loop import Step
@@ -226,7 +228,7 @@ def steps(quick: bool) -> list[Row]:
             large = enlarged(views, size)
             turns = 2 if quick else 7
             default = bbfit.FitConfig(views_per_step=1, levels=1, placement="even", texel_density=1)
-            for count in (4,) if quick else (2, 4, 8, 16):
+            for count in (4,) if quick else (2, 4, 8, 16, 32):
                 rows.append(step_row(large, replace(default, billboards=count), "step", device=device, turns=turns, copy=copy))
                 show(rows[-1])
             if size == 1024 and not quick:

@@ -131,7 +131,8 @@ def differentiate(
         arguments.append(warp_array(nothing if image_gradient is None else image_gradient, wp.vec4))
         arguments.append(warp_array(target.view(torch.int32).squeeze(-1), wp.int32))
         arguments += [int(loss.straight), LOSSES[loss.kind], loss.weight, int(loss.own_colors)] if loss else [0, 0, 0.0, 0]
-        outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4), warp_array(matrices.view(-1, 3, 3), wp.mat33d), strips]
+        outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4)]
+        outputs += [warp_array(matrices.view(-1, 3, 3), wp.mat33d), strips]
         on = wp.device_from_torch(device)
         compile_for(compiled.differentiate, on)
 

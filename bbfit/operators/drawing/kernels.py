@@ -64,7 +64,8 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
     @wp.func
     def draw_row(
         tile: wp.ref[Tile], view: int, line: int, begin: int, end: int, orthographic: int, count: int, test: wp.vec4,
-        planes: wp.array(dtype=Plane), texels: wp.array(dtype=wp.vec4), occupied: wp.array(dtype=wp.uint8), image: wp.array3d(dtype=wp.vec4),
+        planes: wp.array(dtype=Plane), texels: wp.array(dtype=wp.vec4), occupied: wp.array(dtype=wp.uint8),
+        image: wp.array3d(dtype=wp.vec4),
     ):  # fmt: skip
         """Draw a row of tiles from column ``begin`` to ``end``."""
         row = line * rows
