@@ -156,6 +156,12 @@ def with_alpha(cloud: BillboardCloud, alphas: list[float]) -> BillboardCloud:
     return cloud.with_texels(texels)
 
 
+def sparse(cloud: BillboardCloud) -> BillboardCloud:
+    """The cloud with one texel in a hundred; the others are transparent."""
+    chosen = torch.rand(len(cloud.texels), generator=torch.Generator().manual_seed(0)) < 0.01
+    return cloud.with_texels(torch.where(chosen[:, None], cloud.texels, 0))
+
+
 SCENES: dict[str, Callable[[], Scene]] = {
     "wide": lambda: Scene(noise(turned(0.6)), aside(31, 5)),
     "tall": lambda: Scene(noise(turned(0.6)), aside(4, 33)),
@@ -170,6 +176,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "camera on a plane": lambda: Scene(facing_cloud([0.0, 4.0], [(4, 4), (3, 6)]), aside(9, 7)),
     "no area": lambda: Scene(
         replace(turned(0.6), half_extents=torch.tensor([[0.0, 1], [1, 1]]).double()), aside(9, 7)
+    ),
+    "narrow and sparse": lambda: Scene(
+        sparse(facing_cloud([3.0, 4.0], [(99, 14), (120, 21)], (0.4, 2.4))), rolled(aside(64, 64), 10)
     ),
     "off-screen": lambda: Scene(replace(turned(0.6), centers=torch.tensor([[500.0, 0, -3], [0, 70, -3]]).double()), aside(9, 7)),
     "one texel": lambda: Scene(facing_cloud([3.0], [(1, 1)]), aside(12, 7)),

@@ -193,16 +193,18 @@ SAMPLE = """
             return sum;
         };
         for (int begin = 0; begin < LANES; begin += COLUMNS) {
-            bool inside = true, empty = false;
-            for (int l = begin; l < begin + COLUMNS; ++l) inside &= place[l] >= 0;
-            if (inside && shown) {
-                const int i = place[begin], j = place[begin + COLUMNS - 1], least = i < j ? i : j, most = i < j ? j : i;
-                if (most - least <= REACH) {
-                    int any = 0;
-                    for (int b = least / BLOCK; b <= (most + 1) / BLOCK; ++b) any |= occupied.data[b];
-                    for (int b = (least + width) / BLOCK; b <= (most + 1 + width) / BLOCK; ++b) any |= occupied.data[b];
-                    empty = !any;
-                }
+            int least = place[begin], most = place[begin];
+            for (int l = begin; l < begin + COLUMNS; ++l) {
+                least = place[l] < least ? place[l] : least;
+                most = place[l] > most ? place[l] : most;
+            }
+            const bool inside = least >= 0;
+            bool empty = false;
+            if (inside && shown && most - least <= REACH) {
+                int any = 0;
+                for (int b = least / BLOCK; b <= (most + 1) / BLOCK; ++b) any |= occupied.data[b];
+                for (int b = (least + width) / BLOCK; b <= (most + 1 + width) / BLOCK; ++b) any |= occupied.data[b];
+                empty = !any;
             }
             if (empty) {
                 ONE_BY_ONE
