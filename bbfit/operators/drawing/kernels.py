@@ -104,7 +104,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
                 narrow(tile, planes, base, column)
             meet(tile, planes, base, column, row, orthographic, texels, texel_gradient)
             # Where picture and target are both empty there is neither a loss nor a gradient.
-            if anything(target, image_gradient, view, column, row, width, height) or not vacant(tile, occupied):
+            if anything(target, image_gradient, view, column, row, width, height) or not vacant(tile, planes, base, occupied):
                 arrange(tile)
                 position = int(0)
                 while position < tile.active:

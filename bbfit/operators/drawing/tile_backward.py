@@ -15,7 +15,7 @@ ADD = """
 VACANT = """
     for (int k = 0; k < tile.active; ++k) {
         for (int l = 0; l < LANES; ++l) {
-            const int i = tile.place.data[k][l], j = i + tile.widths.c[k];
+            const int i = tile.place.data[k][l], j = i + planes.data[base + tile.ids.c[k]].texture.c[2];
             const unsigned char* f = occupied.data;
             if (i == BORDER || (i >= 0 && (f[i / BLOCK] | f[(i + 1) / BLOCK] | f[j / BLOCK] | f[(j + 1) / BLOCK]))) return false;
         }
@@ -65,10 +65,12 @@ COMPARE = """
 """
 PULL_BACK = """
     const pixel *g = (const pixel*)tile.slope.data[0], *seen = (const pixel*)tile.seen.data[0], *linear = (const pixel*)tile.linear.data[0];
-    float values[CAPACITY][LANES], behind[LANES] = {};  // v_k and s_k of kernels.py
+    // v_k and s_k of kernels.py. The depths have been used.
+    auto& values = tile.near.data;
+    float behind[LANES] = {};
     for (int p = tile.active - 1; p >= 0; --p) {
         float parts[LANES], raw[LANES];
-        if (tile.same.c[p]) {
+        if (LANES == 1 || tile.same.c[p]) {
             const int k = tile.order.data[p][0];
             const pixel* samples = (const pixel*)tile.samples.data[k * LANES];
             ONE_BY_ONE
@@ -96,7 +98,7 @@ PULL_BACK = """
         const float* shares = tile.shares.data[p];
         ONE_BY_ONE
         for (int l = 0; l < LANES; ++l) {
-            const int k = tile.order.data[p][tile.same.c[p] ? 0 : l];
+            const int k = tile.order.data[p][LANES == 1 || tile.same.c[p] ? 0 : l];
             pixel* s = (pixel*)tile.samples.data[k * LANES + l];
             pixel of_color = g[l];
             if (own_colors) of_color = linear[l] + (*s * seen[l][3] - seen[l]) * (2.0f * weight);
@@ -108,7 +110,8 @@ PULL_BACK = """
 """
 SCATTER = """
     for (int k = 0; k < tile.active; ++k) {
-        const int first = tile.firsts.c[k], height = tile.heights.c[k], width = tile.widths.c[k], id = tile.ids.c[k];
+        const int id = tile.ids.c[k], *texture = planes.data[base + id].texture.c;
+        const int first = texture[0], height = texture[1], width = texture[2];
         const auto& m = planes.data[base + id].to_texel.data;
         float of_u[LANES], of_v[LANES];
         ONE_BY_ONE

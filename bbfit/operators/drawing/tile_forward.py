@@ -54,7 +54,8 @@ RESTART = """
     }
 """
 NARROW = """
-    tile.close = 0;
+    tile.close = LANES > 1 ? 0 : tile.reaching;  // a single pixel has no other planes than its row
+    if (LANES == 1) return;
     for (int slot = 0; slot < tile.reaching; ++slot) {
         const int* box = planes.data[base + tile.listed.c[slot]].box.c;
         if (column + SPAN > box[0] && column <= box[1]) tile.span.c[tile.close++] = slot;
@@ -68,7 +69,7 @@ MEET = """
     }
     int k = 0;
     for (int c = 0; c < tile.close; ++c) {
-        const int slot = tile.span.c[c], id = tile.listed.c[slot];
+        const int slot = LANES > 1 ? tile.span.c[c] : c, id = tile.listed.c[slot];
         if (column + COLUMNS <= planes.data[base + id].box.c[0] || column > planes.data[base + id].box.c[1]) continue;
         const auto plane = planes.data[base + id];
         const auto& m = plane.to_texel.data;
@@ -119,12 +120,11 @@ MEET = """
             }
         }
 #endif
-        tile.slots.c[k] = slot;
         tile.ids.c[k] = id;
-        tile.firsts.c[k] = first;
-        tile.heights.c[k] = height;
-        tile.widths.c[k] = width;
-        tile.sampled.c[k] = 0;
+        if (LANES > 1) {
+            tile.slots.c[k] = slot;
+            tile.sampled.c[k] = 0;
+        }
         ++k;
     }
     tile.active = k;
@@ -135,7 +135,7 @@ MEET = """
 """
 ARRANGE = """
     bool moved = false;
-    for (int p = 0; p < tile.active; ++p) tile.same.c[p] = 1;
+    for (int p = 0; p < tile.active && LANES > 1; ++p) tile.same.c[p] = 1;
     for (int position = 1; position < tile.active; ++position) {
         for (int p = position; p > 0; --p) {
             float *front = tile.near.data[p - 1], *back = tile.near.data[p];
@@ -157,6 +157,7 @@ ARRANGE = """
             }
             if (!changes) break;
             moved = true;
+            if (LANES == 1) continue;
             if (changes < LANES) {
                 tile.same.c[p - 1] = tile.same.c[p] = 0;
             } else {
@@ -166,18 +167,21 @@ ARRANGE = """
             }
         }
     }
-    if (moved) {
+    if (moved && LANES > 1) {
         int sorted[CAPACITY];
         for (int p = 0; p < tile.active; ++p) sorted[p] = tile.ids.c[tile.order.data[p][LANES - 1]];
         for (int k = 0; k < tile.active; ++k) tile.listed.c[tile.slots.c[k]] = sorted[k];
     }
 """
 SAMPLE = """
-    for (int lane = 0; lane < (tile.same.c[position] ? 1 : LANES); ++lane) {
+    for (int lane = 0; lane < (LANES == 1 || tile.same.c[position] ? 1 : LANES); ++lane) {
         const int k = tile.order.data[position][lane];
-        if (tile.sampled.c[k]) continue;
-        tile.sampled.c[k] = 1;
-        const int first = tile.firsts.c[k], height = tile.heights.c[k], width = tile.widths.c[k];
+        if (LANES > 1) {
+            if (tile.sampled.c[k]) continue;
+            tile.sampled.c[k] = 1;
+        }
+        const int* texture = planes.data[base + tile.ids.c[k]].texture.c;
+        const int first = texture[0], height = texture[1], width = texture[2];
         const int* place = tile.place.data[k];
         const float *fx = tile.fx.data[k], *fy = tile.fy.data[k];
         pixel* samples = (pixel*)tile.samples.data[k * LANES];
@@ -292,7 +296,7 @@ BLEND = """
     const float* opacities = tile.opacities.data[tile.order.data[position][0]];
     pixel gathered[LANES];
     float of_gathered[LANES];
-    if (!tile.same.c[position]) {
+    if (LANES > 1 && !tile.same.c[position]) {
         ONE_BY_ONE
         for (int l = 0; l < LANES; ++l) {
             const int k = tile.order.data[position][l];

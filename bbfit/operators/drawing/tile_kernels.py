@@ -58,6 +58,7 @@ def tiles(capacity: int, lanes: int) -> SimpleNamespace:
     columns = max(lanes // 2, 1)
     wide = wp.types.vector(length=lanes, dtype=wp.float32)
     each = wp.types.vector(length=capacity, dtype=wp.int32)
+    shared = wp.types.vector(length=capacity if lanes > 1 else 1, dtype=wp.int32)  # what a single pixel does not need
     wides = wp.types.matrix(shape=(capacity, lanes), dtype=wp.float32)
     wides_ints = wp.types.matrix(shape=(capacity, lanes), dtype=wp.int32)
     colors = wp.types.matrix(shape=(lanes, 4), dtype=wp.float32)
@@ -69,15 +70,12 @@ def tiles(capacity: int, lanes: int) -> SimpleNamespace:
         reaching: int  # number of planes that reach the row of tiles
         listed: each  # these planes, in the order of the last tile
         close: int  # number of them that reach the next tiles
-        span: each  # their places in ``listed``
+        span: shared  # their places in ``listed``
         active: int  # number of layers: planes that some pixel meets
-        slots: each  # of each layer: its place in ``listed``
+        slots: shared  # of each layer: its place in ``listed``
         ids: each  # its plane
-        firsts: each  # its texture
-        heights: each
-        widths: each
-        sampled: each
-        same: each  # of each position: whether all pixels have the same layer there
+        sampled: shared
+        same: shared  # of each position: whether all pixels have the same layer there
         place: wides_ints  # of each layer and pixel: the upper left texel, MISS or BORDER
         fx: wides  # texel coordinates, less their whole parts unless ``place`` is BORDER
         fy: wides
@@ -85,7 +83,7 @@ def tiles(capacity: int, lanes: int) -> SimpleNamespace:
         opacities: wides
         slopes: wides  # of opacity
         order: wides_ints  # of each position, front to back, and pixel: the layer
-        near: wides
+        near: wides  # in the end v_k of kernels.py
         exposed: wides  # transmittance in front
         shares: wides  # weight in the picture
         through: wide  # of each pixel: transmittance so far
@@ -125,7 +123,7 @@ def tiles(capacity: int, lanes: int) -> SimpleNamespace:
         """Composite the layers at a position. Returns whether anything behind them can show."""
 
     @wp.func_native(prefix + backward.VACANT)
-    def vacant(tile: wp.ref[Tile], occupied: wp.array(dtype=wp.uint8)) -> bool:
+    def vacant(tile: wp.ref[Tile], planes: wp.array(dtype=Plane), base: int, occupied: wp.array(dtype=wp.uint8)) -> bool:
         """Whether all blocks of texels that the tile reads are transparent."""
 
     @wp.func_native(prefix + PIXEL + forward.STORE)
