@@ -84,7 +84,7 @@ def update_block(
     """Take a step for block ``i``, whose numbers stay in registers."""
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 4))
 def update_blocks(
     first: int,
     run: int,

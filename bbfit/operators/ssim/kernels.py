@@ -242,7 +242,7 @@ def kernels(pixels: int = 1) -> SimpleNamespace:
     ):  # fmt: skip
         """Adjoint of the blur along columns; writes the gradient in rows y and y + 1 of ``a``, zero outside the range."""
 
-    @wp.kernel(**options)
+    @wp.kernel(**options, launch_bounds=(256, 2))
     def sweep(
         view: int, first: int, last: int, first_stage: int, last_stage: int, threads_down: int, threads_along: int, scale: float,
         window_ranges: wp.array2d(dtype=wp.vec2i), pixel_ranges: wp.array2d(dtype=wp.vec2i),
