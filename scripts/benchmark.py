@@ -8,6 +8,7 @@ copy      bytes per second of a plain copy in memory (read plus written)
 step      one training step (render, loss, gradient, update) at the default fit's last level, for evenly placed billboards with a texel
           per pixel, by the reference renderer and by the fused kernels; one view, and at 1024 x 1024 also the two views of the preset;
           bound_s is the time in which a plain copy moves the bytes that the step must move
+mask      the same for an antialiased mask with a ramp, as in the middle of a default fit
 thesis    the same for the thesis preset, whose billboards fill the viewport
 views     steps of several views
 quality   for each folder of views: the 10,000 steps of the thesis preset by the fused kernels, an estimate of their time by the reference
@@ -55,7 +56,8 @@ from torch.nn.functional import interpolate
 from bbfit.fitting.initialize import random_textures, start_cloud
 from bbfit.fitting.levels import Targets, resize_textures, shrunk_sizes
 from bbfit.fitting.loop import Step
-from bbfit.fitting.steps import Stepper
+from bbfit.fitting.steps import BLEND, Stepper
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import write_png
 from bbfit.operators.adam.fused import AdamFused, rest_after
@@ -66,6 +68,8 @@ TREES = {"quaking_aspen": 0, "weeping_willow": 0}
 """Species to grow with all their leaves, and their seeds."""
 WARM_STEPS = {"default": 160, "thesis": 1200}
 """Number of steps at an eighth of the size. Each finer level has half as many."""
+RAMP = AlphaMode("mask", 0.2, 4.0, antialiased=True)
+"""A mask in the middle of a fit."""
 ROWS = ("grow", "steps", "quality", "placement", "start", "render", "run", "memory")
 """What ``--only`` can choose."""
 Row = dict[str, Any]
@@ -172,8 +176,10 @@ def warm(views: ViewSet, config: bbfit.FitConfig, device: torch.device) -> Stepp
     return stepper
 
 
-def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torch.device, turns: int, copy: float) -> Row:
-    """Measure a row ``step`` or ``thesis``."""
+def step_row(
+    views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torch.device, turns: int, copy: float, alpha: AlphaMode = BLEND
+) -> Row:
+    """Measure a row ``step``, ``mask`` or ``thesis``."""
     config, targets = config.resolve(), Targets.at(views, 0)
     fused = warm(views, config, device)
     start = start_cloud(views, config).to(device)
@@ -183,10 +189,10 @@ def step_row(views: ViewSet, config: bbfit.FitConfig, name: str, *, device: torc
     batch = config.views_per_step or 1
     for turn in range(turns):
         sample = [(turn * batch + index) % len(views) for index in range(batch)]
-        times["reference"].append(seconds_of(lambda sample=sample: reference.step(sample, 0.01), device))  # type: ignore[misc]
+        times["reference"].append(seconds_of(lambda sample=sample: reference.step(sample, 0.01, alpha=alpha), device))  # type: ignore[misc]
         for index in range(4):
             sample = [((4 * turn + index) * batch + view) % len(views) for view in range(batch)]
-            times["fused"].append(seconds_of(lambda sample=sample: fused.step(sample, 0.01), device))  # type: ignore[misc]
+            times["fused"].append(seconds_of(lambda sample=sample: fused.step(sample, 0.01, alpha=alpha), device))  # type: ignore[misc]
     slow, fast = (statistics.median(times[name]) for name in ("reference", "fused"))
     moved = bytes_of_a_step(fused, views, batch, rest_after(config.beta1 or 0.0))
     return {
@@ -231,6 +237,9 @@ def steps(quick: bool) -> list[Row]:
             for count in (4,) if quick else (2, 4, 8, 16, 32):
                 rows.append(step_row(large, replace(default, billboards=count), "step", device=device, turns=turns, copy=copy))
                 show(rows[-1])
+            mask = replace(default, billboards=4)
+            rows.append(step_row(large, mask, "mask", device=device, turns=turns, copy=copy, alpha=RAMP))
+            show(rows[-1])
             if size == 1024 and not quick:
                 rows.append(
                     step_row(large, replace(default, billboards=4, views_per_step=None), "step", device=device, turns=turns, copy=copy)
