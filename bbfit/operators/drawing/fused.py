@@ -85,7 +85,6 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None,
     compiled, runs, arguments = _prepared(texels, projection, occupied)
     device, outputs = wp.device_from_torch(texels.device), [warp_array(image, wp.vec4)]
     compile_for(compiled.draw, device)
-
     with_tile = _scratch(compiled, texels.device)
 
     def launch(begin: int, end: int) -> None:
@@ -127,15 +126,13 @@ def differentiate(
         nothing = torch.zeros(0, 0, 0, 4, dtype=torch.float32, device=device)
         target = loss.target if loss else nothing.to(torch.uint8)
         compiled, runs, arguments = _prepared(texels, projection, occupied)
-        arguments += [projection.height]
-        arguments.append(warp_array(nothing if image_gradient is None else image_gradient, wp.vec4))
+        arguments += [projection.height, warp_array(nothing if image_gradient is None else image_gradient, wp.vec4)]
         arguments.append(warp_array(target.view(torch.int32).squeeze(-1), wp.int32))
         arguments += [int(loss.straight), LOSSES[loss.kind], loss.weight, int(loss.own_colors)] if loss else [0, 0, 0.0, 0]
         outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4)]
         outputs += [warp_array(matrices.view(-1, 3, 3), wp.mat33d), strips]
         on = wp.device_from_torch(device)
         compile_for(compiled.differentiate, on)
-
         with_tile = _scratch(compiled, device)
 
         def launch(view: int, number: int, begin: int, end: int) -> None:

@@ -285,7 +285,7 @@ SAMPLE = """
                 const float above = alpha[l] - test.c[0], ramp = 0.5f + above * rates[l];
                 const float clamped = ramp < 0.0f ? 0.0f : ramp > 1.0f ? 1.0f : ramp, step = above >= 0.0f ? 1.0f : 0.0f;
                 const float opaque = rates[l] == 0.0f ? step : clamped;
-                alpha[l] = rates[l] < 0.0f ? 0.0f : opaque;
+                alpha[l] = ((rates[l] < 0.0f) | (place[l] == MISS)) ? 0.0f : opaque;
                 slopes[l] = fabsf(above) * gentle[l] <= 0.5f ? gentle[l] : 0.0f;
             }
         }
