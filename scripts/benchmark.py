@@ -8,9 +8,9 @@ copy      bytes per second of a plain copy in memory (read plus written)
 step      one training step (render, loss, gradient, update) at the default fit's last level, for evenly placed billboards with a texel
           per pixel, by the reference renderer and by the fused kernels; one view, and at 1024 x 1024 also the two views of the preset;
           bound_s is the time in which a plain copy moves the bytes that the step must move
+parts     milliseconds that the operators of a fused step take, at 1024 x 1024 with four billboards
 mask      the same for an antialiased mask with a ramp, as in the middle of a default fit
 thesis    the same for the thesis preset, whose billboards fill the viewport
-views     steps of several views
 quality   for each folder of views: the 10,000 steps of the thesis preset by the fused kernels, an estimate of their time by the reference
           renderer (the mean of 50 steps, times 10,000), and the default preset with as many billboards and without a mesh; reached_s is
           the time, including the search for a placement, until that fit reaches the thesis preset's PSNR on the held-out views (checked
@@ -21,6 +21,8 @@ start     starting up: ``bbfit --help`` and ``import bbfit`` (medians of five), 
           of compiled kernels; only with ``--only start``
 render    the default views of a grown aspen, with all samples for training views and with the default number; only with ``--only render``
 run       the stages of ``bbfit run`` without a tree and without options; only with ``--only run``
+scaling   milliseconds of a fused step by the size of the picture, the number of billboards and the number of views; only with
+          ``--only scaling``
 memory    the peak resident memory of a default fit of 360 views at 1024 x 1024, in a separate process
 
 PSNR, SSIM and FLIP are means over four backgrounds.
@@ -41,10 +43,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import bbfit  # before torch, for which it sets environment variables
 
@@ -53,6 +57,7 @@ import numpy as np
 import torch
 from torch.nn.functional import interpolate
 
+from bbfit.fitting import fused_pass
 from bbfit.fitting.initialize import random_textures, start_cloud
 from bbfit.fitting.levels import Targets, resize_textures, shrunk_sizes
 from bbfit.fitting.loop import Step
@@ -61,6 +66,7 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import write_png
 from bbfit.operators.adam.fused import AdamFused, rest_after
+from bbfit.operators.image_loss import fused as image_loss
 from bbfit.views.view_set import ViewSet
 
 DATA = Path(__file__).resolve().parents[1] / "data"
@@ -70,7 +76,7 @@ WARM_STEPS = {"default": 160, "thesis": 1200}
 """Number of steps at an eighth of the size. Each finer level has half as many."""
 RAMP = AlphaMode("mask", 0.2, 4.0, antialiased=True)
 """A mask in the middle of a fit."""
-ROWS = ("grow", "steps", "quality", "placement", "start", "render", "run", "memory")
+ROWS = ("grow", "steps", "quality", "placement", "start", "render", "run", "scaling", "memory")
 """What ``--only`` can choose."""
 Row = dict[str, Any]
 
@@ -211,6 +217,26 @@ def step_row(
     }
 
 
+def parts_row(views: ViewSet, config: bbfit.FitConfig, device: torch.device, turns: int) -> Row:
+    """Measure the row ``parts``."""
+    operators = {"draw": fused_pass, "unpacked": fused_pass, "differentiate": fused_pass, "ssim_and_gradient": image_loss}
+    stepper, times = warm(views, config.resolve(), device), dict[str, list[float]]()
+    places = [*((module, name) for name, module in operators.items()), (image_loss, "add_sharpness_gradient"), (AdamFused, "update")]
+    with ExitStack() as stack:
+        for place, name in places:
+            original, own = getattr(place, name), times.setdefault(name, [])
+
+            def timed(*args: Any, _original: Any = original, _own: list[float] = own, **kwargs: Any) -> Any:
+                result: list[Any] = []
+                _own.append(seconds_of(lambda: result.append(_original(*args, **kwargs)), device))
+                return result[0]
+
+            stack.enter_context(mock.patch.object(place, name, timed))
+        for index in range(4 * turns):
+            stepper.step([index % len(views)], 0.01)
+    return {"name": "parts", "device": device.type} | {name: round(1000 * statistics.median(own), 2) for name, own in times.items()}
+
+
 def bytes_of_a_step(stepper: Stepper, views: ViewSet, batch: int, rest: int) -> int:
     """Bytes that a step must move: for each view, the targets and the touched texels with their gradients; then the awake blocks."""
     state, steps = stepper.state, stepper.steps
@@ -224,7 +250,7 @@ def bytes_of_a_step(stepper: Stepper, views: ViewSet, batch: int, rest: int) -> 
 
 
 def steps(quick: bool) -> list[Row]:
-    """Measure the rows ``copy``, ``step``, ``thesis`` and ``views``."""
+    """Measure the rows ``copy``, ``step``, ``mask``, ``parts`` and ``thesis``."""
     rows: list[Row] = []
     views = bbfit.ViewDataset.load(DATA / "views").train
     for device in [torch.device("cpu"), *([torch.device("cuda")] if torch.cuda.is_available() else [])]:
@@ -240,6 +266,9 @@ def steps(quick: bool) -> list[Row]:
             mask = replace(default, billboards=4)
             rows.append(step_row(large, mask, "mask", device=device, turns=turns, copy=copy, alpha=RAMP))
             show(rows[-1])
+            if size == 1024:
+                rows.append(parts_row(large, replace(default, billboards=4), device, turns))
+                show(rows[-1])
             if size == 1024 and not quick:
                 rows.append(
                     step_row(large, replace(default, billboards=4, views_per_step=None), "step", device=device, turns=turns, copy=copy)
@@ -249,20 +278,21 @@ def steps(quick: bool) -> list[Row]:
                 thesis = bbfit.FitConfig(preset="thesis")
                 rows.append(step_row(large, thesis, "thesis", device=device, turns=turns, copy=copy))
                 show(rows[-1])
-        if not quick:
-            rows += views_rows(enlarged(views, 512), device)
     return rows
 
 
-def views_rows(views: ViewSet, device: torch.device) -> list[Row]:
-    """Measure the rows ``views``: fused steps of several views."""
-    rows = []
-    stepper = warm(views, bbfit.FitConfig(billboards=4, levels=1, placement="even", texel_density=1).resolve(), device)
-    for count in (1, 2, 4, 8):
-        sample = list(range(count))
-        seconds = statistics.median(seconds_of(lambda sample=sample: stepper.step(sample, 0.01), device) for _ in range(20))  # type: ignore[misc]
-        rows.append({"name": "views", "device": device.type, "size": 512, "billboards": 4, "views": count, "fused_s": round(seconds, 5)})
-        show(rows[-1])
+def scaling() -> list[Row]:
+    """Measure the rows ``scaling``."""
+    rows, views, device = [], bbfit.ViewDataset.load(DATA / "views").train, torch.device("cpu")
+    cases = [("pixels", size, 4, 1) for size in (128, 256, 512, 1024, 2048)]
+    cases += [("billboards", 512, count, 1) for count in (4, 8, 16, 32, 64)]
+    cases += [("views", 512, 4, batch) for batch in (1, 2, 4, 8, 16)]
+    for what, size, count, batch in cases:
+        large = enlarged(views, size)
+        stepper = warm(large, bbfit.FitConfig(billboards=count, levels=1, placement="even", texel_density=1).resolve(), device)
+        samples = [[(turn + view) % len(large) for view in range(batch)] for turn in range(12)]
+        seconds = statistics.median(seconds_of(partial(stepper.step, sample, 0.01), device) for sample in samples)
+        rows.append({"name": "scaling", "of": what, "size": size, "billboards": count, "views": batch, "ms": round(1000 * seconds, 2)})
     return rows
 
 
@@ -426,7 +456,8 @@ def main() -> None:
         rows += quality(arguments.views or [DATA / "views"])
     if "placement" in selected:
         rows += placement(arguments.views or [DATA / "views"])
-    others = {"grow": lambda: grow(arguments.quick), "start": starting, "render": rendering, "run": whole, "memory": memory}
+    others = {"grow": lambda: grow(arguments.quick), "start": starting, "render": rendering, "run": whole, "scaling": scaling}
+    others["memory"] = memory
     for name, measured in others.items():
         if name in selected:
             for row in measured():
