@@ -18,7 +18,7 @@ from bbfit.images import premultiply, unpremultiply
 
 # Least alpha that does not round to 0 in 8 bits.
 _VISIBLE = 0.5 / 255
-# Texels that the palette is chosen from, iterations, and the seed of the choice.
+# Texels that the palette is chosen from, those among them that the first colors are, iterations, and the seed of the choice.
 _SAMPLE, _FIRST, _ITERATIONS, _SEED = 40_000, 8_000, 12, 0
 # Of a mask's alpha, differences count within so much of the cutoff, where edges are.
 _EDGE = 0.25
