@@ -1,14 +1,8 @@
 """bbfit: a 3D tree as a handful of textured planes that look like it from every side."""
 
-import os
 from typing import Any
 
 import lazy_loader
-
-# Torch reads these variables when it is loaded. After each operation its threads wait for the next one on all cores, by default for
-# milliseconds, and hold up Warp's kernels. Now they wait for a tenth of that. Large tensors get large pages.
-for _name, _value in (("GOMP_SPINCOUNT", "20000"), ("THP_MEM_ALLOC_ENABLE", "1")):
-    os.environ.setdefault(_name, _value)
 
 # Importing bbfit must stay fast: `bbfit --help` does not wait for torch. __init__.pyi lists the names.
 _public_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

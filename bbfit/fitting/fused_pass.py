@@ -18,12 +18,15 @@ from bbfit.operators.drawing.fused import differentiate, draw
 from bbfit.operators.drawing.projection import Projection, project
 from bbfit.operators.drawing.projector import Projector
 from bbfit.operators.image_loss.fused import PixelLoss, add_structure, unpacked
+from bbfit.operators.launching import cores_for_kernels
 
 
 class FusedPass:
     """Differentiates the loss of views in texels and placement; parameters as of :class:`~bbfit.fitting.steps.Stepper`."""
 
     adam = AdamFused
+    cores = staticmethod(cores_for_kernels)
+    """Context of a step."""
 
     def __init__(self, cloud: BillboardCloud, targets: Targets, config: ResolvedFit, movement: Movement | None, groups: int) -> None:
         self._targets, self._config, self._movement, self._groups = targets, config, movement, groups

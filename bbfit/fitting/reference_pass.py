@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 
 import torch
@@ -27,6 +28,7 @@ class ReferencePass:
     """The specification of :class:`~bbfit.fitting.fused_pass.FusedPass`; parameters as of :class:`~bbfit.fitting.steps.Stepper`."""
 
     adam = AdamReference
+    cores = staticmethod(nullcontext)
 
     def __init__(self, cloud: BillboardCloud, targets: Targets, config: ResolvedFit, movement: Movement | None, groups: int) -> None:
         self._cloud, self._targets, self._config, self._movement, self._groups = cloud, targets, config, movement, groups

@@ -69,12 +69,13 @@ class Stepper:
 
     def step(self, chosen: Sequence[int], rate: float, placement_learning_rate: float = 0.0, alpha: AlphaMode = BLEND) -> Tensor:
         """Take the next step with the chosen views, drawn in an alpha mode; return the loss before the update, a scalar."""
-        movement = self._movement if placement_learning_rate > 0 else None
-        loss, of_parameters = self._pass.differentiate(self.state, chosen, alpha, movement is not None)
-        if movement is not None and of_parameters is not None:
-            movement.update(of_parameters, placement_learning_rate)
-        self.steps += 1
-        self.state.update(self.steps, rate, self._betas, self._binarization, alpha_rate(alpha))
+        with self._pass.cores():
+            movement = self._movement if placement_learning_rate > 0 else None
+            loss, of_parameters = self._pass.differentiate(self.state, chosen, alpha, movement is not None)
+            if movement is not None and of_parameters is not None:
+                movement.update(of_parameters, placement_learning_rate)
+            self.steps += 1
+            self.state.update(self.steps, rate, self._betas, self._binarization, alpha_rate(alpha))
         return loss
 
     def tensors(self) -> dict[str, Tensor]:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -39,6 +40,7 @@ PIXEL = """
 """
 """C++ of native functions: the type of a pixel or texel in a register. Without it clang splits sums of pixels into single floats.
 ``ONE_BY_ONE`` before a loop over pixels keeps clang from gathering one channel of many."""
+_workers: ContextVar[int] = ContextVar("workers", default=0)
 LEAST_PIXELS = 1 << 14
 """Least pixels in a piece for a CPU thread."""
 
@@ -103,9 +105,24 @@ def launch(kernel: Any, count: int, least: int, arguments: Sequence[Any], output
     in_parallel(piece, [(0, count)] if on.is_cuda else pieces_of(count, least))
 
 
+@contextmanager
+def cores_for_kernels() -> Iterator[None]:
+    """Within this block torch computes in the calling thread, and CPU launches have the threads that torch had before.
+
+    After an operation on many cores, torch's threads wait for the next one on these cores, for milliseconds, and hold up kernels.
+    """
+    before, token = torch.get_num_threads(), _workers.set(worker_count())
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        _workers.reset(token)
+
+
 def worker_count() -> int:
     """Number of threads for CPU launches: as many as torch uses (``torch.set_num_threads``, ``OMP_NUM_THREADS``)."""
-    return torch.get_num_threads()
+    return _workers.get() or torch.get_num_threads()
 
 
 def in_parallel(launch: Callable[..., None], pieces: Iterable[tuple[int, ...]]) -> None:

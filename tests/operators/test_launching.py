@@ -16,7 +16,7 @@ from threading import Barrier, Event, Lock, Thread, get_ident
 import pytest
 import torch
 
-from bbfit.operators.launching import CacheError, cache_of_kernels, in_parallel, pieces_of, worker_count
+from bbfit.operators.launching import CacheError, cache_of_kernels, cores_for_kernels, in_parallel, pieces_of, worker_count
 
 PATIENCE = 20.0
 """Seconds after which something is taken to hang."""
@@ -28,6 +28,17 @@ def threads() -> Iterator[Callable[[int], None]]:
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
+
+
+def test_kernels_get_the_threads_that_torch_would_use(threads: Callable[[int], None]) -> None:
+    threads(3)
+    with pytest.raises(KeyError), cores_for_kernels():
+        assert (torch.get_num_threads(), worker_count()) == (1, 3)
+        with cores_for_kernels():
+            assert (torch.get_num_threads(), worker_count()) == (1, 3)
+        assert (torch.get_num_threads(), worker_count()) == (1, 3)
+        raise KeyError
+    assert (torch.get_num_threads(), worker_count()) == (3, 3)
 
 
 def in_time(work: Callable[[], None]) -> None:

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from bbfit.operators.adam.kernels import texel_block, update_blocks
+from bbfit.operators.adam.kernels import Step, texel_block, update_blocks
 from bbfit.operators.adam.reference import EPSILON, AdamReference
 from bbfit.operators.drawing.fused import occupancy
 from bbfit.operators.drawing.tile_forward import BLOCK
@@ -63,10 +63,12 @@ class AdamFused(AdamReference):
         """As of the reference, up to rounding and :func:`rest_after`; binarization does not wake blocks that rest."""
         beta1, beta2 = betas
         run = 1 if self.texels.is_cuda else RUN
-        rate, correction = rate / (1 - beta1**step), (1 - beta2**step) ** -0.5
-        numbers = [run, step, rate, beta1, beta2, correction, EPSILON, rest_after(beta1), binarization, alpha_rate]
+        numbers = Step()
+        numbers.index, numbers.beta1, numbers.beta2, numbers.epsilon = step, beta1, beta2, EPSILON
+        numbers.rate, numbers.correction = rate / (1 - beta1**step), (1 - beta2**step) ** -0.5
+        numbers.rest_after, numbers.binarization, numbers.alpha_rate = rest_after(beta1), binarization, alpha_rate
         blocks = (self.texels, self.gradient, self.first_moment, self.second_moment)
         arrays = [warp_array(tensor.view(-1, 4 * BLOCK), texel_block) for tensor in blocks]
         arrays += [warp_array(self.last, wp.int32), warp_array(self.occupied, wp.uint8)]
         on = wp.device_from_torch(self.texels.device)
-        launch(update_blocks, -(-len(self.last) // run), LEAST_RUNS, [*numbers, *arrays], on=on)
+        launch(update_blocks, -(-len(self.last) // run), LEAST_RUNS, [run, numbers, *arrays], on=on)

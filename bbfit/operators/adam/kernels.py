@@ -25,6 +25,21 @@ texel_block = wp.types.vector(length=4 * BLOCK, dtype=wp.float32)
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
 
+@wp.struct
+class Step:
+    """The numbers of a step (:meth:`bbfit.operators.adam.fused.AdamFused.update`)."""
+
+    index: int
+    rate: float
+    beta1: float
+    beta2: float
+    correction: float
+    epsilon: float
+    rest_after: int
+    binarization: float
+    alpha_rate: float
+
+
 @wp.func_native(f"""
     constexpr int SIZE = {4 * BLOCK};
     float *g = gradient.data[i].c, *p = texels.data[i].c, *m = first_moment.data[i].c, *v = second_moment.data[i].c;
@@ -34,24 +49,25 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
         slope[c] = g[c];
         bits |= ((const int*)g)[c] & 0x7fffffff;
     }}
-    const int idle = step - last.data[i];
-    if (!bits && idle > rest_after) return;
-    float decay1 = beta1, decay2 = beta2;
+    const int idle = step.index - last.data[i];
+    if (!bits && idle > step.rest_after) return;
+    float decay1 = step.beta1, decay2 = step.beta2;
     if (bits) {{
-        last.data[i] = step;
+        last.data[i] = step.index;
         for (int c = 0; c < SIZE; ++c) g[c] = 0.0f;
-        if (idle > rest_after) {{
-            decay1 = powf(beta1, idle - rest_after);
-            decay2 = powf(beta2, idle - rest_after);
+        if (idle > step.rest_after) {{
+            decay1 = powf(step.beta1, idle - step.rest_after);
+            decay2 = powf(step.beta2, idle - step.rest_after);
         }}
     }}
     for (int c = 0; c < SIZE; ++c) {{
         const bool alpha = (c & 3) == 3;
-        const float ambiguous = binarization * (1.0f - 2.0f * p[c]);
+        const float ambiguous = step.binarization * (1.0f - 2.0f * p[c]);
         slope[c] += (alpha & (p[c] > 0.0f)) ? ambiguous : 0.0f;
-        first[c] = m[c] * decay1 + slope[c] * (1.0f - beta1);
-        second[c] = v[c] * decay2 + slope[c] * slope[c] * (1.0f - beta2);
-        const float moved = p[c] - (alpha ? rate * alpha_rate : rate) * first[c] / (sqrtf(second[c]) * correction + epsilon);
+        first[c] = m[c] * decay1 + slope[c] * (1.0f - step.beta1);
+        second[c] = v[c] * decay2 + slope[c] * slope[c] * (1.0f - step.beta2);
+        const float rate = alpha ? step.rate * step.alpha_rate : step.rate;
+        const float moved = p[c] - rate * first[c] / (sqrtf(second[c]) * step.correction + step.epsilon);
         const float least = moved > 0.0f ? moved : 0.0f;
         texel[c] = least < 1.0f ? least : 1.0f;
         opaque |= alpha & (texel[c] > 0.0f);
@@ -65,15 +81,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 """)
 def update_block(
     i: int,
-    step: int,
-    rate: float,
-    beta1: float,
-    beta2: float,
-    correction: float,
-    epsilon: float,
-    rest_after: int,
-    binarization: float,
-    alpha_rate: float,
+    step: Step,
     texels: wp.array(dtype=texel_block),
     gradient: wp.array(dtype=texel_block),
     first_moment: wp.array(dtype=texel_block),
@@ -88,15 +96,7 @@ def update_block(
 def update_blocks(
     first: int,
     run: int,
-    step: int,
-    rate: float,
-    beta1: float,
-    beta2: float,
-    correction: float,
-    epsilon: float,
-    rest_after: int,
-    binarization: float,
-    alpha_rate: float,
+    step: Step,
     texels: wp.array(dtype=texel_block),
     gradient: wp.array(dtype=texel_block),
     first_moment: wp.array(dtype=texel_block),
@@ -108,7 +108,4 @@ def update_blocks(
     tid, _ = wp.tid()
     begin = (first + tid) * run
     for i in range(begin, wp.min(begin + run, texels.shape[0])):
-        update_block(
-            i, step, rate, beta1, beta2, correction, epsilon, rest_after, binarization, alpha_rate,
-            texels, gradient, first_moment, second_moment, last, occupied,
-        )  # fmt: skip
+        update_block(i, step, texels, gradient, first_moment, second_moment, last, occupied)

@@ -46,7 +46,7 @@ class Plane:
 
 @cache
 def tiles(capacity: int, lanes: int) -> SimpleNamespace:
-    """The structure ``Tile`` for at most ``capacity`` layers of ``lanes`` pixels, 1 or an even number in two rows, and its functions.
+    """The structure ``Tile`` for at most ``capacity`` layers of ``lanes`` pixels, 1 or a multiple of 4 in two rows, and its functions.
 
     A tile's place is that of its first pixel, (``column``, ``row``), and ``base`` the first plane of its view. An alpha mode ``test`` is
 
