@@ -194,6 +194,7 @@ def step_row(
     for turn in range(turns):
         sample = [(turn * batch + index) % len(views) for index in range(batch)]
         times["reference"].append(seconds_of(lambda sample=sample: reference.step(sample, 0.01, alpha=alpha), device))  # type: ignore[misc]
+        time.sleep(0.1)  # torch's threads wait on all cores after the reference's step
         for index in range(4):
             sample = [((4 * turn + index) * batch + view) % len(views) for view in range(batch)]
             times["fused"].append(seconds_of(lambda sample=sample: fused.step(sample, 0.01, alpha=alpha), device))  # type: ignore[misc]
