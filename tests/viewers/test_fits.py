@@ -24,6 +24,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import fit
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.orbit import Orbit
 from bbfit.images import linear_to_srgb, over_color, srgb_to_linear
 from bbfit.rendering.cards import draw_cards
 from bbfit.views.dataset import ViewDataset
@@ -202,23 +203,23 @@ def test_what_is_not_split_is_shown_in_the_wrong_order(
     assert split > unsplit + 3
 
 
-def test_three_shows_mip_levels_as_dense_as_the_views_from_afar(
-    three: BrowserViewer, fits: dict[str, BillboardCloud], views: ViewDataset, tmp_path: Path
-) -> None:
+def test_three_shows_mip_levels_as_dense_from_afar_as_from_near(three: BrowserViewer, fits: dict[str, BillboardCloud], tmp_path: Path) -> None:
     """At a half, a quarter and an eighth of the size, by textures in KTX2; all pixels that are not white are covered.
 
-    Measured: at least 21.7 dB from bbfit's own, of which without levels it is at least 4.1 dB less; coverage within 0.035 of 1. With the
-    default's 0.8 texels a pixel, it is 19.8 dB from bbfit's own and 0.063 off in coverage at an eighth, where pictures have 16 x 16 pixels.
+    From 72 cameras: the tree has about 40 pixels in a picture of 16 x 16, so coverage in the six held-out views alone differs by up to 0.03
+    between fits. Measured with eight seeds: at least 21.3 dB from bbfit's own, of which without levels it is at least 4.5 dB less;
+    coverage within 0.024 of 1.
     """
     model = shipped_model(fits["mask"], replace(THREE, textures="ktx2", fallback=False))
     (path,), cards = model.save(tmp_path / "model.glb"), model.cards
-    wanted = float(views.test.targets(range(len(views.test)))[..., 3].mean())
-    width, height = views.test.cameras.width, views.test.cameras.height
+    points = np.concatenate([card.corners for card in cards.cards])
+    near = Orbit(72).frame(points, target=torch.from_numpy((points.min(0) + points.max(0)) / 2), width=128, height=128)
+    wanted = float(draw_cards(cards, near)[..., 3].mean())
     for halving in (1, 2, 3):
-        cameras = views.test.cameras.resized(width >> halving, height >> halving)
+        cameras = near.resized(128 >> halving, 128 >> halving)
         shown = three.render(path, cameras)
         own, without = (over_color(draw_cards(each, cameras).double()).numpy() for each in (cards, replace(cards, chain=None)))
-        assert metrics.psnr(own, shown) >= max(21, metrics.psnr(without, shown) + 3)
+        assert metrics.psnr(own, shown) >= max(20, metrics.psnr(without, shown) + 3)
         assert float((shown < 1).any(-1).mean()) / wanted == pytest.approx(1, abs=0.05)
 
 
