@@ -203,7 +203,9 @@ def test_what_is_not_split_is_shown_in_the_wrong_order(
     assert split > unsplit + 3
 
 
-def test_three_shows_mip_levels_as_dense_from_afar_as_from_near(three: BrowserViewer, fits: dict[str, BillboardCloud], tmp_path: Path) -> None:
+def test_three_shows_mip_levels_as_dense_from_afar_as_from_near(
+    three: BrowserViewer, fits: dict[str, BillboardCloud], tmp_path: Path
+) -> None:
     """At a half, a quarter and an eighth of the size, by textures in KTX2; all pixels that are not white are covered.
 
     From 72 cameras: the tree has about 40 pixels in a picture of 16 x 16, so coverage in the six held-out views alone differs by up to 0.03
