@@ -25,7 +25,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in MODULES}
 GROUPS = (
     ("checks",),
     ("provenance", "inputs"),
-    ("files", "glb", "model_files", "scratch"),
+    ("files", "glb", "model_files", "scratch", "threads"),
     ("geometry", "outputs"),
     ("layout",),
     ("images",),

@@ -28,6 +28,7 @@ from bbfit.images import PALETTE, distinct
 from bbfit.operators.drawing.compositing import opacity
 from bbfit.rendering.cards import hits, sheets_of
 from bbfit.rendering.sampling import Footprint, filtered, footprint, joined, sampled
+from bbfit.threads import one_thread
 
 # Largest side in pixels of the pictures in which coverage is measured.
 _SIDE = 96
@@ -62,12 +63,8 @@ def with_mips(cards: Cards, on_level: Callable[[int, int], None] = lambda done, 
     ``on_level`` is that of :func:`matched_chain`.
     """
     surface = None if cards.atlas.surface is None else tuple(surface_chain(cards.atlas.surface, cards.atlas.image[..., 3]))
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # short operations wait for each other's threads: on two busy cores that took several times as long
-    try:
+    with one_thread():
         chain = matched_chain(cards, _chain(cards), _around(cards), on_level)
-    finally:
-        torch.set_num_threads(threads)
     return replace(cards, chain=tuple(chain), surface_chain=surface)
 
 

@@ -27,6 +27,8 @@ _MEANS_ITERATIONS = 4
 # Rounds that fit a plane, and the share of a cluster's extent or of a view's displacement below which either counts as none.
 _PLANE_ROUNDS = 4
 _FLAT = 1e-12
+# Costs that are computed together, so few that they stay in the processor's cache.
+_IN_CACHE = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,43 @@ class Planes:
     """Meters, float64 [K]."""
     labels: Tensor
     """Index of the nearest plane of every point, int64 [P]."""
+
+
+class _Costs:
+    """The costs of points, float64 [P, 3], in clusters: how far views see a point move onto the plane, and how far the center is.
+
+    A cost, in square meters, is a quadratic form in (x, y, z, 1), so that a product of matrices has the costs in all clusters.
+    """
+
+    def __init__(self, points: Tensor, projection: Tensor, locality: float) -> None:
+        self.projection, self._locality = projection, locality
+        self._origin = points.mean(0)  # near which squares of coordinates lose no digits
+        self._rows, self._columns = torch.triu_indices(4, 4)
+        extended = torch.nn.functional.pad(points - self._origin, (0, 1), value=1.0)
+        self._products = (extended[:, self._rows] * extended[:, self._columns]).float()
+
+    def least(self, normals: Tensor, offsets: Tensor, centers: Tensor) -> tuple[Tensor, Tensor]:
+        """The least cost of each point in K clusters, float32 [P], and its cluster, int64 [P]."""
+        planes = torch.cat([normals, (normals @ self._origin - offsets)[:, None]], -1)
+        visible = _form(self.projection, normals).clamp_min(0)
+        return self._least(visible[:, None, None] * planes[:, :, None] * planes[:, None, :] + self._locality * self._distances(centers))
+
+    def nearest(self, centers: Tensor) -> Tensor:
+        """The index of the center, of [K, 3], nearest to each point, int64 [P]."""
+        return self._least(self._distances(centers))[1]
+
+    def _distances(self, centers: Tensor) -> Tensor:
+        """The matrices of the squared distances from K centers, [K, 4, 4]."""
+        identity = torch.eye(3, dtype=centers.dtype).expand(len(centers), 3, 3)
+        away = torch.cat([identity, (self._origin - centers)[..., None]], -1)
+        return away.mT @ away
+
+    def _least(self, forms: Tensor) -> tuple[Tensor, Tensor]:
+        """The least value at each point of K symmetric forms, [K, 4, 4], and the index of that form."""
+        twice = torch.where(self._rows == self._columns, 1, 2)
+        coefficients = (twice * forms[:, self._rows, self._columns]).float().mT.contiguous()
+        parts = [(part @ coefficients).min(-1) for part in self._products.split(max(1, _IN_CACHE // len(forms)))]
+        return torch.cat([part.values for part in parts]), torch.cat([part.indices for part in parts])
 
 
 def view_projection(camera: Camera) -> Tensor:
@@ -60,18 +99,18 @@ def cluster_planes(
     distance from the mean of the cluster's points. With ``upright``, all planes contain the vertical.
     """
     normals = torch.randn(count, 3, dtype=points.dtype, generator=generator)
-    centers = points[torch.randint(len(points), (count,), generator=generator)]
+    centers, costs = points[torch.randint(len(points), (count,), generator=generator)], _Costs(points, projection, locality)
     if locality:
         for _ in range(_MEANS_ITERATIONS):
-            sums = moments(points, torch.cdist(points, centers).argmin(-1), count)
+            sums = moments(points, costs.nearest(centers), count)
             centers = torch.where(sums[:, 3, 3:] > 0, _centers(sums), centers)
-        normals, offsets, _ = best_planes(moments(points, torch.cdist(points, centers).argmin(-1), count), projection, upright=upright)
+        normals, offsets, _ = best_planes(moments(points, costs.nearest(centers), count), projection, upright=upright)
     else:
         if upright:
             normals[:, 1] = 0
         normals = torch.nn.functional.normalize(normals, dim=-1)
         offsets = (normals * centers).sum(-1)
-    return _refined(points, normals, offsets, centers, projection, locality, upright=upright)[0]
+    return _refined(points, normals, offsets, centers, costs, upright=upright)[0]
 
 
 def split_planes(points: Tensor, axes: Tensor, projection: Tensor, *, upright: bool, locality: float = 0.0) -> Planes:
@@ -80,24 +119,22 @@ def split_planes(points: Tensor, axes: Tensor, projection: Tensor, *, upright: b
     For each of A directions, [A, 3], the clustering starts from the two halves of the points below and above the median along it. The
     clustering with the least cost is returned. The other parameters are those of :func:`cluster_planes`.
     """
-    results = []
+    results, costs = [], _Costs(points, projection, locality)
     for axis in axes.to(points):
         along = points @ axis
         sums = moments(points, (along > along.median()).long(), 2)
         normals, offsets, _ = best_planes(sums, projection, upright=upright)
-        results.append(_refined(points, normals, offsets, _centers(sums), projection, locality, upright=upright))
+        results.append(_refined(points, normals, offsets, _centers(sums), costs, upright=upright))
     return min(results, key=itemgetter(1))[0]
 
 
-def _refined(
-    points: Tensor, normals: Tensor, offsets: Tensor, centers: Tensor, projection: Tensor, locality: float, *, upright: bool
-) -> tuple[Planes, float]:
+def _refined(points: Tensor, normals: Tensor, offsets: Tensor, centers: Tensor, costs: _Costs, *, upright: bool) -> tuple[Planes, float]:
     """Iterate the clustering until the assignment is stable. Return the planes and the sum of the costs."""
     count = len(normals)
     least = max(3, int(_STARVED * len(points) / count))
     labels = torch.full((len(points),), -1)
     for _ in range(_ITERATIONS):
-        cost, nearest = _costs(points, normals, offsets, centers, projection, locality).min(-1)
+        cost, nearest = costs.least(normals, offsets, centers)
         for k in torch.nonzero(torch.bincount(nearest, minlength=count) < least)[:, 0].tolist():
             far = points[cost.argmax()]
             around = (points - far).square().sum(-1).topk(min(len(points), 2 * least), largest=False).indices
@@ -106,28 +143,13 @@ def _refined(
             break
         labels = nearest
         sums = moments(points, labels, count)
-        new_normals, new_offsets, _ = best_planes(sums, projection, upright=upright)
+        new_normals, new_offsets, _ = best_planes(sums, costs.projection, upright=upright)
         enough = sums[:, 3, 3] >= 3
         normals = torch.where(enough[:, None], new_normals, normals)
         offsets = torch.where(enough, new_offsets, offsets)
         centers = torch.where(enough[:, None], _centers(sums), centers)
-    cost, labels = _costs(points, normals, offsets, centers, projection, locality).min(-1)
-    return Planes(normals, offsets, labels), float(cost.sum())
-
-
-def _costs(points: Tensor, normals: Tensor, offsets: Tensor, centers: Tensor, projection: Tensor, locality: float) -> Tensor:
-    """The cost of each point in each cluster, in square meters, [P, K]: how far views see the point move, and how far its center is."""
-    origin = points.mean(0)  # near which squares of coordinates lose no digits
-    points, offsets, centers = points - origin, offsets - normals @ origin, centers - origin
-    visible = _form(projection, normals)[:, None].clamp_min(0)
-    # The cost is a quadratic form in (x, y, z, 1), so that one product of matrices has those of all clusters.
-    planes = torch.cat([normals, -offsets[:, None]], -1)
-    forms = visible[..., None] * planes[:, :, None] * planes[:, None, :]
-    forms[:, :3, :3] += locality * torch.eye(3, dtype=points.dtype)
-    forms[:, 3, :3] -= 2 * locality * centers
-    forms[:, 3, 3] += locality * centers.square().sum(-1)
-    extended = torch.nn.functional.pad(points, (0, 1), value=1.0)
-    return (extended[:, :, None] * extended[:, None, :]).flatten(1) @ forms.flatten(1).mT
+    cost, labels = costs.least(normals, offsets, centers)
+    return Planes(normals, offsets, labels), float(cost.sum(dtype=torch.float64))
 
 
 def _centers(sums: Tensor) -> Tensor:
@@ -189,9 +211,9 @@ def rectangles(points: Tensor, planes: Planes, texels_per_meter: float, margin: 
     A rectangle is upright unless a rotated one is a fifth smaller. Returns K billboards, float64, with transparent textures of
     ``texels_per_meter`` along each side. Two-sided ones have a back texture.
     """
-    parts = []
-    for k, (normal, offset) in enumerate(zip(planes.normals, planes.offsets, strict=True)):
-        members = points[planes.labels == k]
+    parts, counts = [], torch.bincount(planes.labels, minlength=len(planes.normals)).tolist()
+    ordered = points[planes.labels.argsort(stable=True)].split(counts)
+    for members, normal, offset in zip(ordered, planes.normals, planes.offsets, strict=True):
         up = torch.tensor([0.0, 0.0, -1.0] if float(normal[1].abs()) > 0.999 else [0.0, 1.0, 0.0], dtype=points.dtype)
         right = torch.nn.functional.normalize(torch.linalg.cross(up, normal), dim=0)
         up = torch.linalg.cross(normal, right)
@@ -211,16 +233,20 @@ def splatted(cloud: BillboardCloud, points: Tensor, colors: Tensor, labels: Tens
     The color of a texel is the mean color of its points. Its alpha is 1 - exp(-n / m), the expected coverage of randomly placed surface,
     where n is the number of points in the texel and m the mean of n over the texels of the billboard that contain points.
     """
-    textures = []
-    for k, (h, w) in enumerate(cloud.texture_sizes.tolist()):
-        members = labels == k
-        offset = points[members] - cloud.centers[k]
-        u = (offset @ cloud.rights[k] / cloud.half_extents[k, 0] + 1) * w / 2
-        v = (1 - offset @ cloud.ups[k] / cloud.half_extents[k, 1]) * h / 2
-        index = v.long().clamp(0, h - 1) * w + u.long().clamp(0, w - 1)
-        number = torch.zeros(h * w).index_add_(0, index, torch.ones(len(index)))
-        color = torch.zeros(h * w, 3).index_add_(0, index, colors[members]) / number.clamp_min(1)[:, None]
-        color[number == 0] = colors[members].mean(0) if len(index) else 0.5
-        alpha = 1 - torch.exp(-number / number[number > 0].mean()) if len(index) else number
-        textures.append(torch.cat([color, alpha[:, None]], -1).repeat(1 + int(cloud.two_sided[k]), 1))
-    return cloud.with_texels(torch.cat(textures))
+    sizes, count = cloud.texture_sizes.prod(-1), len(cloud)
+    owners, total = torch.arange(count).repeat_interleave(sizes), int(sizes.sum())
+    offset, half = points - cloud.centers[labels], cloud.half_extents[labels]
+    h, w = cloud.texture_sizes[labels].unbind(-1)
+    u = ((offset * cloud.rights[labels]).sum(-1) / half[:, 0] + 1) * w / 2
+    v = (1 - (offset * cloud.ups[labels]).sum(-1) / half[:, 1]) * h / 2
+    row, column = v.long().clamp_min(0).minimum(h - 1), u.long().clamp_min(0).minimum(w - 1)
+    index = (sizes.cumsum(0) - sizes)[labels] + row * w + column
+    number = torch.zeros(total).index_add_(0, index, torch.ones(len(index)))
+    color = torch.zeros(total, 3).index_add_(0, index, colors)
+    whole = torch.zeros(count, 4).index_add_(0, owners, torch.cat([color, number[:, None]], -1))
+    shown = torch.zeros(count).index_add_(0, owners, (number > 0).float())
+    mean = torch.where(whole[:, 3:] > 0, whole[:, :3] / whole[:, 3:], 0.5)
+    color = torch.where(number[:, None] > 0, color / number[:, None], mean[owners])
+    alpha = 1 - torch.exp(-number / (whole[:, 3] / shown).nan_to_num(nan=1.0)[owners])
+    textures = torch.cat([color, alpha[:, None]], -1).split(sizes.tolist())
+    return cloud.with_texels(torch.cat([part.repeat(1 + back, 1) for part, back in zip(textures, cloud.two_sided.tolist(), strict=True)]))

@@ -8,13 +8,10 @@ import torch
 from torch import Tensor
 
 from bbfit.fitting.bark import facets
-from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, splatted, split_planes, view_projection
+from bbfit.fitting.clusters import Planes, best_planes, cluster_planes, moments, rectangles, splatted, split_planes
 from bbfit.fitting.config import ResolvedFit
-from bbfit.fitting.initialize import pixels_per_meter
-from bbfit.fitting.points import point_colors
+from bbfit.fitting.points import SeenPoints
 from bbfit.fitting.trunk import crossed_planes, trunk_parts
-from bbfit.fitting.visibility import pixels_of
-from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 
 Losses = Callable[[BillboardCloud], Tensor]
@@ -28,22 +25,15 @@ _SLICE_MARGIN = 0.06
 
 
 class Moves:
-    """Placements for points on a tree, float64 [P, 3], and other placements made from them.
+    """Placements for points on a tree, and other placements made from them.
 
-    All clouds are float32 on the CPU. Their textures show the points in the colors that ``pictures``, premultiplied float32 [V, H, W, 4] of
-    ``cameras``, have there. ``radius`` is that of the tree in meters. ``generator`` makes all random choices but those of
-    :meth:`clustered`.
+    All clouds are float32 on the CPU. Their textures show the points in their colors. ``radius`` is that of the tree in meters.
+    ``generator`` makes all random choices but those of :meth:`clustered`.
     """
 
-    def __init__(
-        self, points: Tensor, cameras: Camera, pictures: Tensor, config: ResolvedFit, radius: float, generator: torch.Generator
-    ) -> None:
-        self.projection = view_projection(cameras)
-        """What the views see of a displacement (:func:`~bbfit.fitting.clusters.view_projection`), float64 [3, 3]."""
-        self._points, self._config, self._radius, self._generator = points, config, radius, generator
-        self._density = float(pixels_per_meter(cameras)) * config.texel_density
-        self._pixels = [pixels_of(points, cameras[index]) for index in range(len(cameras))]
-        self._colors = point_colors(self._pixels, pictures)
+    def __init__(self, seen: SeenPoints, config: ResolvedFit, radius: float, generator: torch.Generator) -> None:
+        self.seen, self._config, self._radius, self._generator = seen, config, radius, generator
+        self._points, self._density = seen.places, seen.pixels_per_meter * config.texel_density
         self._locality = config.locality or 0.0
         self._all_upright, self._proposed = config.orientation == "upright", 0
 
@@ -51,7 +41,7 @@ class Moves:
         """``count`` billboards: a clustering of the points from random start number ``index``."""
         generator = torch.Generator().manual_seed((self._config.seed << 16) + index)
         planes = cluster_planes(
-            self._points, count, self.projection, upright=self._upright(index), generator=generator, locality=self._locality
+            self._points, count, self.seen.projection, upright=self._upright(index), generator=generator, locality=self._locality
         )
         return self._textured(torch.arange(len(self._points)), planes)
 
@@ -107,7 +97,7 @@ class Moves:
         offset = self._points[:, None] - cloud.centers
         x, y = ((offset * axis).sum(-1).abs() for axis in (cloud.rights, cloud.ups))
         beyond = (torch.stack([x, y], -1) - cloud.half_extents).clamp_min(0)
-        visible = ((cloud.normals @ self.projection) * cloud.normals).sum(-1)
+        visible = ((cloud.normals @ self.seen.projection) * cloud.normals).sum(-1)
         return ((offset * cloud.normals).sum(-1).square() * visible + beyond.square().sum(-1)).argmin(-1)
 
     def split(self, cloud: BillboardCloud, weight: Tensor) -> BillboardCloud:
@@ -117,7 +107,7 @@ class Moves:
         split = int(torch.multinomial(losses, 1, generator=self._generator))
         members = torch.nonzero(nearest == split)[:, 0]
         axes = torch.stack([cloud.normals[split], cloud.rights[split], cloud.ups[split]])
-        planes = split_planes(self._points[members], axes, self.projection, upright=self._all_upright, locality=self._locality)
+        planes = split_planes(self._points[members], axes, self.seen.projection, upright=self._all_upright, locality=self._locality)
         return BillboardCloud.joined([cloud.take(k for k in range(len(cloud)) if k != split), self._textured(members, planes)])
 
     def merged(self, cloud: BillboardCloud, number: int) -> BillboardCloud:
@@ -125,8 +115,8 @@ class Moves:
         nearest, upright = self.nearest(cloud), self._all_upright
         sums = moments(self._points, nearest, len(cloud))
         pairs = torch.combinations(torch.arange(len(cloud)))
-        normals, offsets, squares = best_planes(sums[pairs].sum(1), self.projection, upright=upright)
-        increase = squares - best_planes(sums, self.projection, upright=upright)[2][pairs].sum(1)
+        normals, offsets, squares = best_planes(sums[pairs].sum(1), self.seen.projection, upright=upright)
+        increase = squares - best_planes(sums, self.seen.projection, upright=upright)[2][pairs].sum(1)
         pair = int(increase.argsort()[number % min(3, len(pairs))])
         merged = torch.isin(torch.arange(len(cloud)), pairs[pair])
         members = torch.nonzero(merged[nearest])[:, 0]
@@ -142,7 +132,7 @@ class Moves:
     def _weights(self, losses: Tensor) -> Tensor:
         """Average the losses of the pixels that show each point, float64 [P]."""
         weight = torch.zeros(len(self._points))
-        for (index, inside), loss in zip(self._pixels, losses, strict=True):
+        for (index, inside), loss in zip(self.seen.pixels, losses, strict=True):
             weight += loss.flatten()[index] * inside
         return (weight / len(losses)).clamp_min(1e-12).double()
 
@@ -157,7 +147,7 @@ class Moves:
             across = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(along)
         normals = torch.nn.functional.normalize(torch.linalg.cross(along, across), dim=-1)
         near = _NEAR * self._radius
-        visible = ((normals @ self.projection) * normals).sum(-1).clamp_min(1e-12).sqrt()
+        visible = ((normals @ self.seen.projection) * normals).sum(-1).clamp_min(1e-12).sqrt()
         distance = (samples @ normals.mT - (normals * corners[:, 0]).sum(-1)) * visible
         score = torch.exp(-((distance / near) ** 2)).sum(0)
         best = int(torch.where(normals.norm(dim=-1) > 0.5, score, -1).argmax())  # collinear points define no plane
@@ -172,7 +162,7 @@ class Moves:
 
     def _textured(self, members: Tensor, planes: Planes) -> BillboardCloud:
         """Place billboards on planes around the points at the indices ``members`` and splat the points into the textures."""
-        points, colors = self._points[members], self._colors[members]
+        points, colors = self._points[members], self.seen.colors[members]
         margin = (self._config.margin if self._locality else _SLICE_MARGIN) * self._radius
         without_textures = rectangles(points, planes, self._density, margin, two_sided=self._config.sides == "two")
         return splatted(without_textures, points, colors, planes.labels).to(torch.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from bbfit.blender.request import RenderedTree
 from bbfit.checks import fail
 from bbfit.fitting.bark import Bark, bark_of
+from bbfit.fitting.clusters import view_projection
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.fitting.visibility import pixels_of, seen_indices, visibility
@@ -170,6 +172,33 @@ def _carved(views: ViewSet, count: int, seed: int, batch: int, dilation: int) ->
             margin = 0.02 * extent
             low, high = torch.maximum(low, points.amin(0) - margin), torch.minimum(high, points.amax(0) + margin)
     return torch.cat(batches)[:count]
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """P points on a tree, and what V views show of them."""
+
+    places: Tensor
+    """Coordinates, float64 [P, 3]."""
+    pixels: list[tuple[Tensor, Tensor]]
+    """The :func:`~bbfit.fitting.visibility.pixels_of` the points in each view."""
+    colors: Tensor
+    """Straight RGB (:func:`point_colors`), float32 [P, 3]."""
+    projection: Tensor
+    """What the views see of a displacement (:func:`~bbfit.fitting.clusters.view_projection`), float64 [3, 3]."""
+    pixels_per_meter: float
+    """Of the views, at the tree's axis."""
+
+    @staticmethod
+    def of(points: Tensor, cameras: Camera, pictures: Tensor) -> SeenPoints:
+        """Points, float64 [P, 3], in pictures of the cameras, premultiplied RGBA, float32 [V, H, W, 4]."""
+        pixels = [pixels_of(points, cameras[index]) for index in range(len(cameras))]
+        return SeenPoints(points, pixels, point_colors(pixels, pictures), view_projection(cameras), float(pixels_per_meter(cameras)))
+
+    def take(self, members: Tensor) -> SeenPoints:
+        """Some of the points, by their indices, int64, or a mask, bool [P]."""
+        pixels = [(index[members], inside[members]) for index, inside in self.pixels]
+        return replace(self, places=self.places[members], pixels=pixels, colors=self.colors[members])
 
 
 def point_colors(pixels: list[tuple[Tensor, Tensor]], pictures: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from operator import attrgetter, itemgetter
 
 import torch
@@ -17,11 +18,13 @@ from bbfit.fitting.initialize import pixels_per_meter, tree_radius
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.movement import Movement
 from bbfit.fitting.moves import ADDITIONS, REFINEMENTS, Moves
-from bbfit.fitting.steps import Stepper
+from bbfit.fitting.points import SeenPoints
+from bbfit.fitting.steps import Stepper, pass_of
 from bbfit.fitting.trunk import trunk_points
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.image_loss.reference import pixel_loss_reference
 from bbfit.rendering.dispatch import render
+from bbfit.threads import one_thread
 from bbfit.views.view_set import ViewSet
 
 SIDE = 64
@@ -101,37 +104,47 @@ def find_placement(
     ``on_progress`` is called with the work done and the total work. The result is float32 on the CPU and has fitted textures, with the
     texel density of pictures of about :data:`SIDE` pixels.
     """
-    if config.billboards is None:
-        on_progress = on_progress or (lambda done, total: None)
-        cloud = _at_the_knee(views, points, config, on_progress, bark)
-        on_progress(_SEARCHES, _SEARCHES)
-        return cloud
-    return _found(views, points, config, on_progress, effort, bark)[0]
+    tree, on_progress = _Tree(views, points, bark), on_progress or (lambda done, total: None)
+    with pass_of(config).cores():
+        if config.billboards is not None:
+            return _found(tree, config, on_progress, effort)[0]
+        cloud = _at_the_knee(tree, config, on_progress)
+    on_progress(_SEARCHES, _SEARCHES)
+    return cloud
 
 
-def _found(
-    views: ViewSet,
-    points: Tensor,
-    config: ResolvedFit,
-    on_progress: Callable[[int, int], None] | None,
-    effort: Effort,
-    bark: Bark | None,
-) -> tuple[BillboardCloud, _Search]:
+class _Tree:
+    """What a search knows of a tree, whatever the number of billboards."""
+
+    def __init__(self, views: ViewSet, points: Tensor, bark: Bark | None) -> None:
+        side = min(views.cameras.width, views.cameras.height)
+        self.views, self.bark, self.radius, self.threads = views, bark, tree_radius(views), torch.get_num_threads()
+        self.targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
+        self.pictures = self.targets.pictures(range(len(views)))
+        self.points = SeenPoints.of(points, self.targets.cameras, self.pictures)
+
+    @cached_property
+    def trunk(self) -> Tensor:
+        """Indices of the points below the crown (:func:`~bbfit.fitting.trunk.trunk_points`)."""
+        return trunk_points(self.points.places, self.views)
+
+
+def _found(tree: _Tree, config: ResolvedFit, on_progress: Callable[[int, int], None], effort: Effort) -> tuple[BillboardCloud, _Search]:
     """The placement of a known number of billboards, and the search that found it."""
-    on_progress, own, count = on_progress or (lambda done, total: None), config.trunk_billboards, config.billboards
+    own, count, bark, points = config.trunk_billboards, config.billboards, tree.bark, tree.points
     assert count is not None  # see counted()
     if config.trunk == "mesh":
-        share = 0.0 if bark is None else len(bark.members) / len(points)
+        share = 0.0 if bark is None else len(bark.members) / len(points.places)
         faceted = min(round(count * share) if own is None else own, count - 1)
         if bark is not None and faceted >= TRUNK_PLANES:
-            others = torch.ones(len(points), dtype=torch.bool)
+            others = torch.ones(len(points.places), dtype=torch.bool)
             others[bark.members] = share > _BARE
-            search = _Search(views, points[others], _of_the_crown(config, count - faceted), on_progress, effort)
-            return BillboardCloud.joined([search.best(), search.faceted(points[bark.members], bark.normals, faceted)]), search
+            search = _Search(tree, points.take(others), _of_the_crown(config, count - faceted), on_progress, effort)
+            return BillboardCloud.joined([search.best(), search.faceted(points.take(bark.members), bark.normals, faceted)]), search
         own = min(crossed_in_trunk(count), count if own is None else own)
     assert own is not None  # see counted()
-    trunk = trunk_points(points, views) if own else points.new_zeros(0)
-    search = _Search(views, points, _of_the_crown(config, count - (own if len(trunk) else 0)), on_progress, effort)
+    trunk = tree.trunk if own else torch.zeros(0, dtype=torch.int64)
+    search = _Search(tree, points, _of_the_crown(config, count - (own if len(trunk) else 0)), on_progress, effort)
     best = search.best()
     return (BillboardCloud.joined([best, search.moves.crossed(trunk, own)]) if len(trunk) else best), search
 
@@ -141,13 +154,11 @@ def _of_the_crown(config: ResolvedFit, count: int) -> ResolvedFit:
     return replace(config, billboards=count, trunk_billboards=0)
 
 
-def _at_the_knee(
-    views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None], bark: Bark | None
-) -> BillboardCloud:
+def _at_the_knee(tree: _Tree, config: ResolvedFit, on_progress: Callable[[int, int], None]) -> BillboardCloud:
     """The placement of as many billboards as pay for the tree; see :func:`find_placement`."""
 
     def tried(number: int, count: int) -> _Trial:
-        cloud, search = _found(views, points, config.counted(count), None, QUICK, bark)
+        cloud, search = _found(tree, config.counted(count), lambda done, total: None, QUICK)
         on_progress(number, _SEARCHES)
         return _Trial(count, cloud, search.layers(cloud), search.decibels(cloud))
 
@@ -177,15 +188,11 @@ class _Trial:
 
 class _Search:
     def __init__(
-        self, views: ViewSet, points: Tensor, config: ResolvedFit, on_progress: Callable[[int, int], None], effort: Effort = USUAL
+        self, tree: _Tree, points: SeenPoints, config: ResolvedFit, on_progress: Callable[[int, int], None], effort: Effort
     ) -> None:
         self._config, self._on_progress, self._effort = replace(config.coarse(), ssim_weight=0.0, colors="joint"), on_progress, effort
-        side = min(views.cameras.width, views.cameras.height)
-        self._targets = Targets.at(views, max(0, round(math.log2(side / SIDE))))
-        self._pictures = self._targets.pictures(range(len(views)))
-        self._radius, self._generator = tree_radius(views), torch.Generator().manual_seed(config.seed)
-        self._locality = config.locality
-        self.moves = Moves(points, self._targets.cameras, self._pictures, config, self._radius, self._generator)
+        self._tree, self._generator, self._locality = tree, torch.Generator().manual_seed(config.seed), config.locality
+        self.moves = Moves(points, config, tree.radius, self._generator)
         assert config.billboards and config.candidates and config.restarts and config.refinement_rounds is not None  # see counted()
         self._restarts, self._candidates, self._rounds = config.restarts, config.candidates, config.refinement_rounds
         # An addition is a slice through the whole tree, and compact parts leave none out.
@@ -198,18 +205,18 @@ class _Search:
         each = effort.steps * config.candidates + effort.more_steps * self._survivors + effort.mend_steps * ADDITIONS * completed
         self._total = config.restarts * each + effort.mend_steps * (1 + REFINEMENTS) * config.refinement_rounds
 
-    def faceted(self, points: Tensor, normals: Tensor, count: int) -> BillboardCloud:
-        """At most ``count`` billboards for points on bark, float64 [P, 3], with unit normals, [P, 3], with hardly a margin."""
+    def faceted(self, points: SeenPoints, normals: Tensor, count: int) -> BillboardCloud:
+        """At most ``count`` billboards for P points on bark with unit normals, [P, 3], with hardly a margin."""
         config = replace(self._config, margin=_FACET_MARGIN, locality=1.0)
-        return Moves(points, self._targets.cameras, self._pictures, config, self._radius, self._generator).faceted(normals, count)
+        return Moves(points, config, self._tree.radius, self._generator).faceted(normals, count)
 
     def layers(self, cloud: BillboardCloud) -> float:
         """How many visible texels of a cloud lie before each other in a pixel of the rectangle around the tree, on average over views."""
-        cameras, cloud = self._targets.cameras, cloud.to(torch.float64)
+        cameras, cloud = self._tree.targets.cameras, cloud.to(torch.float64)
         visible = torch.stack([(texture[..., 3] > _VISIBLE).double().mean() for texture in cloud.textures()])
         facing = (cameras.batch().forward.double() @ cloud.normals.mT).abs().mean(0)
         drawn = float((4 * cloud.half_extents.prod(-1) * visible * facing).sum()) * float(pixels_per_meter(cameras)) ** 2
-        shown = self._pictures[..., 3] > 0
+        shown = self._tree.pictures[..., 3] > 0
         height, width = (_extent(shown.any(axis)) for axis in (2, 1))
         return drawn / max(float((height * width).mean()), 1.0)
 
@@ -226,7 +233,7 @@ class _Search:
 
     def searched(self, number: int) -> tuple[BillboardCloud, float]:
         """Run search ``number``. Return its cloud and the loss."""
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        with one_thread(), ThreadPoolExecutor(self._tree.threads) as pool:
             starts = range(number * self._candidates, (number + 1) * self._candidates)
             clouds = list(pool.map(lambda start: self.moves.clustered(start, self._clusters), starts))
         clouds, losses = self._fitted(clouds, self._effort.steps, _RATE)
@@ -245,11 +252,11 @@ class _Search:
     def _fitted(self, clouds: list[BillboardCloud], steps: int, rate: float) -> tuple[list[BillboardCloud], list[float]]:
         """Fit clouds of equal size side by side, placement and textures. Return the clouds and their losses over all views."""
         config, joined = self._config, BillboardCloud.joined(clouds)
-        movement = Movement(joined, self._radius, grow=not self._locality) if config.placement_learning_rate else None
-        stepper = Stepper(joined.to(config.device), self._targets, config, movement, groups=len(clouds))
+        movement = Movement(joined, self._tree.radius, grow=not self._locality) if config.placement_learning_rate else None
+        stepper = Stepper(joined.to(config.device), self._tree.targets, config, movement, groups=len(clouds))
         for step in range(steps):
             decay = 0.5 * (1 + math.cos(math.pi * step / steps))
-            batch = torch.randperm(len(self._targets.cameras), generator=self._generator)[:_BATCH].tolist()
+            batch = torch.randperm(len(self._tree.targets.cameras), generator=self._generator)[:_BATCH].tolist()
             stepper.step(batch, rate * decay, config.placement_learning_rate * decay)
             self._done += len(clouds)
             self._on_progress(self._done, self._total)
@@ -259,8 +266,8 @@ class _Search:
     def _losses(self, cloud: BillboardCloud) -> Tensor:
         """Compute the loss of every pixel of every training view, [V, H, W]."""
         device = self._config.device
-        image = render(cloud.to(device), self._targets.cameras.to(device), backend=self._config.backend)
-        return pixel_loss_reference(image.cpu(), self._pictures, self._config.loss)
+        image = render(cloud.to(device), self._tree.targets.cameras.to(device), backend=self._config.backend)
+        return pixel_loss_reference(image.cpu(), self._tree.pictures, self._config.loss)
 
 
 def _extent(shown: Tensor) -> Tensor:

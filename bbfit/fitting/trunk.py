@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from bisect import insort
+from statistics import median
 
 import torch
 from torch import Tensor
@@ -39,13 +41,16 @@ def trunk_top(inside: Tensor) -> int | None:
     the trunk. The highest 5 % of these rows do not count. Returns ``None`` if the rest is lower than 5 % of the silhouette, as with a tree
     whose leaves hang to the ground, or if the silhouette is empty.
     """
-    widths = inside.sum(-1)
-    shown = torch.nonzero(widths)[:, 0].tolist()
+    widths = inside.sum(-1).tolist()
+    shown = [row for row, width in enumerate(widths) if width]
     if not shown:
         return None
     first, bottom = shown[0], shown[-1]
-    narrow, top = _NARROW * float(widths.max()), bottom
-    while top >= 0 and 0 < int(widths[top]) <= min(narrow, _FORKED * float(widths[top : bottom + 1].double().quantile(0.5))):
+    narrow, top, below = _NARROW * max(widths), bottom, list[int]()
+    while top >= 0 and widths[top]:
+        insort(below, widths[top])
+        if widths[top] > min(narrow, _FORKED * median(below)):
+            break
         top -= 1
     left_out = round(_HANGING * (bottom - top))
     if bottom - top - left_out < _LEAST_HEIGHT * (bottom - first + 1):

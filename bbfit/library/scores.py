@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-import torch
 from torch import Tensor
 
 from bbfit.evaluation.backgrounds import mean_psnr
@@ -18,6 +17,7 @@ from bbfit.geometry.cards import Cards
 from bbfit.images import shrunk
 from bbfit.library.manifest import LevelScore
 from bbfit.rendering.cards import CardRenderer
+from bbfit.threads import one_thread
 from bbfit.views.dataset import ViewDataset
 from bbfit.views.view_set import ViewSet
 
@@ -43,16 +43,12 @@ def scored(cards: Cards, level: LodLevel, dataset: ViewDataset, texels: int) -> 
     share = min(1.0, (level.tree_pixels or height) / height)
     width, tall = (max(_LEAST_SIDE, round(side * share)) for side in (views.cameras.width, views.cameras.height))
     near, far, colors, draw = list[float](), list[float](), list[float](), drawing(cards, views)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # short operations wait for each other's threads: on two busy cores that took five times as long
-    try:
+    with one_thread():
         for index in range(len(views)):
             near.append(mean_psnr(*held_out(draw, views, index)))
             target = shrunk(views.targets([index])[0].double(), width, tall)
             image = draw(views.cameras[index].resized(width, tall)).double().clamp(0, 1)
             far.append(mean_psnr(target, image))
             colors.append(color_error(target, image))
-    finally:
-        torch.set_num_threads(threads)
     near_mean, far_mean, color_mean = (sum(values) / len(views) for values in (near, far, colors))
     return near_mean, LevelScore(height * share, far_mean, color_mean, texels)

@@ -18,6 +18,7 @@ import warp as wp
 from torch import Tensor
 
 from bbfit.checks import InputError
+from bbfit.threads import one_thread
 
 FLAGS = "-march=native -ffp-contract=fast"
 """Clang's flags for CPU kernels; they enable the host's vector instructions and fused multiply-add."""
@@ -107,16 +108,12 @@ def launch(kernel: Any, count: int, least: int, arguments: Sequence[Any], output
 
 @contextmanager
 def cores_for_kernels() -> Iterator[None]:
-    """Within this block torch computes in the calling thread, and CPU launches have the threads that torch had before.
-
-    After an operation on many cores, torch's threads wait for the next one on these cores, for milliseconds, and hold up kernels.
-    """
-    before, token = torch.get_num_threads(), _workers.set(worker_count())
-    torch.set_num_threads(1)
+    """Within this block torch computes in the calling thread, and CPU launches have the threads that torch had before."""
+    token = _workers.set(worker_count())
     try:
-        yield
+        with one_thread():
+            yield
     finally:
-        torch.set_num_threads(before)
         _workers.reset(token)
 
 

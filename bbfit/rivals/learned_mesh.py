@@ -30,6 +30,7 @@ from bbfit.rivals.mesh_charts import unfold
 from bbfit.rivals.mesh_hull import hull_surface
 from bbfit.rivals.mesh_rays import RayCaster, pixel_rays
 from bbfit.rivals.mesh_silhouettes import Surface, boundary_gradient
+from bbfit.threads import one_thread
 from bbfit.views.view_set import ViewSet
 
 DRAW_GRID = 4
@@ -153,12 +154,8 @@ def refine_mesh(
     done and the step's loss. Raises ``InputError`` if an argument is out of range, or Mitsuba or LLVM is missing.
     """
     _check_plan(steps, size, seed)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # Dr.Jit has threads of its own; with both, a step took 2.5 times as long on two cores
-    try:
+    with one_thread():  # Dr.Jit has threads of its own; with both, a step took 2.5 times as long on two cores
         return _refined(start, views, steps, size, seed, on_step or (lambda step, loss: None))
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _check_plan(steps: int, size: int, seed: int) -> None:

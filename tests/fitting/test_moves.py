@@ -12,7 +12,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.fitting.initialize import tree_radius
 from bbfit.fitting.levels import Targets
 from bbfit.fitting.moves import ADDITIONS, REFINEMENTS, Moves
-from bbfit.fitting.points import mesh_points
+from bbfit.fitting.points import SeenPoints, mesh_points
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.operators.drawing.reference import render_reference
 from bbfit.operators.image_loss.reference import pixel_loss_reference
@@ -41,7 +41,7 @@ def points(views: ViewSet) -> torch.Tensor:
 @pytest.fixture(scope="module")
 def moves(views: ViewSet, targets: Targets, points: torch.Tensor) -> Moves:
     pictures, generator = targets.pictures(range(len(views))), torch.Generator().manual_seed(0)
-    return Moves(points, targets.cameras, pictures, FitConfig().resolve(), tree_radius(views), generator)
+    return Moves(SeenPoints.of(points, targets.cameras, pictures), FitConfig().resolve(), tree_radius(views), generator)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_points_belong_to_the_billboard_that_moves_them_least(moves: Moves, clus
     local = torch.einsum("nij,pnj->pni", axes, points[:, None] - clustered.centers.double())
     inside = torch.minimum(torch.maximum(local[..., :2], -clustered.half_extents.double()), clustered.half_extents.double())
     moved = torch.cat([local[..., :2] - inside, local[..., 2:]], -1)
-    seen = torch.einsum("pni,nij,jk,nlk,pnl->pn", moved[..., 2:], axes[:, 2:], moves.projection, axes[:, 2:], moved[..., 2:])
+    seen = torch.einsum("pni,nij,jk,nlk,pnl->pn", moved[..., 2:], axes[:, 2:], moves.seen.projection, axes[:, 2:], moved[..., 2:])
     assert torch.equal(carried, (seen + moved[..., :2].square().sum(-1)).argmin(-1))
     assert len(carried.unique()) == len(clustered)
     # Beyond a rectangle's border its plane is of no use.
@@ -102,7 +102,7 @@ def test_merging_takes_two_that_lie_almost_on_one_plane(moves: Moves, clustered:
     assert len(merged) == 3
     given_up = [k for k in range(4) if k not in kept(cloud, merged)]
     held = points[torch.isin(moves.nearest(cloud), torch.tensor(given_up))]
-    least = best_planes(moments(held, torch.zeros(len(held), dtype=torch.int64), 1), moves.projection, upright=False)[2]
+    least = best_planes(moments(held, torch.zeros(len(held), dtype=torch.int64), 1), moves.seen.projection, upright=False)[2]
     assert float(on_planes(merged.take([2]), held)) == pytest.approx(float((least / len(held)).sqrt()), rel=1e-3)
     if turn % 3 == 0:
         assert given_up == [0, 3]
