@@ -13,7 +13,7 @@ from torch import Tensor
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.orbit import Orbit
-from bbfit.operators.drawing.fused import schedule
+from bbfit.operators.drawing.fused import Piece, schedule
 from bbfit.operators.drawing.projection import Projection, project
 
 
@@ -155,10 +155,6 @@ def test_upright_planes_on_a_ring_need_few_rows_apart(fov: float | None) -> None
         assert project(upright(64), camera).rows_apart.max() <= 35  # measured 29
 
 
-Pieces = list[tuple[int, int, int, int]]
-"""A view, how many, and a band of rows, each."""
-
-
 CPU = torch.device("cpu")
 
 
@@ -166,9 +162,9 @@ def test_the_backward_pass_of_an_ordinary_view_runs_on_all_cores() -> None:
     projection = project(upright(512), ring(CORNERS, 512, 512))
     for v in range(len(projection)):
         phases = schedule(projection.take(torch.tensor([v])), CPU)
-        bands = sorted((begin, end) for phase in phases for _, _, begin, end in phase)
+        bands = sorted((piece.begin, piece.end) for phase in phases for piece in phase)
         assert bands[0][0] == 0 and bands[-1][1] == 512 and all(end == begin for (_, end), (begin, _) in pairwise(bands))
-        assert all(piece[:2] == (0, 1) for phase in phases for piece in phase)
+        assert all(piece[:3] == (0, 0, 1) for phase in phases for piece in phase)
         assert all(len(phase) >= 2 for phase in phases)
 
 
@@ -179,13 +175,18 @@ def test_every_row_of_every_view_is_launched_once() -> None:
     for order, expected in (([0, 1, 2], 3), ([1, 2, 0], 3), ([1, 0, 2], 4), ([0, 0, 1], 5), ([1, 2, 1], 1)):
         phases = schedule(wide.take(torch.tensor(order)), CPU)
         assert launched(phases, 3) == [[(0, 64)]] * 3 and len(phases) == expected
-    assert schedule(wide.grouped(2), CPU) == [[(0, 3, 0, 64), (3, 3, 0, 64)]]
+    for gradients in (2, 3, 9):
+        phases = schedule(wide, CPU, gradients)
+        assert launched(phases, 3) == [[(0, 64)]] * 3
+        assert {piece.gradient for phase in phases for piece in phase} == set(range(min(gradients, 3)))
+        assert len(phases) == 2  # those of the view that is cut up, and at the same time the others
+    assert schedule(wide.grouped(2), CPU) == [[(0, 0, 3, 0, 64), (0, 3, 3, 0, 64)]]
 
 
-def launched(phases: list[Pieces], views: int) -> list[list[tuple[int, int]]]:
+def launched(phases: list[list[Piece]], views: int) -> list[list[tuple[int, int]]]:
     """The rows of each view that were launched, with bands that meet joined."""
     rows: list[list[tuple[int, int]]] = [[] for _ in range(views)]
-    for view, number, begin, end in sorted(piece for phase in phases for piece in phase):
+    for _, view, number, begin, end in sorted(piece for phase in phases for piece in phase):
         for v in range(view, view + number):
             if rows[v] and rows[v][-1][1] == begin:
                 begin = rows[v].pop()[0]
@@ -200,7 +201,7 @@ def test_bands_that_run_at_once_touch_different_texels() -> None:
             texel, row = touched(cloud, camera.batch()[v : v + 1])[0].unbind(-1)
             projection = replace(project(cloud, camera.batch()[v : v + 1]), least_pixels=1)
             for phase in schedule(projection, CPU):
-                seen = [set(texel[(row >= begin) & (row < end)].tolist()) for _, _, begin, end in phase]
+                seen = [set(texel[(row >= piece.begin) & (row < piece.end)].tolist()) for piece in phase]
                 assert len(set().union(*seen)) == sum(map(len, seen))
                 parallel += len(phase) > 1
     assert parallel >= 20

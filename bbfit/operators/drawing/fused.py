@@ -6,9 +6,10 @@ import ctypes
 import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from itertools import chain, zip_longest
 from queue import SimpleQueue
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -29,6 +30,9 @@ from bbfit.operators.launching import compile_for, in_parallel, pieces_of, struc
 
 # Most bands of rows that a picture is cut into. Independent of the number of threads, which must not change the order of sums.
 MOST_BANDS = 32
+# Most parts of the views that are differentiated at once, each with a gradient of its own, and most texels of further gradients for each
+# pixel. Both are independent of the number of threads too.
+MOST_GRADIENTS, MOST_TEXELS = 4, 3
 
 
 def render_fused(cloud: BillboardCloud, camera: Camera) -> Tensor:
@@ -47,6 +51,21 @@ def render_projection(texels: Tensor, projection: Projection) -> Tensor:
     if projection.alpha.kind == "hash":
         return draw(texels.detach().contiguous(), projection)
     return _Drawing.apply(texels, projection.to_texel, projection)
+
+
+class Piece(NamedTuple):
+    """A part of a backward pass for one thread."""
+
+    gradient: int
+    """Index of the gradient that it adds to."""
+    view: int
+    """First view."""
+    views: int
+    """Number of views."""
+    begin: int
+    """First row, with which a strip begins."""
+    end: int
+    """Row after the last one."""
 
 
 class _Drawing(torch.autograd.Function):
@@ -129,45 +148,60 @@ def differentiate(
         arguments += [projection.height, warp_array(nothing if image_gradient is None else image_gradient, wp.vec4)]
         arguments.append(warp_array(target.view(torch.int32).squeeze(-1), wp.int32))
         arguments += [int(loss.straight), LOSSES[loss.kind], loss.weight, int(loss.own_colors)] if loss else [0, 0, 0.0, 0]
-        outputs = [warp_array(sums, wp.float32), warp_array(texel_gradient, wp.vec4)]
-        outputs += [warp_array(matrices.view(-1, 3, 3), wp.mat33d), strips]
+        most = min(MOST_GRADIENTS, 1 + MOST_TEXELS * views * projection.height * projection.width // max(len(texels), 1))
+        phases = schedule(projection, device, most)
+        further = torch.zeros(max(piece.gradient for phase in phases for piece in phase), *texels.shape, device=device)
+        gradients = [warp_array(gradient, wp.vec4) for gradient in (texel_gradient, *further)]
+        of_loss, of_placement = warp_array(sums, wp.float32), [warp_array(matrices.view(-1, 3, 3), wp.mat33d), strips]
         on = wp.device_from_torch(device)
         compile_for(compiled.differentiate, on)
         with_tile = _scratch(compiled, device)
 
-        def launch(view: int, number: int, begin: int, end: int) -> None:
+        def launch(gradient: int, view: int, number: int, begin: int, end: int) -> None:
             size, first = (number, -(-(end - begin) // compiled.rows), runs), begin // compiled.rows
             with with_tile() as tile:
+                outputs = [of_loss, gradients[gradient], *of_placement]
                 wp.launch(compiled.differentiate, size, [*tile, view, first, *arguments], outputs, device=on)
 
-        for phase in schedule(projection, device):
+        for phase in phases:
             in_parallel(launch, phase)
+        for gradient in further:
+            texel_gradient += gradient
     return (sums.sum(-1, dtype=torch.float64) if loss else None), (matrices.sum(1) if placement else None)
 
 
-def schedule(projection: Projection, device: torch.device) -> list[list[tuple[int, int, int, int]]]:
-    """Phases of a backward pass, whose pieces run at the same time; a piece is a first view, a number of views, and a band of rows
-    that begins with a strip.
+def schedule(projection: Projection, device: torch.device, gradients: int = 1) -> list[list[Piece]]:
+    """Phases of a backward pass, whose pieces run at the same time.
 
-    On a CPU bands of equal parity touch different texels: no two threads add to the same texel, and every sum has one order. CUDA adds
-    atomically. Pictures are not cut into bands of fewer than ``projection.least_pixels``.
+    On a CPU, no two threads add to the same texel of a gradient, and every sum has one order: the views are divided among ``gradients``,
+    and a view's bands of equal parity touch different texels. CUDA adds atomically. Pictures are not cut into bands of fewer than
+    ``projection.least_pixels``.
     """
-    views, height, width = len(projection), projection.height, projection.width
+    views, height = len(projection), projection.height
     if device.type == "cuda":
-        return [[(0, views, 0, height)]]
+        return [[Piece(0, 0, views, 0, height)]]
+    share = views // projection.groups
+    parts = pieces_of(share, 1, gradients)
     if projection.groups > 1:
-        share = views // projection.groups
-        return [[(group * share, share, 0, height) for group in range(projection.groups)]]
-    phases = list[list[tuple[int, int, int, int]]]()
-    for view, apart in enumerate(projection.rows_apart.tolist()):
+        starts = range(0, views, share)
+        return [[Piece(n, start + begin, end - begin, 0, height) for start in starts for n, (begin, end) in enumerate(parts)]]
+    of_parts = [_phases(projection, n, *part) for n, part in enumerate(parts)]
+    return [list(chain(*phases)) for phases in zip_longest(*of_parts, fillvalue=[])]
+
+
+def _phases(projection: Projection, gradient: int, first: int, last: int) -> list[list[Piece]]:
+    """The phases of the views from ``first`` to before ``last``, which add to one gradient."""
+    height, width = projection.height, projection.width
+    phases = list[list[Piece]]()
+    for view, apart in enumerate(projection.rows_apart[first:last].tolist(), first):
         strips = pieces_of(-(-height // STRIP), -(-max(apart, -(-projection.least_pixels // width)) // STRIP), MOST_BANDS)
-        bands = [(STRIP * begin, min(STRIP * end, height)) for begin, end in strips]
+        bands = [Piece(gradient, view, 1, STRIP * begin, min(STRIP * end, height)) for begin, end in strips]
         if len(bands) > 3:
-            phases += [[(view, 1, *band) for band in bands[parity::2]] for parity in (0, 1)]
+            phases += [bands[::2], bands[1::2]]
         elif phases and len(phases[-1]) == 1:  # views that are not cut form one piece
-            phases[-1] = [(phases[-1][0][0], phases[-1][0][1] + 1, 0, height)]
+            phases[-1] = [phases[-1][0]._replace(views=phases[-1][0].views + 1)]
         else:
-            phases.append([(view, 1, 0, height)])
+            phases.append([Piece(gradient, view, 1, 0, height)])
     return phases
 
 
