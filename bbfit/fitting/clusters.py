@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from operator import itemgetter
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -75,9 +76,11 @@ class _Costs:
     def _least(self, forms: Tensor) -> tuple[Tensor, Tensor]:
         """The least value at each point of K symmetric forms, [K, 4, 4], and the index of that form."""
         twice = torch.where(self._rows == self._columns, 1, 2)
-        coefficients = (twice * forms[:, self._rows, self._columns]).float().mT.contiguous()
-        parts = [(part @ coefficients).min(-1) for part in self._products.split(max(1, _IN_CACHE // len(forms)))]
-        return torch.cat([part.values for part in parts]), torch.cat([part.indices for part in parts])
+        coefficients = (twice * forms[:, self._rows, self._columns]).float()
+        parts = self._products.split(max(1, _IN_CACHE // len(forms)))
+        # numpy instead of torch, whose argmin takes several times as long
+        labels = torch.from_numpy(np.concatenate([(part @ coefficients.mT).numpy().argmin(-1) for part in parts]))
+        return (self._products * coefficients[labels]).sum(-1), labels
 
 
 def view_projection(camera: Camera) -> Tensor:

@@ -98,8 +98,8 @@ def find_placement(
 
     If ``billboards`` is None, their number is chosen at the knee of the curve, within ``least_billboards`` and ``most_billboards``. What a
     graphics card pays for is the pixels that it shades, and they grow with the number of layers before each other. Two quick
-    searches measure the layers of few and of many billboards, and the number of billboards with ``most_layers`` is interpolated on a
-    logarithmic scale. If a doubling of the number would gain less than :data:`LEAST_GAIN_DB`, it is the smaller one.
+    searches with one candidate measure the layers of few and of many billboards, and the number of billboards with ``most_layers`` is
+    interpolated on a logarithmic scale. If a doubling of the number would gain less than :data:`LEAST_GAIN_DB`, it is the smaller one.
 
     ``on_progress`` is called with the work done and the total work. The result is float32 on the CPU and has fitted textures, with the
     texel density of pictures of about :data:`SIDE` pixels.
@@ -158,32 +158,41 @@ def _at_the_knee(tree: _Tree, config: ResolvedFit, on_progress: Callable[[int, i
     """The placement of as many billboards as pay for the tree; see :func:`find_placement`."""
 
     def tried(number: int, count: int) -> _Trial:
-        cloud, search = _found(tree, config.counted(count), lambda done, total: None, QUICK)
+        whole = config.counted(count)
+        brief = replace(whole, restarts=1, candidates=1, refinement_rounds=0)
+        cloud, search = _found(tree, brief, lambda done, total: None, QUICK)
         on_progress(number, _SEARCHES)
-        return _Trial(count, cloud, search.layers(cloud), search.decibels(cloud))
+        return _Trial(count, cloud if brief == whole else None, search.layers(cloud), search.decibels(cloud))
+
+    def chosen(count: int, *trials: _Trial) -> BillboardCloud:
+        clouds = [trial.cloud for trial in trials if trial.count == count and trial.cloud is not None]
+        return clouds[0] if clouds else _found(tree, config.counted(count), lambda done, total: None, QUICK)[0]
 
     first = tried(1, min(max(_FIRST, config.least_billboards), config.most_billboards))
     other = config.most_billboards if first.layers <= config.most_layers else config.least_billboards
     if other == first.count:
-        return first.cloud
+        return chosen(other, first)
     few, many = sorted([first, tried(2, other)], key=attrgetter("count"))
     doublings = math.log2(many.count / few.count)
     if many.decibels - few.decibels < LEAST_GAIN_DB * doublings or few.layers >= config.most_layers:
-        return few.cloud
+        return chosen(few.count, few)
     if many.layers <= config.most_layers:
-        return many.cloud
+        return chosen(many.count, many)
     position = (config.most_layers - few.layers) / (many.layers - few.layers)
-    return tried(3, round(few.count * 2 ** (doublings * position))).cloud
+    return chosen(round(few.count * 2 ** (doublings * position)), few, many)
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """A placement of a number of billboards, with its layers and its quality at the resolution of the search."""
+    """What a short search with one candidate says of a number of billboards."""
 
     count: int
-    cloud: BillboardCloud
+    cloud: BillboardCloud | None
+    """The placement, if a whole search would have found the same."""
     layers: float
+    """As :meth:`_Search.layers`."""
     decibels: float
+    """Quality at the resolution of the search."""
 
 
 class _Search:
