@@ -56,12 +56,17 @@ class _Costs:
         self._rows, self._columns = torch.triu_indices(4, 4)
         extended = torch.nn.functional.pad(points - self._origin, (0, 1), value=1.0)
         self._products = (extended[:, self._rows] * extended[:, self._columns]).float()
+        self._squares = _squares(points)
 
     def least(self, normals: Tensor, offsets: Tensor, centers: Tensor) -> tuple[Tensor, Tensor]:
         """The least cost of each point in K clusters, float32 [P], and its cluster, int64 [P]."""
         planes = torch.cat([normals, (normals @ self._origin - offsets)[:, None]], -1)
         visible = _form(self.projection, normals).clamp_min(0)
         return self._least(visible[:, None, None] * planes[:, :, None] * planes[:, None, :] + self._locality * self._distances(centers))
+
+    def moments(self, labels: Tensor, count: int) -> Tensor:
+        """The :func:`moments` of ``count`` clusters of the points."""
+        return _summed(self._squares, labels, count)
 
     def nearest(self, centers: Tensor) -> Tensor:
         """The index of the center, of [K, 3], nearest to each point, int64 [P]."""
@@ -105,9 +110,9 @@ def cluster_planes(
     centers, costs = points[torch.randint(len(points), (count,), generator=generator)], _Costs(points, projection, locality)
     if locality:
         for _ in range(_MEANS_ITERATIONS):
-            sums = moments(points, costs.nearest(centers), count)
+            sums = costs.moments(costs.nearest(centers), count)
             centers = torch.where(sums[:, 3, 3:] > 0, _centers(sums), centers)
-        normals, offsets, _ = best_planes(moments(points, costs.nearest(centers), count), projection, upright=upright)
+        normals, offsets, _ = best_planes(costs.moments(costs.nearest(centers), count), projection, upright=upright)
     else:
         if upright:
             normals[:, 1] = 0
@@ -125,7 +130,7 @@ def split_planes(points: Tensor, axes: Tensor, projection: Tensor, *, upright: b
     results, costs = [], _Costs(points, projection, locality)
     for axis in axes.to(points):
         along = points @ axis
-        sums = moments(points, (along > along.median()).long(), 2)
+        sums = costs.moments((along > along.median()).long(), 2)
         normals, offsets, _ = best_planes(sums, projection, upright=upright)
         results.append(_refined(points, normals, offsets, _centers(sums), costs, upright=upright))
     return min(results, key=itemgetter(1))[0]
@@ -145,7 +150,7 @@ def _refined(points: Tensor, normals: Tensor, offsets: Tensor, centers: Tensor, 
         if torch.equal(nearest, labels):
             break
         labels = nearest
-        sums = moments(points, labels, count)
+        sums = costs.moments(labels, count)
         new_normals, new_offsets, _ = best_planes(sums, costs.projection, upright=upright)
         enough = sums[:, 3, 3] >= 3
         normals = torch.where(enough[:, None], new_normals, normals)
@@ -165,8 +170,17 @@ def moments(points: Tensor, labels: Tensor, count: int) -> Tensor:
 
     The moments of a union of clusters are the sum of their moments.
     """
+    return _summed(_squares(points), labels, count)
+
+
+def _squares(points: Tensor) -> Tensor:
+    """p p^T of the points p = (x, y, z, 1), [P, 4, 4]."""
     extended = torch.nn.functional.pad(points, (0, 1), value=1.0)
-    return points.new_zeros(count, 4, 4).index_add_(0, labels, extended[:, :, None] * extended[:, None, :])
+    return extended[:, :, None] * extended[:, None, :]
+
+
+def _summed(squares: Tensor, labels: Tensor, count: int) -> Tensor:
+    return squares.new_zeros(count, 4, 4).index_add_(0, labels, squares)
 
 
 def best_planes(sums: Tensor, projection: Tensor, *, upright: bool) -> tuple[Tensor, Tensor, Tensor]:

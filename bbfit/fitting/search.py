@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 
 import torch
 from torch import Tensor
@@ -235,31 +235,36 @@ class _Search:
 
     def best(self) -> BillboardCloud:
         """See :func:`find_placement`."""
-        best = min((self.searched(number) for number in range(self._restarts)), key=itemgetter(1))
+        best = self._best_of([self.searched(number) for number in range(self._restarts)])
         for number in range(self._rounds):
-            best = min(best, self._best_of([best[0], *self.moves.refined(best[0], number, self._losses)]), key=itemgetter(1))
-        return best[0]
+            best = self._best_of([best, *self._mended([best, *self.moves.refined(best, number, self._losses)])])
+        return best
 
-    def searched(self, number: int) -> tuple[BillboardCloud, float]:
-        """Run search ``number``. Return its cloud and the loss."""
+    def searched(self, number: int) -> BillboardCloud:
+        """Run search ``number``. Return its cloud."""
         with one_thread(), ThreadPoolExecutor(self._tree.threads) as pool:
             starts = range(number * self._candidates, (number + 1) * self._candidates)
             clouds = list(pool.map(lambda start: self.moves.clustered(start, self._clusters), starts))
-        clouds, losses = self._fitted(clouds, self._effort.steps, _RATE)
-        survivors = sorted(range(len(clouds)), key=losses.__getitem__)[: self._survivors]
-        clouds, losses = self._fitted([clouds[index] for index in survivors], self._effort.more_steps, _LATER_RATE)
-        best = sorted(zip(clouds, losses, strict=True), key=itemgetter(1))[: self._chains]
+        clouds = self._ranked(self._fitted(clouds, self._effort.steps, _RATE))[: self._survivors]
+        clouds = self._ranked(self._fitted(clouds, self._effort.more_steps, _LATER_RATE))[: self._chains]
         for _ in range(self._added):
-            best = sorted((self._best_of(self.moves.extended(cloud, self._losses)) for cloud, _ in best), key=itemgetter(1))
-            best = best[: max(1, len(best) // 2)]
-        return best[0]
+            clouds = self._ranked([self._best_of(self._mended(self.moves.extended(cloud, self._losses))) for cloud in clouds])
+            clouds = clouds[: max(1, len(clouds) // 2)]
+        return clouds[0]
 
-    def _best_of(self, clouds: list[BillboardCloud]) -> tuple[BillboardCloud, float]:
-        """Fit clouds for some steps. Return the best one and its loss."""
-        return min(zip(*self._fitted(clouds, self._effort.mend_steps, _LATER_RATE), strict=True), key=itemgetter(1))
+    def _ranked(self, clouds: list[BillboardCloud]) -> list[BillboardCloud]:
+        """Clouds in the order of their losses over all views, the least first."""
+        return sorted(clouds, key=lambda cloud: float(self._losses(cloud).mean())) if len(clouds) > 1 else clouds
 
-    def _fitted(self, clouds: list[BillboardCloud], steps: int, rate: float) -> tuple[list[BillboardCloud], list[float]]:
-        """Fit clouds of equal size side by side, placement and textures. Return the clouds and their losses over all views."""
+    def _best_of(self, clouds: list[BillboardCloud]) -> BillboardCloud:
+        return self._ranked(clouds)[0]
+
+    def _mended(self, clouds: list[BillboardCloud]) -> list[BillboardCloud]:
+        """Fit changed clouds for some steps."""
+        return self._fitted(clouds, self._effort.mend_steps, _LATER_RATE)
+
+    def _fitted(self, clouds: list[BillboardCloud], steps: int, rate: float) -> list[BillboardCloud]:
+        """Fit clouds of equal size side by side, placement and textures."""
         config, joined = self._config, BillboardCloud.joined(clouds)
         movement = Movement(joined, self._tree.radius, grow=not self._locality) if config.placement_learning_rate else None
         stepper = Stepper(joined.to(config.device), self._tree.targets, config, movement, groups=len(clouds))
@@ -269,8 +274,7 @@ class _Search:
             stepper.step(batch, rate * decay, config.placement_learning_rate * decay)
             self._done += len(clouds)
             self._on_progress(self._done, self._total)
-        clouds = stepper.finish().parts(len(clouds))
-        return clouds, [float(self._losses(cloud).mean()) for cloud in clouds]
+        return stepper.finish().parts(len(clouds))
 
     def _losses(self, cloud: BillboardCloud) -> Tensor:
         """Compute the loss of every pixel of every training view, [V, H, W]."""
