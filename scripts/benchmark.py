@@ -21,8 +21,6 @@ start     starting up: ``bbfit --help`` and ``import bbfit`` (medians of five), 
           of compiled kernels; only with ``--only start``
 render    the default views of a grown aspen, with all samples for training views and with the default number; only with ``--only render``
 run       the stages of ``bbfit run`` without a tree and without options; only with ``--only run``
-scaling   milliseconds of a fused step by the size of the picture, the number of billboards and the number of views; only with
-          ``--only scaling``
 memory    the peak resident memory of a default fit of 360 views at 1024 x 1024, in a separate process
 
 PSNR, SSIM and FLIP are means over four backgrounds.
@@ -74,7 +72,7 @@ WARM_STEPS = {"default": 160, "thesis": 1200}
 """Number of steps at an eighth of the size. Each finer level has half as many."""
 RAMP = AlphaMode("mask", 0.2, 4.0, antialiased=True)
 """A mask in the middle of a fit."""
-ROWS = ("grow", "steps", "quality", "placement", "start", "render", "run", "scaling", "memory")
+ROWS = ("grow", "steps", "quality", "placement", "start", "render", "run", "memory")
 """What ``--only`` can choose."""
 Row = dict[str, Any]
 
@@ -280,21 +278,6 @@ def steps(quick: bool) -> list[Row]:
     return rows
 
 
-def scaling() -> list[Row]:
-    """Measure the rows ``scaling``."""
-    rows, views, device = [], bbfit.ViewDataset.load(DATA / "views").train, torch.device("cpu")
-    cases = [("pixels", size, 4, 1) for size in (128, 256, 512, 1024, 2048)]
-    cases += [("billboards", 512, count, 1) for count in (4, 8, 16, 32, 64)]
-    cases += [("views", 512, 4, batch) for batch in (1, 2, 4, 8, 16)]
-    for what, size, count, batch in cases:
-        large = enlarged(views, size)
-        stepper = warm(large, bbfit.FitConfig(billboards=count, levels=1, placement="even", texel_density=1).resolve(), device)
-        samples = [[(turn + view) % len(large) for view in range(batch)] for turn in range(12)]
-        seconds = statistics.median(seconds_of(partial(stepper.step, sample, 0.01), device) for sample in samples)
-        rows.append({"name": "scaling", "of": what, "size": size, "billboards": count, "views": batch, "ms": round(1000 * seconds, 2)})
-    return rows
-
-
 def quality(folders: list[Path]) -> list[Row]:
     """Measure the rows ``quality``."""
     rows = []
@@ -455,7 +438,7 @@ def main() -> None:
         rows += quality(arguments.views or [DATA / "views"])
     if "placement" in selected:
         rows += placement(arguments.views or [DATA / "views"])
-    others = {"grow": lambda: grow(arguments.quick), "start": starting, "render": rendering, "run": whole, "scaling": scaling}
+    others = {"grow": lambda: grow(arguments.quick), "start": starting, "render": rendering, "run": whole}
     others["memory"] = memory
     for name, measured in others.items():
         if name in selected:
