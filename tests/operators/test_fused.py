@@ -14,7 +14,9 @@ from torch import Tensor
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
+from bbfit.operators.drawing import fused
 from bbfit.operators.drawing.fused import differentiate, render_fused, render_projection
+from bbfit.operators.drawing.kernels import kernels
 from bbfit.operators.drawing.projection import Projection, project
 from bbfit.operators.drawing.reference import render_reference
 from bbfit.operators.image_loss.fused import PixelLoss
@@ -366,3 +368,14 @@ def test_a_thread_a_pixel_gives_the_same(count: int) -> None:
     for seed in range(5):
         for orthographic in (False, True):
             assert max(errors(*random_scene(seed, count, orthographic=orthographic), launched(lanes=1)).values()) < ALLOWED
+
+
+def test_a_single_pixel_has_room_for_its_layers_not_for_all_billboards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU, where threads have little memory: 60 small billboards are scattered, and a pixel meets at most 16 of them."""
+    rooms = list[int]()
+    monkeypatch.setattr(fused, "kernels", lambda capacity, lanes: rooms.append(capacity) or kernels(capacity, lanes))
+    for seed in range(3):
+        cloud, _ = random_scene(seed, 60, orthographic=False)
+        cloud = replace(cloud, half_extents=0.06 * cloud.half_extents)
+        assert max(errors(cloud, camera_on_z(24, 20), launched(lanes=1)).values()) < ALLOWED
+    assert set(rooms) <= {8, 16}

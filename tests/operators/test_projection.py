@@ -90,6 +90,19 @@ def test_every_pixel_that_hits_lies_in_its_box() -> None:
     assert hits > 30_000
 
 
+def test_the_most_layers_are_those_of_the_pixel_that_is_in_most_boxes() -> None:
+    most = 0
+    for cloud, camera in scenes(12):
+        projection = project(cloud, camera)
+        y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+        left, right, top, bottom = projection.boxes[..., None, None].unbind(2)
+        inside = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
+        assert projection.most_layers() == int(inside.sum(1).max())
+        most = max(most, projection.most_layers())
+    assert most == 3
+    assert project(cloud.take([]), camera).most_layers() == 0
+
+
 def test_boxes_are_no_larger_than_they_must_be() -> None:
     """A rectangle of 2 m at 3 m, seen at 4 pixels a meter: its corners and its margins of a quarter meter are known."""
     cloud, camera = facing_cloud([3.0], [(8, 8)]), camera_on_z(33, 21, fov=None, extent=33 / 4)

@@ -228,7 +228,9 @@ def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -
     """Compiled kernels, the number of threads for a row of tiles, and the arguments that both kernels begin with after their offsets."""
     lanes = 1 if texels.is_cuda else projection.lanes
     run = 1 if lanes == 1 else projection.width
-    compiled = kernels(max(4, 1 << (projection.count - 1).bit_length()), lanes)  # for the next power of two of billboards
+    # A single pixel needs room for the layers that meet there, a tile for all billboards; at least for the next power of two.
+    layers = projection.most_layers() if lanes == 1 else projection.count
+    compiled = kernels(max(4, 1 << (layers - 1).bit_length()), lanes)
     numbers = [projection.to_texel.detach().flatten(2), projection.nearness]
     planes = torch.cat([*(part.contiguous().view(torch.int32) for part in numbers), projection.textures, projection.boxes], -1)
     occupied = occupancy(texels.detach()) if occupied is None else occupied

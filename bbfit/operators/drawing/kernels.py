@@ -54,8 +54,10 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
 @cache
 def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
-    """The kernels ``draw`` and ``differentiate``, compiled for at most ``capacity`` billboards and tiles of ``lanes`` pixels: 1 on CUDA, 16
-    on a CPU."""
+    """The kernels ``draw`` and ``differentiate``, compiled for tiles of ``lanes`` pixels: 1 on CUDA, 16 on a CPU.
+
+    A tile has room for ``capacity`` billboards, a single pixel for as many layers.
+    """
     own = tiles(capacity, lanes)
     Tile, restart, narrow, meet, arrange, sample, blend = own.Tile, own.restart, own.narrow, own.meet, own.arrange, own.sample, own.blend
     vacant, store, anything, compare, pull_back, scatter = own.vacant, own.store, own.anything, own.compare, own.pull_back, own.scatter

@@ -56,6 +56,16 @@ class Projection:
         """Number N of billboards."""
         return self.boxes.shape[1]
 
+    def most_layers(self) -> int:
+        """The largest number of billboards whose boxes have a pixel in common."""
+        left, right, top, bottom = self.boxes.long().unbind(-1)
+        drawn = ((left <= right) & (top <= bottom)).int()
+        counts = self.boxes.new_zeros(len(self), self.height + 1, self.width + 1)
+        view = torch.arange(len(self), device=counts.device)[:, None].expand_as(left)
+        for sign, row, column in ((1, top, left), (-1, top, right + 1), (-1, bottom + 1, left), (1, bottom + 1, right + 1)):
+            counts.index_put_((view, row, column), sign * drawn, accumulate=True)
+        return int(counts.cumsum(1).cumsum(2).max()) if counts.numel() else 0
+
     def take(self, views: Tensor) -> Projection:
         """The projection into some of the views, int64 [B]."""
         per_view = ("to_texel", "nearness", "textures", "boxes", "rows_apart")
