@@ -1,10 +1,10 @@
-"""Report what CUDA kernels need of a GPU, without one: python scripts/cuda_report.py [--architectures N ...] [--billboards N ...]
+"""Report what CUDA kernels need of a GPU, without one: python scripts/cuda_report.py [--architectures N ...] [--layers N ...]
 
 NVRTC compiles all kernels that a fit launches. The report reads from its machine code, for each kernel and architecture:
 
 registers   of a thread
-local       bytes of local memory of a thread: arrays that are indexed, and spilled registers. The kernels of drawing have arrays with an
-            entry for each billboard, rounded up to a power of two; a pixel uses as many entries as it meets billboards
+local       bytes of local memory of a thread: arrays that are indexed, and spilled registers. The kernels of drawing have arrays with room
+            for the most layers in a pixel, rounded up to a power of two
 occupancy   resident warps that the registers allow, over those that a multiprocessor can hold, for blocks of 256 threads
 """
 
@@ -67,9 +67,9 @@ def of_kernel(kernel: Any, architecture: int) -> Row:
     return {"architecture": architecture, "registers": found[COUNT], "local": found[FRAME], "occupancy": round(occupancy, 2)}
 
 
-def report(architectures: Sequence[int], billboards: Sequence[int]) -> Iterator[Row]:
-    """The rows, one for each kernel, number of billboards and architecture."""
-    kernels = [(f"drawing.{name}, {count}", getattr(drawing(count, 1), name)) for count in billboards for name in ("draw", "differentiate")]
+def report(architectures: Sequence[int], layers: Sequence[int]) -> Iterator[Row]:
+    """The rows, one for each kernel, number of layers and architecture."""
+    kernels = [(f"drawing.{name}, {count}", getattr(drawing(count, 1), name)) for count in layers for name in ("draw", "differentiate")]
     kernels += [("ssim.sweep", ssim(1).sweep), ("sharpness.measure", sharpness.measure)]
     kernels += [("sharpness.differentiate", sharpness.differentiate), ("adam.update_blocks", update_blocks)]
     for name, kernel in kernels:
@@ -82,11 +82,11 @@ def main() -> None:
     parser.add_argument(
         "--architectures", type=int, nargs="+", choices=MOST_WARPS, default=[75, 90, 120], help="compute capabilities, times ten"
     )
-    parser.add_argument("--billboards", type=int, nargs="+", default=[4, 32, 256], help="numbers of billboards, powers of two from 4 on")
+    parser.add_argument("--layers", type=int, nargs="+", default=[4, 16, 64], help="most layers in a pixel, powers of two from 4 on")
     parser.add_argument("--json", type=Path, help="write the rows to this file as a JSON list")
     arguments = parser.parse_args()
     rows = []
-    for row in report(arguments.architectures, arguments.billboards):
+    for row in report(arguments.architectures, arguments.layers):
         rows.append(row)
         print("  ".join(f"{value}" if key == "kernel" else f"{key} {value}" for key, value in row.items()), flush=True)
     if arguments.json:

@@ -1,10 +1,11 @@
-"""Write the pictures in docs/: python scripts/make_pictures.py [species] [acer] [pages]
+"""Write the pictures in docs/: python scripts/make_pictures.py [species] [acer] [pages] [steps]
 
-All pictures need Blender. ``pages`` also needs Chromium and playwright.
+All but ``steps`` need Blender. ``pages`` also needs Chromium and playwright.
 
 species    species.png: one view of every species that bbfit grows
 acer       acer.png: held-out views of an acer over sky and grass, and the results of the thesis preset and of the default
 pages      report.png and view.png: the report of a run, and its page in ``bbfit view``
+steps      steps.png: the parts of a training step, from the table in performance.md
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from bbfit.images import over_color
 from bbfit.trees.species import known_species
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
+PERFORMANCE = DOCS / "performance.md"
 SEED = 1
 SIZE = 480
 # A thumbnail does not need millions of leaves.
@@ -114,6 +116,27 @@ def draw_pages(run: Path) -> None:
         browser.close()
 
 
+def steps() -> None:
+    """Draw steps.png: the middle of each range in the table of the parts of a step, side by side."""
+    rows = [line.strip("| ").split(" | ") for line in PERFORMANCE.read_text(encoding="utf-8").splitlines() if line.startswith("|")]
+    first = next(index for index, row in enumerate(rows) if "differentiate" in row)
+    names, bars = rows[first], rows[first + 2 : first + 4]
+    figure, axis = plt.subplots(figsize=(9, 2.3))
+    for label, *cells in reversed(bars):
+        left = 0.0
+        for color, name, cell in zip(("#1f5f8b", "#a9c6da", "#c8501e", "#e3a17f", "#3f9e4d", "#8f6bc1"), names, cells, strict=True):
+            width = float(np.mean([float(number) for number in cell.split(" to ")]))
+            axis.barh(label, width, left=left, color=color, height=0.6, label=name if label == bars[-1][0] else None)
+            axis.text(left + width / 2, label, f"{width:.0f}", ha="center", va="center", fontsize=8, color="white")
+            left += width
+    axis.set_xlabel("milliseconds")
+    axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(names), frameon=False, fontsize=8, handlelength=1)
+    axis.spines[["top", "right"]].set_visible(b=False)
+    figure.tight_layout()
+    figure.savefig(DOCS / "steps.png", dpi=110)
+
+
 if __name__ == "__main__":
-    for name in sys.argv[1:] or ["species", "acer", "pages"]:
-        {"species": species, "acer": acer, "pages": pages}[name]()
+    pictures = {"species": species, "acer": acer, "pages": pages, "steps": steps}
+    for name in sys.argv[1:] or pictures:
+        pictures[name]()

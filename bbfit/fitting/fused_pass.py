@@ -14,11 +14,17 @@ from bbfit.fitting.movement import Movement
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.adam.fused import AdamFused
+from bbfit.operators.adam.kernels import update_blocks
 from bbfit.operators.drawing.fused import differentiate, draw
+from bbfit.operators.drawing.fused import kernels_for as drawing_kernels
 from bbfit.operators.drawing.projection import Projection, project
+from bbfit.operators.drawing.projection_kernels import project_planes
 from bbfit.operators.drawing.projector import Projector
 from bbfit.operators.image_loss.fused import PixelLoss, add_structure, unpacked
-from bbfit.operators.launching import cores_for_kernels
+from bbfit.operators.image_loss.kernels import unpack
+from bbfit.operators.launching import compile_together, cores_for_kernels
+from bbfit.operators.sharpness.kernels import measure
+from bbfit.operators.ssim.fused import kernels_for as ssim_kernels
 
 
 class FusedPass:
@@ -33,6 +39,23 @@ class FusedPass:
         self._scratch: list[Tensor] | None = None
         self._fixed = None if movement else project(cloud, targets.cameras.to(cloud.texels.device))
         self._projector = Projector(cloud, targets.cameras) if movement else None
+        self._compile(len(cloud) // groups, cloud.texels.device)
+
+    def _compile(self, count: int, device: torch.device) -> None:
+        """Compile the kernels of a step that are not compiled yet."""
+        on_gpu, config = device.type == "cuda", self._config
+        kernels = [update_blocks, project_planes]
+        if not on_gpu:  # there the kernels depend on the layers in a picture
+            drawing = drawing_kernels(count)
+            kernels += [drawing.draw, drawing.differentiate]
+        if config.ssim_weight:
+            structure = ssim_kernels(self._targets.cameras.width, on_gpu)
+            kernels += [structure.sweep, structure.find_extents, structure.widen_extents]
+        if config.sharpness_weight:
+            kernels += [measure]
+        if config.ssim_weight or config.sharpness_weight:
+            kernels += [unpack]
+        compile_together(kernels, device)
 
     def differentiate(self, state: AdamFused, chosen: Sequence[int], alpha: AlphaMode, moves: bool) -> tuple[Tensor, Tensor | None]:
         """Add the gradient in the texels to ``state.gradient``, for the chosen views drawn in an alpha mode.

@@ -93,6 +93,13 @@ def compile_for(kernel: Any, on: Any) -> None:
         kernel.module.load(on, None if on.is_cuda else 1)  # the size of blocks, which is 1 in all launches on a CPU
 
 
+def compile_together(kernels: Iterable[Any], device: torch.device) -> None:
+    """:func:`compile_for` several kernels side by side, which takes less time than one after the other as they are launched."""
+    on, modules = wp.device_from_torch(device), list({kernel.module: None for kernel in kernels})
+    with cache_of_kernels():
+        wp.force_load(on, modules, block_dim=None if on.is_cuda else 1, max_workers=worker_count())
+
+
 def launch(kernel: Any, count: int, least: int, arguments: Sequence[Any], outputs: Sequence[Any] = (), *, across: int = 1, on: Any) -> None:
     """Launch a kernel over [count, across] on a device: at once on a GPU, in pieces of at least ``least`` of ``count`` on a CPU.
 

@@ -33,6 +33,8 @@ MOST_BANDS = 32
 # Most parts of the views that are differentiated at once, each with a gradient of its own, and most texels of further gradients for each
 # pixel. Both are independent of the number of threads too.
 MOST_GRADIENTS, MOST_TEXELS = 4, 3
+# Least room for layers of a tile on a CPU.
+_ROOM = 512
 
 
 def render_fused(cloud: BillboardCloud, camera: Camera) -> Tensor:
@@ -205,6 +207,14 @@ def _phases(projection: Projection, gradient: int, first: int, last: int) -> lis
     return phases
 
 
+def kernels_for(layers: int, lanes: int = Projection.lanes) -> SimpleNamespace:
+    """The kernels for tiles of ``lanes`` pixels, with room for as many layers: of a single pixel, or for all billboards of a tile.
+
+    Room is a power of two, so that few numbers of billboards need kernels of their own. On a CPU it costs nothing that is not used.
+    """
+    return kernels(max(4 if lanes == 1 else _ROOM, 1 << (layers - 1).bit_length()), lanes)
+
+
 def _scratch(compiled: SimpleNamespace, device: torch.device) -> Callable[[], AbstractContextManager[list[Any]]]:
     """A context that lends a tile's memory to a launch, as the first arguments of both kernels. On CUDA every thread has its own."""
     workers, words = (0, 1) if device.type == "cuda" else (worker_count(), ctypes.sizeof(compiled.Tile.ctype) // 4)
@@ -228,9 +238,7 @@ def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -
     """Compiled kernels, the number of threads for a row of tiles, and the arguments that both kernels begin with after their offsets."""
     lanes = 1 if texels.is_cuda else projection.lanes
     run = 1 if lanes == 1 else projection.width
-    # A single pixel needs room for the layers that meet there, a tile for all billboards; at least for the next power of two.
-    layers = projection.most_layers() if lanes == 1 else projection.count
-    compiled = kernels(max(4, 1 << (layers - 1).bit_length()), lanes)
+    compiled = kernels_for(projection.most_layers() if lanes == 1 else projection.count, lanes)
     numbers = [projection.to_texel.detach().flatten(2), projection.nearness]
     planes = torch.cat([*(part.contiguous().view(torch.int32) for part in numbers), projection.textures, projection.boxes], -1)
     occupied = occupancy(texels.detach()) if occupied is None else occupied

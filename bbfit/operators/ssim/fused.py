@@ -34,7 +34,7 @@ def ssim_and_gradient(a: Tensor, b: Tensor, weight: float, out: Tensor | None = 
     a, b, on_gpu, device = a.detach(), b.detach(), a.is_cuda, wp.device_from_torch(a.device)
     views, height, width, channels = a.shape
     pairs, terms = (height + 1) // 2, views * (height - REACH) * (width - REACH) * channels
-    own = kernels(1 if on_gpu or width - REACH < 4 else 4)
+    own = kernels_for(width, on_gpu)
     vector = own.vector
     down, along = (pairs + PAIRS_REACH, -(-width // own.step)) if on_gpu else (1, 1)
 
@@ -67,6 +67,11 @@ def ssim_and_gradient(a: Tensor, b: Tensor, weight: float, out: Tensor | None = 
         compile_for(own.sweep, device)
         in_parallel(sweep, pieces_of(views * pairs, _LEAST_PAIRS))
     return 1 - sums.sum(dtype=torch.float64) / terms, gradient
+
+
+def kernels_for(width: int, on_gpu: bool = False) -> SimpleNamespace:
+    """The kernels for pictures of a width in pixels."""
+    return kernels(1 if on_gpu or width - REACH < 4 else 4)
 
 
 def _ranges(a: Tensor, b: Tensor, own: SimpleNamespace) -> list[Any]:
