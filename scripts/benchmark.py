@@ -17,8 +17,8 @@ quality   for each folder of views: the 10,000 steps of the thesis preset by the
           every 25 steps)
 placement for each folder of views: the thesis preset with four two-sided billboards, with L2 and with L1, and the default preset, which
           has as many vertices; only with ``--only placement``
-start     starting up: ``bbfit --help`` and ``import bbfit`` (medians of five), and a fit of two steps with an empty and with a filled cache
-          of compiled kernels; only with ``--only start``
+start     starting up: ``bbfit --help`` and ``import bbfit`` (medians of five), and a fit of two steps and the first step of a fit, with an
+          empty and with a filled cache of compiled kernels; only with ``--only start``
 render    the default views of a grown aspen, with all samples for training views and with the default number; only with ``--only render``
 run       the stages of ``bbfit run`` without a tree and without options; only with ``--only run``
 memory    the peak resident memory of a default fit of 360 views at 1024 x 1024, in a separate process
@@ -77,12 +77,12 @@ ROWS = ("grow", "steps", "quality", "placement", "start", "render", "run", "memo
 Row = dict[str, Any]
 
 
-def own_process(script: str, *arguments: str) -> Row:
+def own_process(script: str, *arguments: str, environment: Mapping[str, str] = os.environ) -> Row:
     """Run a Python script. Return the JSON object in its last line of output, with the seconds that it took."""
     started = time.perf_counter()
     reading, writing = os.pipe()
     process = os.posix_spawn(
-        sys.executable, [sys.executable, "-c", script, *arguments], os.environ, file_actions=[(os.POSIX_SPAWN_DUP2, writing, 1)]
+        sys.executable, [sys.executable, "-c", script, *arguments], environment, file_actions=[(os.POSIX_SPAWN_DUP2, writing, 1)]
     )
     os.close(writing)
     with os.fdopen(reading) as pipe:
@@ -120,6 +120,20 @@ result = bbfit.fit(views)
 print(json.dumps({"views": len(views.train) + len(views.test), "fit_s": round(result.seconds, 2), "peak_bytes": peak()}))
 """
 )
+
+
+COMPILE = """
+import json, sys, time, bbfit
+from bbfit.fitting.initialize import start_cloud
+from bbfit.fitting.levels import Targets
+from bbfit.fitting.movement import Movement
+from bbfit.fitting.steps import Stepper
+views, config = bbfit.ViewDataset.load(sys.argv[1]).train, bbfit.FitConfig(billboards=4, placement="even").resolve()
+start = start_cloud(views, config)
+began = time.perf_counter()
+Stepper(start, Targets.at(views, 0), config, Movement(start, 1.0)).step([0], 0.01, 0.01)
+print(json.dumps({"compiled_s": round(time.perf_counter() - began, 2)}))
+"""
 
 
 def grow(quick: bool) -> list[Row]:
@@ -357,9 +371,14 @@ def starting() -> list[Row]:
         {"name": "start", "what": what, "seconds": statistics.median(of_command(own) for _ in range(5))} for what, own in commands.items()
     ]
     with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {"WARP_CACHE_PATH": str(Path(folder) / "cache")}
-        for what in ("a short fit, nothing compiled", "a short fit, compiled before"):
-            rows.append({"name": "start", "what": what, "seconds": of_command([*fit, "--out", str(Path(folder) / what)], environment)})
+        for cached in ("nothing compiled", "compiled before"):
+            environment = os.environ | {"WARP_CACHE_PATH": str(Path(folder) / "cache")}
+            fit = [*fit, "--out", str(Path(folder) / cached)]
+            rows.append({"name": "start", "what": f"a short fit, {cached}", "seconds": of_command(fit, environment)})
+        for cached in ("nothing compiled", "compiled before"):
+            environment = os.environ | {"WARP_CACHE_PATH": str(Path(folder) / "another cache")}
+            seconds = own_process(COMPILE, str(DATA / "views"), environment=environment)["compiled_s"]
+            rows.append({"name": "start", "what": f"the first step of a fit, {cached}", "seconds": seconds})
     return rows
 
 

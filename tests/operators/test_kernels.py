@@ -58,7 +58,7 @@ def test_every_kernel_compiles_for_cuda(path: Path, tmp_path: Path) -> None:
 def test_kernels_leave_room_for_others_on_a_multiprocessor(tmp_path: Path) -> None:
     """What the compiler says of registers and local memory, by the script that the documentation names. Measured: 44 to 128 registers."""
     script, file = PACKAGE.parent / "scripts" / "cuda_report.py", tmp_path / "rows.json"
-    subprocess.run([sys.executable, script, "--architectures", "90", "--billboards", "4", "--json", file], check=True, capture_output=True)
+    subprocess.run([sys.executable, script, "--architectures", "90", "--layers", "4", "--json", file], check=True, capture_output=True)
     rows = {row["kernel"]: row for row in json.loads(file.read_text())}
     assert len(rows) == 6 and all(16 <= row["registers"] <= 128 and row["occupancy"] >= 0.25 for row in rows.values())
     # Arrays with an entry for each of four layers, 15 numbers in all, and six pixels.
