@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -100,17 +101,43 @@ def compile_together(kernels: Iterable[Any], device: torch.device) -> None:
         wp.force_load(on, modules, block_dim=None if on.is_cuda else 1, max_workers=worker_count())
 
 
-def launch(kernel: Any, count: int, least: int, arguments: Sequence[Any], outputs: Sequence[Any] = (), *, across: int = 1, on: Any) -> None:
-    """Launch a kernel over [count, across] on a device: at once on a GPU, in pieces of at least ``least`` of ``count`` on a CPU.
+def launch(
+    kernel: Any, length: int, least: int, arguments: Sequence[Any], outputs: Sequence[Any] = (), *, across: int = 1, on: Any
+) -> None:
+    """Launch a kernel over [length, across] on a device: at once on a GPU, in pieces of at least ``least`` of ``length`` on a CPU.
 
     Warp runs a CPU launch in the calling thread; the pieces share all cores. The kernel's first argument is where its piece begins.
     """
-    compile_for(kernel, on)
+    again = repeated(kernel, lambda thread: arguments, outputs, on)
 
     def piece(begin: int, end: int) -> None:
-        wp.launch(kernel, (end - begin, across), [begin, *arguments], outputs, device=on)
+        again((end - begin, across), begin)
 
-    in_parallel(piece, [(0, count)] if on.is_cuda else pieces_of(count, least))
+    in_parallel(piece, [(0, length)] if on.is_cuda else pieces_of(length, least))
+
+
+def repeated(kernel: Any, arguments: Callable[[int], Sequence[Any]], outputs: Sequence[Any], on: Any) -> Callable[..., None]:
+    """A function that launches a kernel on a device, with a size and values of the first parameters, for :func:`in_parallel`.
+
+    ``arguments`` returns the arguments for the other parameters, but ``outputs``, which are the last. It is called once in each thread that
+    launches, with the thread's number, at most :func:`worker_count`, and they are packed for the kernel once. That takes longer than the
+    launch of a small piece.
+    """
+    compile_for(kernel, on)
+    threads, own = count(), threading.local()
+
+    def again(size: tuple[int, ...], *first: Any) -> None:
+        command = getattr(own, "command", None)
+        if command is None:
+            own.inputs = [*first, *arguments(next(threads))]  # of which the command would not keep the memory alive
+            command = own.command = wp.launch(kernel, size, own.inputs, outputs, device=on, record_cmd=True)
+        else:
+            command.set_dim(size)
+            for index, value in enumerate(first):
+                command.set_param_at_index(index, value)
+        command.launch()
+
+    return again
 
 
 @contextmanager
@@ -153,10 +180,10 @@ def in_parallel(launch: Callable[..., None], pieces: Iterable[tuple[int, ...]]) 
         other.result()
 
 
-def pieces_of(count: int, least: int, most: int | None = None) -> list[tuple[int, int]]:
-    """Cut ``range(count)`` into nearly equal pieces of at least ``least``: at most ``most`` of them, or four for each worker."""
-    number = max(1, min(count // max(least, 1), 4 * worker_count() if most is None else most))
-    edges = [count * i // number for i in range(number + 1)]
+def pieces_of(length: int, least: int, most: int | None = None) -> list[tuple[int, int]]:
+    """Cut ``range(length)`` into nearly equal pieces of at least ``least``: at most ``most`` of them, or four for each worker."""
+    number = max(1, min(length // max(least, 1), 4 * worker_count() if most is None else most))
+    edges = [length * i // number for i in range(number + 1)]
     return [(begin, end) for begin, end in pairwise(edges) if end > begin]
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+import threading
 from itertools import chain, zip_longest
-from queue import SimpleQueue
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -26,15 +24,16 @@ from bbfit.operators.drawing.tile_forward import BLENDED, BLOCK, COVERAGE, HASHE
 from bbfit.operators.drawing.tile_kernels import Plane
 from bbfit.operators.image_loss.fused import PixelLoss
 from bbfit.operators.image_loss.kernels import LOSSES
-from bbfit.operators.launching import compile_for, in_parallel, pieces_of, struct_array, warp_array, worker_count
+from bbfit.operators.launching import in_parallel, pieces_of, repeated, struct_array, warp_array, worker_count
 
 # Most bands of rows that a picture is cut into. Independent of the number of threads, which must not change the order of sums.
 MOST_BANDS = 32
 # Most parts of the views that are differentiated at once, each with a gradient of its own, and most texels of further gradients for each
 # pixel. Both are independent of the number of threads too.
 MOST_GRADIENTS, MOST_TEXELS = 4, 3
-# Least room for layers of a tile on a CPU.
-_ROOM = 512
+# Least room for layers of a tile on a CPU, and what is added to a power of two.
+_ROOM, _ASIDE = 512, 8
+_kept = threading.local()
 
 
 def render_fused(cloud: BillboardCloud, camera: Camera) -> Tensor:
@@ -104,17 +103,15 @@ def draw(texels: Tensor, projection: Projection, occupied: Tensor | None = None,
     if not len(texels) or not views:
         return image.zero_()
     compiled, runs, arguments = _prepared(texels, projection, occupied)
-    device, outputs = wp.device_from_torch(texels.device), [warp_array(image, wp.vec4)]
-    compile_for(compiled.draw, device)
-    with_tile = _scratch(compiled, texels.device)
+    on, outputs = wp.device_from_torch(texels.device), [warp_array(image, wp.vec4)]
+    again = repeated(compiled.draw, lambda thread: [thread, *arguments], outputs, on)
 
     def launch(begin: int, end: int) -> None:
-        with with_tile() as tile:
-            wp.launch(compiled.draw, (views, end - begin, runs), [*tile, begin, *arguments], outputs, device=device)
+        again((views, end - begin, runs), begin)
 
     lines = -(-height // compiled.rows)
     least = -(-projection.least_pixels // (width * views * compiled.rows))
-    in_parallel(launch, [(0, lines)] if texels.is_cuda else pieces_of(lines, least, MOST_BANDS))
+    in_parallel(launch, [(0, lines)] if on.is_cuda else pieces_of(lines, least))
     return image
 
 
@@ -147,23 +144,19 @@ def differentiate(
         nothing = torch.zeros(0, 0, 0, 4, dtype=torch.float32, device=device)
         target = loss.target if loss else nothing.to(torch.uint8)
         compiled, runs, arguments = _prepared(texels, projection, occupied)
+        on = wp.device_from_torch(device)
         arguments += [projection.height, warp_array(nothing if image_gradient is None else image_gradient, wp.vec4)]
         arguments.append(warp_array(target.view(torch.int32).squeeze(-1), wp.int32))
         arguments += [int(loss.straight), LOSSES[loss.kind], loss.weight, int(loss.own_colors)] if loss else [0, 0, 0.0, 0]
         most = min(MOST_GRADIENTS, 1 + MOST_TEXELS * views * projection.height * projection.width // max(len(texels), 1))
         phases = schedule(projection, device, most)
-        further = torch.zeros(max(piece.gradient for phase in phases for piece in phase), *texels.shape, device=device)
+        further = torch.zeros(max(piece.gradient for phase in phases for piece in phase), *texels.shape, dtype=torch.float32, device=device)
         gradients = [warp_array(gradient, wp.vec4) for gradient in (texel_gradient, *further)]
-        of_loss, of_placement = warp_array(sums, wp.float32), [warp_array(matrices.view(-1, 3, 3), wp.mat33d), strips]
-        on = wp.device_from_torch(device)
-        compile_for(compiled.differentiate, on)
-        with_tile = _scratch(compiled, device)
+        outputs = [warp_array(sums, wp.float32), warp_array(matrices.view(-1, 3, 3), wp.mat33d), strips]
+        again = repeated(compiled.differentiate, lambda thread: [thread, *arguments], outputs, on)
 
         def launch(gradient: int, view: int, number: int, begin: int, end: int) -> None:
-            size, first = (number, -(-(end - begin) // compiled.rows), runs), begin // compiled.rows
-            with with_tile() as tile:
-                outputs = [of_loss, gradients[gradient], *of_placement]
-                wp.launch(compiled.differentiate, size, [*tile, view, first, *arguments], outputs, device=on)
+            again((number, -(-(end - begin) // compiled.rows), runs), view, begin // compiled.rows, gradients[gradient])
 
         for phase in phases:
             in_parallel(launch, phase)
@@ -210,28 +203,21 @@ def _phases(projection: Projection, gradient: int, first: int, last: int) -> lis
 def kernels_for(layers: int, lanes: int = Projection.lanes) -> SimpleNamespace:
     """The kernels for tiles of ``lanes`` pixels, with room for as many layers: of a single pixel, or for all billboards of a tile.
 
-    Room is a power of two, so that few numbers of billboards need kernels of their own. On a CPU it costs nothing that is not used.
+    Few numbers of billboards need kernels of their own: room doubles, and on a CPU room that is not used costs nothing. There it is no power
+    of two, with which the arrays of a tile would share the sets of the processor's caches.
     """
-    return kernels(max(4 if lanes == 1 else _ROOM, 1 << (layers - 1).bit_length()), lanes)
+    room = 1 << (layers - 1).bit_length()
+    return kernels(max(4, room), lanes) if lanes == 1 else kernels(max(_ROOM, room) + _ASIDE, lanes)
 
 
-def _scratch(compiled: SimpleNamespace, device: torch.device) -> Callable[[], AbstractContextManager[list[Any]]]:
-    """A context that lends a tile's memory to a launch, as the first arguments of both kernels. On CUDA every thread has its own."""
-    workers, words = (0, 1) if device.type == "cuda" else (worker_count(), ctypes.sizeof(compiled.Tile.ctype) // 4)
-    memory = struct_array(torch.empty(workers, words, dtype=torch.int32, device=device), compiled.Tile)
-    spare: SimpleQueue[int] = SimpleQueue()
-    for worker in range(max(workers, 1)):
-        spare.put(worker)
-
-    @contextmanager
-    def lent() -> Iterator[list[Any]]:
-        worker = spare.get()
-        try:
-            yield [worker, memory]
-        finally:
-            spare.put(worker)
-
-    return lent
+def _tiles(compiled: SimpleNamespace, device: torch.device) -> Any:
+    """Memory for a tile of each thread that launches, which the calling thread keeps. On CUDA a thread has its own."""
+    if device.type == "cuda":
+        return struct_array(torch.empty(0, 1, dtype=torch.int32, device=device), compiled.Tile)
+    shape = (worker_count() + 1, ctypes.sizeof(compiled.Tile.ctype) // 4)
+    if getattr(_kept, "tiles", torch.empty(0)).shape != shape:
+        _kept.tiles = torch.empty(shape, dtype=torch.int32)
+    return struct_array(_kept.tiles, compiled.Tile)
 
 
 def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -> tuple[SimpleNamespace, int, list[Any]]:
@@ -242,7 +228,14 @@ def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -
     numbers = [projection.to_texel.detach().flatten(2), projection.nearness]
     planes = torch.cat([*(part.contiguous().view(torch.int32) for part in numbers), projection.textures, projection.boxes], -1)
     occupied = occupancy(texels.detach()) if occupied is None else occupied
-    arguments = [run, projection.width, int(projection.orthographic), projection.count, _test(projection.alpha)]
+    arguments = [
+        _tiles(compiled, texels.device),
+        run,
+        projection.width,
+        int(projection.orthographic),
+        projection.count,
+        _test(projection.alpha),
+    ]
     arguments += [struct_array(planes.flatten(0, 1), Plane), warp_array(texels, wp.vec4), warp_array(occupied, wp.uint8)]
     return compiled, -(-projection.width // run), arguments
 

@@ -121,9 +121,9 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
     def draw(
-        slot: int,
-        scratch: wp.array(dtype=Tile),
         first_line: int,
+        thread: int,
+        scratch: wp.array(dtype=Tile),
         run: int,
         width: int,
         orthographic: int,
@@ -140,17 +140,18 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         begin = piece * run
         end = wp.min(begin + run, width)
         if wp.static(lanes > 1):
-            draw_row(scratch[slot], view, line, begin, end, orthographic, count, test, planes, texels, occupied, image)
+            draw_row(scratch[thread], view, line, begin, end, orthographic, count, test, planes, texels, occupied, image)
         else:
             tile = Tile()
             draw_row(tile, view, line, begin, end, orthographic, count, test, planes, texels, occupied, image)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
     def differentiate(
-        slot: int,
-        scratch: wp.array(dtype=Tile),
         first_view: int,
         first_line: int,
+        texel_gradient: wp.array(dtype=wp.vec4),
+        thread: int,
+        scratch: wp.array(dtype=Tile),
         run: int,
         width: int,
         orthographic: int,
@@ -167,7 +168,6 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         weight: float,
         own_colors: int,
         loss: wp.array2d(dtype=wp.float32),
-        texel_gradient: wp.array(dtype=wp.vec4),
         matrices: wp.array(dtype=wp.mat33d),
         strips: int,
     ):
@@ -184,7 +184,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
         total = float(0.0)
         if wp.static(lanes > 1):
             total = differentiate_row(
-                scratch[slot], view, line, begin, end, orthographic, count, test, planes, texels, occupied, width, height,
+                scratch[thread], view, line, begin, end, orthographic, count, test, planes, texels, occupied, width, height,
                 image_gradient, target, straight, pixel_loss, weight, own_colors, strips, texel_gradient, matrices,
             )  # fmt: skip
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from queue import SimpleQueue
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from bbfit.operators.launching import compile_for, differentiable, in_parallel, launch, pieces_of, worker_count
+from bbfit.operators.launching import differentiable, in_parallel, launch, pieces_of, repeated
 from bbfit.operators.ssim.kernels import PAIRS_REACH, REACH, STAGES, kernels
 
 # Least pairs of rows for a thread, which starts PAIRS_REACH pairs early.
@@ -52,19 +51,13 @@ def ssim_and_gradient(a: Tensor, b: Tensor, weight: float, out: Tensor | None = 
             for stage in range(STAGES):
                 wp.launch(own.sweep, (down, along), [view, 0, down, stage, stage + 1, *fixed, *scratch], outputs, device=device)
     else:
-        spare: SimpleQueue[list[Any]] = SimpleQueue()
-        for _ in range(worker_count()):
-            spare.put(_scratch(a, own, 2, REACH + 2))
+        again = repeated(own.sweep, lambda thread: [0, STAGES, *fixed, *_scratch(a, own, 2, REACH + 2)], outputs, device)
 
         def sweep(begin: int, end: int) -> None:
-            scratch = spare.get()
             for view in range(begin // pairs, (end - 1) // pairs + 1):
                 first, last = max(begin - view * pairs, 0), min(end - view * pairs, pairs)
-                arguments = [view, first, last + PAIRS_REACH, 0, STAGES, *fixed, *scratch]
-                wp.launch(own.sweep, (1, 1), arguments, outputs, device=device)
-            spare.put(scratch)
+                again((1, 1), view, first, last + PAIRS_REACH)
 
-        compile_for(own.sweep, device)
         in_parallel(sweep, pieces_of(views * pairs, _LEAST_PAIRS))
     return 1 - sums.sum(dtype=torch.float64) / terms, gradient
 
