@@ -203,8 +203,8 @@ def _phases(projection: Projection, gradient: int, first: int, last: int) -> lis
 def kernels_for(layers: int, lanes: int = Projection.lanes) -> SimpleNamespace:
     """The kernels for tiles of ``lanes`` pixels, with room for as many layers: of a single pixel, or for all billboards of a tile.
 
-    Few numbers of billboards need kernels of their own: room doubles, and on a CPU room that is not used costs nothing. There it is no power
-    of two, with which the arrays of a tile would share the sets of the processor's caches.
+    Few numbers of billboards need kernels of their own: room doubles, and on a CPU room that is not used costs nothing. There it is no
+    power of two, with which the arrays of a tile would share the sets of the processor's caches.
     """
     room = 1 << (layers - 1).bit_length()
     return kernels(max(4, room), lanes) if lanes == 1 else kernels(max(_ROOM, room) + _ASIDE, lanes)
