@@ -17,6 +17,8 @@ quality   for each folder of views: the 10,000 steps of the thesis preset by the
           every 25 steps)
 placement for each folder of views: the thesis preset with four two-sided billboards, with L2 and with L1, and the default preset, which
           has as many vertices; only with ``--only placement``
+search    for each folder of views: seconds of the default search for a placement, in the visual hull (the median of three, after one that
+          is not counted); only with ``--only search``
 start     starting up: ``bbfit --help`` and ``import bbfit`` (medians of five), and a fit of two steps and the first step of a fit, with an
           empty and with a filled cache of compiled kernels; only with ``--only start``
 render    the default views of a grown aspen, with all samples for training views and with the default number; only with ``--only render``
@@ -26,7 +28,8 @@ memory    the peak resident memory of a default fit of 360 views at 1024 x 1024,
 PSNR, SSIM and FLIP are means over four backgrounds.
 
 ``--quick`` takes less than a minute. It omits the willow, the thesis, steps of two views, most numbers of billboards, quality and memory.
-``--views`` are the folders for quality, by default data/views. bound_s does not include the bytes that SSIM and sharpness move.
+``--views`` are the folders for quality, placement and search, by default data/views. bound_s does not include the bytes that SSIM and
+sharpness move.
 """
 
 from __future__ import annotations
@@ -57,6 +60,8 @@ from bbfit.fitting import fused_pass
 from bbfit.fitting.initialize import random_textures, start_cloud
 from bbfit.fitting.levels import Targets, resize_textures, shrunk_sizes
 from bbfit.fitting.loop import Step
+from bbfit.fitting.points import placement_points
+from bbfit.fitting.search import find_placement
 from bbfit.fitting.steps import BLEND, Stepper
 from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
@@ -72,7 +77,7 @@ WARM_STEPS = {"default": 160, "thesis": 1200}
 """Number of steps at an eighth of the size. Each finer level has half as many."""
 RAMP = AlphaMode("mask", 0.2, 4.0, antialiased=True)
 """A mask in the middle of a fit."""
-ROWS = ("grow", "steps", "quality", "placement", "start", "render", "run", "memory")
+ROWS = ("grow", "steps", "quality", "placement", "search", "start", "render", "run", "memory")
 """What ``--only`` can choose."""
 Row = dict[str, Any]
 
@@ -363,6 +368,22 @@ def reference_step(views: ViewSet, config: bbfit.FitConfig, steps: int = 50) -> 
     return (time.perf_counter() - started) / steps
 
 
+def searching(folders: list[Path]) -> list[Row]:
+    """Measure the rows ``search``."""
+    rows, config = [], bbfit.FitConfig().resolve()
+    for folder in folders:
+        views = bbfit.ViewDataset.load(folder)
+        points, _ = placement_points(views, config, None)
+        times = []
+        for _ in range(4):
+            started = time.perf_counter()
+            found = find_placement(views.train, points, config)
+            times.append(time.perf_counter() - started)
+        rows.append({"name": "search", "views": folder.name, "billboards": len(found), "seconds": round(statistics.median(times[1:]), 2)})
+        show(rows[-1])
+    return rows
+
+
 def starting() -> list[Row]:
     """Measure the rows ``start``."""
     fit = ["-m", "bbfit.cli", "fit", str(DATA / "views"), "--steps", "2", "--placement", "even", "--billboards", "2"]
@@ -444,7 +465,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="take less than a minute")
     parser.add_argument("--json", type=Path, help="write the rows to this file as a JSON list")
-    parser.add_argument("--views", type=Path, nargs="*", help="folders of views for the rows quality and placement")
+    parser.add_argument("--views", type=Path, nargs="*", help="folders of views for the rows quality, placement and search")
     parser.add_argument("--only", nargs="*", choices=ROWS, help="measure only these rows")
     arguments = parser.parse_args()
     selected = arguments.only or (["grow", "steps"] if arguments.quick else ["grow", "steps", "quality", "memory"])
@@ -455,6 +476,8 @@ def main() -> None:
         rows += steps(arguments.quick)
     if "quality" in selected:
         rows += quality(arguments.views or [DATA / "views"])
+    if "search" in selected:
+        rows += searching(arguments.views or [DATA / "views"])
     if "placement" in selected:
         rows += placement(arguments.views or [DATA / "views"])
     others = {"grow": lambda: grow(arguments.quick), "start": starting, "render": rendering, "run": whole}
