@@ -30,7 +30,7 @@ import bbfit
 
 LEAVES = {"quaking_aspen": (0.02, 0.1, 0.3, 1.0), "weeping_willow": (0.1, 0.3)}
 """Species that grow for the curve of vertices, and shares of their leaves."""
-FEW, MANY = 4, 12
+FEW, MANY = 3, 8
 """Numbers of pictures of which the seconds of one are the difference."""
 
 
@@ -61,7 +61,7 @@ def renders(curve: str) -> Iterator[Row]:
     """Measure ``vertices`` or ``suns``."""
     cases = [(species, leaves, 0) for species, shares in LEAVES.items() for leaves in shares]
     if curve == "suns":
-        cases = [("quaking_aspen", 0.3, suns) for suns in (0, 1, 2, 4, 8)]
+        cases = [("quaking_aspen", 0.3, suns) for suns in (0, 1, 2, 4)]
     for species, leaves, suns in cases:
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place)
