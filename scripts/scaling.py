@@ -53,7 +53,7 @@ def steps(curve: str) -> Iterator[Row]:
 def rendered(tree: Path, folder: Path, count: int, **options: int) -> float:
     """Seconds of ``count`` pictures of all samples."""
     started = time.perf_counter()
-    bbfit.render_views(tree, folder, bbfit.ViewsConfig(count=count, size=384, workers=1, **options))
+    bbfit.render_views(tree, folder, bbfit.ViewsConfig(count=count, size=384, **options))
     return time.perf_counter() - started
 
 
