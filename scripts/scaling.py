@@ -86,6 +86,8 @@ def sweeps(curve: str) -> Iterator[Row]:
 
 
 CURVES = {"pixels": steps, "billboards": steps, "views": steps, "vertices": renders, "suns": renders, "processes": sweeps}
+LINEAR = ("suns", "processes")
+"""Curves on linear axes."""
 TITLES = {
     "pixels": ("width of a view, pixels", "a step, ms"),
     "billboards": ("billboards", "a step, ms"),
@@ -97,26 +99,38 @@ TITLES = {
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """Draw the curves that have rows."""
+    """Draw the curves that have rows. Dotted lines are proportional to pixels, billboards, views and vertices."""
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
     names = [name for name in CURVES if any(row["name"] == name for row in rows)]
     figure, axes = plt.subplots(-(-len(names) // 3), 3, figsize=(11, 3.1 * -(-len(names) // 3)), squeeze=False)
     labels = {"ms": None, "seconds": None, "first_s": "first picture", "further_s": "each further one"}
     for axis, name in zip(axes.flat, names, strict=False):
-        curve = [row for row in rows if row["name"] == name]
+        curve = sorted((row for row in rows if row["name"] == name), key=lambda row: row["at"])
         for key, label in labels.items():
-            points = [(row["at"], row[key]) for row in curve if key in row and not (name == "suns" and key == "first_s")]
-            if points:
-                axis.plot(*zip(*sorted(points), strict=True), marker="o", markersize=4, label=label)
+            if key in curve[0] and not (name == "suns" and key == "first_s"):
+                at, values = zip(*((row["at"], row[key]) for row in curve), strict=True)
+                (line,) = axis.plot(at, values, marker="o", markersize=4, label=label)
+                if name not in LINEAR:
+                    power = 2 if name == "pixels" else 1
+                    axis.plot(at, [values[-1] * (x / at[-1]) ** power for x in at], ":", color=line.get_color(), linewidth=1)
         axis.set_xlabel(TITLES[name][0])
         axis.set_ylabel(TITLES[name][1])
-        if name not in ("suns", "processes"):
-            axis.set_xscale("log", base=10 if name == "vertices" else 2)
-            axis.set_yscale("log")
-        else:
-            axis.set_xticks([row["at"] for row in curve])
+        if name in LINEAR:
+            axis.set_xticks(at)
             axis.set_ylim(bottom=0)
+        else:
+            axis.set_xscale("log")
+            axis.set_yscale("log")
+            axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.yaxis.set_minor_locator(NullLocator())
+            if name != "vertices":
+                axis.set_xticks(at, [f"{x}" for x in at])
+                axis.xaxis.set_minor_locator(NullLocator())
+            low, high = (end(row[key] for row in curve for key in labels if key in row) for end in (min, max))
+            axis.set_ylim(low / 1.3, high * 1.3)
         axis.grid(visible=True, color="#e4e7ea")
         if name == "vertices":
             axis.legend(frameon=False)
