@@ -51,7 +51,7 @@ def steps(curve: str) -> Iterator[Row]:
 
 
 def rendered(tree: Path, folder: Path, count: int, **options: int) -> float:
-    """Seconds of ``count`` pictures of all samples."""
+    """Seconds of ``count`` pictures with the default numbers of samples."""
     started = time.perf_counter()
     bbfit.render_views(tree, folder, bbfit.ViewsConfig(count=count, size=384, **options))
     return time.perf_counter() - started
@@ -81,7 +81,7 @@ def sweeps(curve: str) -> Iterator[Row]:
         config = bbfit.SweepConfig(billboards=(2, 4, 8, 16), variants=("base",), workers=workers)
         with tempfile.TemporaryDirectory() as folder:
             started = time.perf_counter()
-            bbfit.sweep(folder, config, stages, views=[DATA / "views"])
+            bbfit.run_sweep(folder, config, stages, views=[DATA / "views"])
             yield {"name": curve, "at": workers, "seconds": round(time.perf_counter() - started, 1)}
 
 
@@ -126,9 +126,9 @@ def draw(rows: list[Row], path: Path) -> None:
             axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axis.yaxis.set_minor_locator(NullLocator())
-            if name != "vertices":
-                axis.set_xticks(at, [f"{x}" for x in at])
-                axis.xaxis.set_minor_locator(NullLocator())
+            ticks = [200_000, 1_000_000, 5_000_000] if name == "vertices" else at
+            axis.set_xticks(ticks, [f"{x:,}" for x in ticks])
+            axis.xaxis.set_minor_locator(NullLocator())
             low, high = (end(row[key] for row in curve for key in labels if key in row) for end in (min, max))
             axis.set_ylim(low / 1.3, high * 1.3)
         axis.grid(visible=True, color="#e4e7ea")
