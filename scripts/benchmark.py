@@ -57,6 +57,7 @@ from torch.nn.functional import interpolate
 
 import bbfit
 from bbfit.fitting import fused_pass
+from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.initialize import random_textures, start_cloud
 from bbfit.fitting.levels import Targets, resize_textures, shrunk_sizes
 from bbfit.fitting.loop import Step
@@ -143,7 +144,7 @@ print(json.dumps({"compiled_s": round(time.perf_counter() - began, 2)}))
 
 def grow(quick: bool) -> list[Row]:
     """Measure the rows ``grow``."""
-    rows = []
+    rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         for name in list(TREES)[: 1 if quick else None]:
             path = Path(folder) / f"{name}.glb"
@@ -183,7 +184,7 @@ def copy_speed(device: torch.device) -> float:
     return 2 * 4 * source.numel() / statistics.median(seconds_of(lambda: target.copy_(source), device) for _ in range(15))
 
 
-def warm(views: ViewSet, config: bbfit.FitConfig, device: torch.device) -> Stepper:
+def warm(views: ViewSet, config: ResolvedFit, device: torch.device) -> Stepper:
     """Advance a fused fit into its last level, where empty texels are empty, as in most steps of a fit."""
     start = start_cloud(views, config)
     cloud = random_textures(start, shrunk_sizes(start, 3), 0)

@@ -122,13 +122,15 @@ def steps() -> None:
     first = next(index for index, row in enumerate(rows) if "differentiate" in row)
     names, bars = rows[first], rows[first + 2 : first + 4]
     figure, axis = plt.subplots(figsize=(9, 2.3))
-    for label, *cells in reversed(bars):
+    for row, (_, *cells) in enumerate(bars):
         left = 0.0
         for color, name, cell in zip(("#1f5f8b", "#a9c6da", "#c8501e", "#e3a17f", "#3f9e4d", "#8f6bc1"), names, cells, strict=True):
             width = float(np.mean([float(number) for number in cell.split(" to ")]))
-            axis.barh(label, width, left=left, color=color, height=0.6, label=name if label == bars[-1][0] else None)
-            axis.text(left + width / 2, label, f"{width:.0f}", ha="center", va="center", fontsize=8, color="white")
+            axis.barh(row, width, left=left, color=color, height=0.6, label=None if row else name)
+            axis.text(left + width / 2, row, f"{width:.0f}", ha="center", va="center", fontsize=8, color="white")
             left += width
+    axis.set_yticks(range(len(bars)), [label for label, *_ in bars])
+    axis.invert_yaxis()
     axis.set_xlabel("milliseconds")
     axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(names), frameon=False, fontsize=8, handlelength=1)
     axis.spines[["top", "right"]].set_visible(b=False)

@@ -5,8 +5,8 @@ The curves, each a list of rows:
 pixels      milliseconds of a training step of four billboards by the width of the square view
 billboards  the same by the number of billboards, one view of 512 x 512 pixels
 views       the same by the number of views, four billboards
-vertices    seconds of Blender by the vertices of a quaking aspen: until the first picture, and for each further one; 384 x 384 pixels
-suns        seconds of Blender for each further camera of the same tree, by the number of suns besides the baked light
+vertices    seconds of Blender by the vertices of an aspen and a willow: until the first picture of 384 x 384 pixels, and for each other one
+suns        seconds of Blender for each further camera around an aspen, by the number of suns besides the baked light
 processes   seconds of a sweep of eight short fits by the number of processes
 
 ``--json`` writes the rows to a file. ``--picture`` draws them, with those that are in the file of ``--json`` already.
@@ -31,7 +31,7 @@ import bbfit
 LEAVES = {"quaking_aspen": (0.02, 0.1, 0.3, 1.0), "weeping_willow": (0.1, 0.3)}
 """Species that grow for the curve of vertices, and shares of their leaves."""
 FEW, MANY = 3, 8
-"""Numbers of pictures of which the seconds of one are the difference."""
+"""Numbers of cameras. The difference of their seconds is that of as many cameras as the difference of the numbers."""
 
 
 def steps(curve: str) -> Iterator[Row]:
@@ -50,10 +50,10 @@ def steps(curve: str) -> Iterator[Row]:
         yield {"name": curve, "at": at, "ms": round(1000 * seconds, 2)}
 
 
-def rendered(tree: Path, folder: Path, count: int, **options: int) -> float:
-    """Seconds of ``count`` pictures with the default numbers of samples."""
+def rendered(tree: Path, folder: Path, count: int, suns: int) -> float:
+    """Seconds of the pictures of ``count`` cameras with the default numbers of samples."""
     started = time.perf_counter()
-    bbfit.render_views(tree, folder, bbfit.ViewsConfig(count=count, size=384, **options))
+    bbfit.render_views(tree, folder, bbfit.ViewsConfig(count=count, size=384, suns=suns, turned=0))
     return time.perf_counter() - started
 
 
@@ -68,7 +68,7 @@ def renders(curve: str) -> Iterator[Row]:
             scene = bbfit.grow(species, leaves=leaves)
             vertices = sum(len(mesh.vertices) for mesh in scene.geometry.values())
             tree = bbfit.write_tree(scene, folder / "tree.glb")[0]
-            few, many = (rendered(tree, folder / str(count), count, suns=suns) for count in (FEW, MANY))
+            few, many = (rendered(tree, folder / str(count), count, suns) for count in (FEW, MANY))
         further = (many - few) / (MANY - FEW)
         row: Row = {"name": curve, "at": suns if curve == "suns" else vertices, "species": species}
         yield row | {"first_s": round(few - (FEW - 1) * further, 2), "further_s": round(further, 2)}

@@ -97,10 +97,10 @@ def test_the_most_layers_are_those_of_the_pixel_that_is_in_most_boxes() -> None:
         y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
         left, right, top, bottom = projection.boxes[..., None, None].unbind(2)
         inside = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
-        assert projection.most_layers() == int(inside.sum(1).max())
-        most = max(most, projection.most_layers())
+        assert projection.most_layers == int(inside.sum(1).max())
+        most = max(most, projection.most_layers)
     assert most == 3
-    assert project(cloud.take([]), camera).most_layers() == 0
+    assert project(cloud.take([]), camera).most_layers == 0
 
 
 def test_boxes_are_no_larger_than_they_must_be() -> None:

@@ -31,8 +31,8 @@ MOST_BANDS = 32
 # Most parts of the views that are differentiated at once, each with a gradient of its own, and most texels of further gradients for each
 # pixel. Both are independent of the number of threads too.
 MOST_GRADIENTS, MOST_TEXELS = 4, 3
-# Least room for layers of a tile on a CPU, and what is added to a power of two.
-_ROOM, _ASIDE = 512, 8
+# Least room for layers of a single pixel; the same of a tile, and what is added to a power of two.
+_LAYERS, _ROOM, _ASIDE = 4, 512, 8
 _kept = threading.local()
 
 
@@ -207,7 +207,7 @@ def kernels_for(layers: int, lanes: int = Projection.lanes) -> SimpleNamespace:
     power of two, with which the arrays of a tile would share the sets of the processor's caches.
     """
     room = 1 << (layers - 1).bit_length()
-    return kernels(max(4, room), lanes) if lanes == 1 else kernels(max(_ROOM, room) + _ASIDE, lanes)
+    return kernels(max(_LAYERS, room), lanes) if lanes == 1 else kernels(max(_ROOM, room) + _ASIDE, lanes)
 
 
 def _tiles(compiled: SimpleNamespace, device: torch.device) -> Any:
@@ -224,7 +224,8 @@ def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -
     """Compiled kernels, the number of threads for a row of tiles, and the arguments that both kernels begin with after their offsets."""
     lanes = 1 if texels.is_cuda else projection.lanes
     run = 1 if lanes == 1 else projection.width
-    compiled = kernels_for(projection.most_layers() if lanes == 1 else projection.count, lanes)
+    few = lanes > 1 or projection.count <= _LAYERS  # else a GPU has to finish what it does, to count them
+    compiled = kernels_for(projection.count if few else projection.most_layers, lanes)
     numbers = [projection.to_texel.detach().flatten(2), projection.nearness]
     planes = torch.cat([*(part.contiguous().view(torch.int32) for part in numbers), projection.textures, projection.boxes], -1)
     occupied = occupancy(texels.detach()) if occupied is None else occupied

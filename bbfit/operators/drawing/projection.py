@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -56,6 +57,7 @@ class Projection:
         """Number N of billboards."""
         return self.boxes.shape[1]
 
+    @cached_property
     def most_layers(self) -> int:
         """The largest number of billboards whose boxes have a pixel in common."""
         left, right, top, bottom = self.boxes.long().unbind(-1)
