@@ -25,9 +25,10 @@ from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Atlas, Cards
 from bbfit.geometry.orbit import Orbit
 from bbfit.images import PALETTE, distinct
+from bbfit.operators.cards.reference import hits
+from bbfit.operators.cards.sampling import Footprint, filtered, footprint, joined, sampled
+from bbfit.operators.cards.sheets import sheets_of
 from bbfit.operators.drawing.compositing import opacity
-from bbfit.rendering.cards import hits, sheets_of
-from bbfit.rendering.sampling import Footprint, filtered, footprint, joined, sampled
 from bbfit.threads import one_thread
 
 # Largest side in pixels of the pictures in which coverage is measured.

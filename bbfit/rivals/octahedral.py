@@ -27,7 +27,7 @@ from bbfit.blender.pictures import FILTER_REACH, depth_path, render_pictures
 from bbfit.checks import check_choice, check_range, check_shape, fail
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics
 from bbfit.images import bleed_color, premultiply, read_rgba
-from bbfit.rendering.sampling import MipChain, filtered, joined
+from bbfit.operators.cards.sampling import MipChain, filtered, joined
 from bbfit.rivals.baking import BakeConfig, tree_triangles
 from bbfit.rivals.mesh_rays import rays_through
 from bbfit.rivals.octahedral_grid import OctahedralGrid

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -22,10 +23,18 @@ from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics, pinh
 from bbfit.geometry.cards import Atlas, Card, Cards
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
+from bbfit.operators.cards.reference import hits
+from bbfit.operators.cards.sheets import sheets_of
 from bbfit.operators.drawing.reference import render_reference
-from bbfit.rendering.cards import draw_cards, hits, sheets_of
+from bbfit.rendering.cards import draw_cards
 
 KINDS = ("one", "two", "mixed")
+
+
+@pytest.fixture(autouse=True, params=["fused", "reference"])
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test here draws with each of both renderers."""
+    monkeypatch.setattr(f"{__name__}.draw_cards", partial(draw_cards, backend=request.param))
 
 
 def parallel(camera: Camera) -> Camera:
@@ -106,7 +115,7 @@ def test_cameras_that_are_drawn_together_see_what_each_sees_alone(
     alone = torch.stack([draw_cards(drawn, cameras[index]) for index in range(len(cameras))])
     assert not alone[len(orbit)].any() and alone[0].any()
     assert torch.equal(draw_cards(drawn, cameras), alone)
-    monkeypatch.setattr("bbfit.rendering.cards._TOGETHER", 2 * cameras.width * cameras.height)
+    monkeypatch.setattr("bbfit.operators.cards.reference._TOGETHER", 2 * cameras.width * cameras.height)
     assert torch.equal(draw_cards(drawn, cameras), alone)
 
 

@@ -26,7 +26,9 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import MASK_RIM, Cards
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.rendering.cards import CardRenderer, draw_cards, hits, sheets_of
+from bbfit.operators.cards.reference import hits
+from bbfit.operators.cards.sheets import sheets_of
+from bbfit.rendering.cards import CardRenderer, draw_cards
 
 
 def of_kind(cards: Cards, kind: str) -> Cards:

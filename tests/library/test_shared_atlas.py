@@ -24,7 +24,9 @@ from bbfit.geometry.orbit import Orbit
 from bbfit.glb import split_glb
 from bbfit.library.shared_atlas import cell_texels, safe_level, shared_pages
 from bbfit.library.stored_cards import read_cards, write_cards
-from bbfit.rendering.cards import CardRenderer, hits, sheets_of
+from bbfit.operators.cards.reference import hits
+from bbfit.operators.cards.sheets import sheets_of
+from bbfit.rendering.cards import CardRenderer
 
 SUN = Light(*(torch.tensor(values).double() for values in ([[0.0, 0.6, 0.8]], [5.0], [[1.0, 1.0, 1.0]], [0.4])))
 CONFIGS = {

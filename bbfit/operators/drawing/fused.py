@@ -235,13 +235,13 @@ def _prepared(texels: Tensor, projection: Projection, occupied: Tensor | None) -
         projection.width,
         int(projection.orthographic),
         projection.count,
-        _test(projection.alpha),
+        encoded_alpha(projection.alpha),
     ]
     arguments += [struct_array(planes.flatten(0, 1), Plane), warp_array(texels, wp.vec4), warp_array(occupied, wp.uint8)]
     return compiled, -(-projection.width // run), arguments
 
 
-def _test(mode: AlphaMode) -> Any:
+def encoded_alpha(mode: AlphaMode) -> Any:
     """An alpha mode as :func:`~bbfit.operators.drawing.tile_kernels.tiles` expects it."""
     if not mode.tested:
         return wp.vec4(BLENDED if mode.kind == "blend" else HASHED, 0.0, 0.0, 0.0)

@@ -1,0 +1,225 @@
+"""Warp kernel that draws cards: rows of pixels, whose fragments are kept in lists until all pieces have been visited.
+
+A row visits the pieces that it crosses. Every pixel of a piece whose center lies in the polygon adds a fragment to the pixel's linked list,
+which is ordered front to back (an A-buffer; Carpenter 1984, "The A-buffer, an Antialiased Hidden Surface Method"). Then the lists are
+blended. Textures are filtered only now, so what opaque fragments hide costs nothing.
+"""
+
+# mypy: ignore-errors
+# ruff: noqa: UP018, RUF046 - int(0) declares a variable of a kernel, 0 a constant.
+
+import warp as wp
+
+from bbfit.operators.cards.sheets import SLACK as SLACK_VALUE
+from bbfit.operators.drawing.compositing import HASH, LEAST_CONTRAST, TIE
+from bbfit.operators.drawing.tile_forward import BLENDED, COVERAGE, HASHED, SMOOTH
+from bbfit.operators.launching import FLAGS
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
+
+TIED = wp.constant(wp.float64(1 + TIE))
+SLACK = wp.constant(wp.float64(SLACK_VALUE))
+LEAST = wp.constant(LEAST_CONTRAST)
+OF_X, OF_Y, OF_TEXTURE, FIRST_ROUND, SECOND_ROUND = (wp.constant(wp.uint32(factor)) for factor in HASH)
+NO_CUTOFF, HASH_CUTOFF, IS_SMOOTH, IS_COVERAGE = (wp.constant(float(value)) for value in (BLENDED, HASHED, SMOOTH, COVERAGE))
+
+
+@wp.struct
+class Fragment:
+    """What a pixel sees of a sheet. 40 bytes, which the host allocates."""
+
+    u: wp.float64
+    v: wp.float64
+    scale: wp.float64
+    """The third homogeneous coordinate of (u, v)."""
+    depth: wp.float64
+    sheet: int
+    following: int
+    """Index of the next fragment of the pixel, farther away; -1 after the last."""
+
+
+@wp.func
+def texel(texels: wp.array(dtype=wp.vec4ub), index: int):
+    """A texel in [0, 255]."""
+    value = texels[index]
+    return wp.vec4(float(value[0]), float(value[1]), float(value[2]), float(value[3]))
+
+
+@wp.func
+def within(place: wp.float64, size: int) -> wp.float64:
+    """A place clamped to the centers of the outer texels; the first one for NaN."""
+    if place > wp.float64(0.0):
+        return wp.min(place, wp.float64(size - 1))
+    return wp.float64(0.0)
+
+
+@wp.func
+def bilinear(texels: wp.array(dtype=wp.vec4ub), levels: wp.array(dtype=wp.vec3i), level: int, u: wp.float64, v: wp.float64):
+    """A sample in [0, 255] of one mip level, clamped to the edge."""
+    start, width, height = levels[level][0], levels[level][1], levels[level][2]
+    half = wp.float64(0.5)
+    x, y = within(u * wp.float64(width) - half, width), within(v * wp.float64(height) - half, height)
+    left, top = int(x), int(y)
+    right, down = int(0), int(0)
+    if left + 1 < width:
+        right = 1
+    if top + 1 < height:
+        down = width
+    at = start + top * width + left
+    a, b, c, d = texel(texels, at), texel(texels, at + right), texel(texels, at + down), texel(texels, at + down + right)
+    fx, fy = float(x - wp.float64(left)), float(y - wp.float64(top))
+    upper, lower = a + (b - a) * fx, c + (d - c) * fx
+    return upper + (lower - upper) * fy
+
+
+@wp.func
+def trilinear(texels: wp.array(dtype=wp.vec4ub), levels: wp.array(dtype=wp.vec3i), u: wp.float64, v: wp.float64, detail: wp.float64):
+    """A sample in [0, 1] between the two mip levels around a level of detail, which exists."""
+    level = int(detail)
+    share = float(detail - wp.float64(level))
+    sample = bilinear(texels, levels, level, u, v)
+    if share > 0.0:
+        sample += (bilinear(texels, levels, level + 1, u, v) - sample) * share
+    return sample / 255.0
+
+
+@wp.func
+def alpha_beside(
+    texels: wp.array(dtype=wp.vec4ub), levels: wp.array(dtype=wp.vec3i), to_uv: wp.mat33d, detail: wp.float64, x: int, y: int
+) -> float:
+    """Filtered alpha of a plane in another pixel, at a given level of detail."""
+    place = to_uv * wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(1.0))
+    return trilinear(texels, levels, place[0] / place[2], place[1] / place[2], detail)[3]
+
+
+@wp.func
+def threshold(x: int, y: int, texture: int) -> float:
+    """:func:`bbfit.operators.drawing.compositing.thresholds`"""
+    mixed = (wp.uint32(x) * OF_X) ^ (wp.uint32(y) * OF_Y) ^ (wp.uint32(texture) * OF_TEXTURE)
+    mixed = (mixed ^ (mixed >> wp.uint32(16))) * FIRST_ROUND
+    mixed = (mixed ^ (mixed >> wp.uint32(15))) * SECOND_ROUND
+    mixed = mixed ^ (mixed >> wp.uint32(16))
+    return (float(mixed >> wp.uint32(9)) + 0.5) / 8388608.0
+
+
+@wp.func
+def opacity(alpha: float, contrast: float, test: wp.vec4) -> float:
+    """:func:`bbfit.operators.drawing.compositing.opacity`, without the mode ``hash``; ``contrast`` is for an antialiased mask."""
+    if test[3] == IS_COVERAGE:
+        return wp.where(test[1] == 0.0, alpha, wp.floor(alpha * test[1] + 0.5) / wp.max(test[1], 1.0))
+    if test[0] == NO_CUTOFF:
+        return alpha
+    slope = test[1]
+    if test[3] == IS_SMOOTH:
+        if alpha <= 0.0:
+            return 0.0
+        steep = 1.0 / wp.max(contrast, LEAST)
+        slope = wp.where(slope == 0.0, steep, wp.min(steep, slope))
+    if slope == 0.0:
+        return wp.where(alpha >= test[0], 1.0, 0.0)
+    return wp.clamp(0.5 + (alpha - test[0]) * slope, 0.0, 1.0)
+
+
+@wp.func
+def is_inside(sides: wp.array2d(dtype=wp.vec3d), piece: int, u: wp.float64, v: wp.float64) -> bool:
+    """Whether texture coordinates lie in a piece."""
+    for side in range(sides.shape[1]):
+        edge = sides[piece, side]
+        if edge[0] * u + edge[1] * v > edge[2] + SLACK:
+            return False
+    return True
+
+
+@wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": FLAGS})
+def draw_rows(
+    first_line: int,
+    thread: int,
+    heads: wp.array3d(dtype=wp.int32),
+    fragments: wp.array2d(dtype=Fragment),
+    height: int,
+    width: int,
+    test: wp.vec4,
+    boxes: wp.array2d(dtype=wp.vec4i),
+    of_piece: wp.array(dtype=wp.int32),
+    sides: wp.array2d(dtype=wp.vec3d),
+    to_uv: wp.array2d(dtype=wp.mat33d),
+    to_depth: wp.array2d(dtype=wp.vec3d),
+    first_texels: wp.array(dtype=wp.int32),
+    levels: wp.array(dtype=wp.vec3i),
+    texels: wp.array(dtype=wp.vec4ub),
+    image: wp.array3d(dtype=wp.vec4),
+    counts: wp.array2d(dtype=wp.int32),
+):
+    """Write ``image`` [V, H, W] and the number of fragments of each row, ``counts`` [V, H]; launched over rows of all views.
+
+    Memory of a thread: ``heads``, the first and the latest fragment of each pixel of a row, and the ``fragments`` of a row.
+    Pieces of a sheet are consecutive, and sheets ascend.
+    """
+    line, _ = wp.tid()
+    line += first_line
+    view, row = line // height, line % height
+    y, nothing = wp.float64(row), wp.float64(0.0)
+    for column in range(width):
+        heads[thread, 0, column] = -1
+        heads[thread, 1, column] = -1
+    used = int(0)
+    for piece in range(of_piece.shape[0]):
+        box = boxes[view, piece]
+        if row < box[1] or row >= box[3]:
+            continue
+        sheet = of_piece[piece]
+        matrix, away = to_uv[view, sheet], to_depth[view, sheet]
+        for column in range(box[0], box[2]):
+            x = wp.float64(column)
+            scale = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]
+            u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]) / scale
+            v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]) / scale
+            depth = away[0] * u + away[1] * v + away[2]
+            if depth > nothing and wp.isfinite(depth) and is_inside(sides, piece, u, v):
+                latest = heads[thread, 1, column]
+                if latest >= 0:
+                    if fragments[thread, latest].sheet == sheet:
+                        continue  # where pieces of a sheet overlap, the first one shows
+                before, after = int(-1), int(heads[thread, 0, column])
+                while after >= 0:
+                    if fragments[thread, after].depth > depth * TIED:
+                        break
+                    before = after
+                    after = int(fragments[thread, after].following)
+                fragments[thread, used] = Fragment(u, v, scale, depth, sheet, after)
+                if before < 0:
+                    heads[thread, 0, column] = used
+                else:
+                    fragments[thread, before].following = used
+                heads[thread, 1, column] = used
+                used += 1
+    counts[view, row] = used
+    size = wp.vec2d(wp.float64(levels[0][1]), wp.float64(levels[0][2]))
+    last = wp.float64(levels.shape[0] - 1)
+    nested = test[3] != 0.0
+    for column in range(width):
+        color = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        hidden = float(0.0)
+        at = int(heads[thread, 0, column])
+        while at >= 0 and hidden < 1.0:
+            seen = fragments[thread, at]
+            rows = to_uv[view, seen.sheet]
+            # d(a / c) = (da - (a / c) dc) / c, in x and in y
+            right = wp.vec2d((rows[0, 0] - seen.u * rows[2, 0]) * size[0], (rows[1, 0] - seen.v * rows[2, 0]) * size[1])
+            down = wp.vec2d((rows[0, 1] - seen.u * rows[2, 1]) * size[0], (rows[1, 1] - seen.v * rows[2, 1]) * size[1])
+            rate = wp.max(wp.length(right), wp.length(down)) / wp.abs(seen.scale)
+            detail = wp.clamp(wp.log2(rate), nothing, last)
+            sample = trilinear(texels, levels, seen.u, seen.v, detail)
+            contrast = float(0.0)
+            if test[3] == IS_SMOOTH:
+                across = alpha_beside(texels, levels, rows, detail, column ^ 1, row)
+                along = alpha_beside(texels, levels, rows, detail, column, row ^ 1)
+                contrast = wp.abs(across - sample[3]) + wp.abs(along - sample[3])
+            alpha = opacity(sample[3], contrast, test)
+            if test[0] == HASH_CUTOFF:
+                alpha = wp.where(sample[3] >= threshold(column, row, first_texels[seen.sheet]), 1.0, 0.0)
+            weight = wp.where(nested, wp.max(alpha - hidden, 0.0), alpha * (1.0 - hidden))
+            color += wp.vec4(sample[0], sample[1], sample[2], 1.0) * weight
+            hidden += weight
+            at = seen.following
+        image[view, row, column] = color

@@ -1,0 +1,125 @@
+"""Drawing of cards in torch: what graphics cards show with bilinear or trilinear filtering."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cards import Cards
+from bbfit.operators.cards.sampling import filtered
+from bbfit.operators.cards.sheets import SLACK, PreparedCards, Sheets, seen_sheets
+from bbfit.operators.drawing.compositing import composite_fragments, coverage, opacity, thresholds
+
+# Most pixels that are compared with polygons at once, and of cameras that are drawn together.
+_AT_ONCE, _TOGETHER = 1 << 21, 1 << 18
+
+
+@dataclass(frozen=True)
+class Hits:
+    """The M places where the rays of the pixels of V cameras meet S sheets on a side that is shown."""
+
+    view: Tensor
+    """Which camera, int64 [M], ascending."""
+    sheet: Tensor
+    """Which sheet, int64 [M], ascending for each camera."""
+    x: Tensor
+    """Columns, int64 [M]; no pixel of a sheet occurs twice."""
+    y: Tensor
+    """Rows, int64 [M]."""
+    uv: Tensor
+    """Texture coordinates, float64 [M, 2]."""
+    detail: Tensor
+    """Level of detail, float64 [M]; negative where texels are magnified."""
+    depth: Tensor
+    """Depth in meters, float64 [M]."""
+    to_uv: Tensor
+    """From a pixel (x, y, 1) to homogeneous texture coordinates of each sheet in each camera, [V, S, 3, 3]."""
+
+
+def draw_cards_reference(prepared: PreparedCards, camera: Camera) -> Tensor:
+    """Draw cards without maps for V cameras: premultiplied RGBA in [0, 1], float32 [V, H, W, 4], as :func:`~bbfit.rendering.draw_cards`."""
+    together, pictures = max(1, _TOGETHER // (camera.width * camera.height)), list[Tensor]()
+    for index in range(0, len(camera), together):
+        some = camera[index : index + together]
+        met, straight = shown(prepared, some)
+        pictures.append(composited(straight[:, :3], straight[:, 3], met, prepared, some))
+    return torch.cat(pictures)
+
+
+def shown(prepared: PreparedCards, camera: Camera) -> tuple[Hits, Tensor]:
+    """The places that cameras see, and the filtered values of the atlas there, [M, C]."""
+    met = hits(prepared.cards, prepared.sheets, camera)
+    return met, filtered(prepared.levels, met.uv, met.detail) / 255
+
+
+def composited(values: Tensor, alphas: Tensor, met: Hits, prepared: PreparedCards, camera: Camera) -> Tensor:
+    """The pictures of places with values [M, C] and alpha [M] in V cameras, [V, H, W, C + 1]."""
+    alpha = prepared.cards.alpha
+    if alpha.kind == "hash":
+        alphas = (alphas >= thresholds(met.x, met.y, prepared.sheets.first[met.sheet])).to(alphas)
+    elif alpha.antialiased:
+        across, down = ((filtered(prepared.levels, uv, met.detail)[:, 3] / 255 - alphas).abs() for uv in _beside(met))
+        alphas = coverage(alphas, across + down, alpha)
+    else:
+        alphas = opacity(alphas, alpha)
+    shape = len(camera), camera.height, camera.width
+    visible, pixels, count = alphas > 0, (met.view * camera.height + met.y) * camera.width + met.x, math.prod(shape)
+    image = composite_fragments(values[visible], alphas[visible], met.depth[visible], pixels[visible], count, nested=alpha.nested)
+    return image.unflatten(0, shape)
+
+
+def hits(cards: Cards, sheets: Sheets, camera: Camera) -> Hits:
+    """The pixels in which one camera or V cameras meet the cards' sheets, whatever their alpha."""
+    seen, views = seen_sheets(sheets, camera), len(camera.batch())
+    low, high = seen.low.flatten(0, 1), seen.high.flatten(0, 1)  # from here on each camera has pieces and sheets of its own
+    of_piece = (len(sheets) * torch.arange(views)[:, None] + sheets.of_piece).flatten()
+    own_to_uv, own_to_depth = seen.to_uv.flatten(0, 1), seen.to_depth.flatten(0, 1)
+    extent, areas, found = high - low, (high - low).prod(-1), list[tuple[Tensor, ...]]()
+    for some in torch.arange(len(areas)).split(_pieces_at_once(areas)):
+        piece = some.repeat_interleave(areas[some])
+        inside = torch.arange(len(piece)) - (areas[some].cumsum(0) - areas[some]).repeat_interleave(areas[some])
+        x, y = low[piece, 0] + inside % extent[piece, 0], low[piece, 1] + inside // extent[piece, 0]
+        sheet = of_piece[piece]
+        u, v, scale = (own_to_uv[sheet, row, 0] * x + own_to_uv[sheet, row, 1] * y + own_to_uv[sheet, row, 2] for row in range(3))
+        u, v = u / scale, v / scale
+        depth = own_to_depth[sheet, 0] * u + own_to_depth[sheet, 1] * v + own_to_depth[sheet, 2]
+        met = (depth > 0) & depth.isfinite()
+        polygon = piece % max(1, len(sheets.of_piece))
+        for along_u, along_v, offset in sheets.sides.permute(1, 2, 0):
+            met &= u * along_u[polygon] + v * along_v[polygon] <= offset[polygon] + SLACK
+        found.append(tuple(values[met] for values in (sheet, x, y, u, v, scale, depth)))
+    sheet, x, y, u, v, scale, depth = (torch.cat(values) for values in zip(*found, strict=True))
+    # Where pieces of a sheet overlap, the first one shows.
+    places, order = ((sheet * camera.height + y) * camera.width + x).sort(stable=True)
+    first = torch.ones_like(places, dtype=torch.bool)
+    first[1:] = places[1:] != places[:-1]
+    sheet, x, y, u, v, scale, depth = (values[order[first]] for values in (sheet, x, y, u, v, scale, depth))
+    uv = torch.stack([u, v], -1)
+    # d(a / c) = (da - (a / c) dc) / c, in x and in y
+    size = torch.tensor(cards.atlas.image.shape[1::-1], dtype=torch.float64)
+    rates = [((own_to_uv[sheet, :2, axis] - uv * own_to_uv[sheet, 2, axis, None]) * size).norm(dim=-1) for axis in (0, 1)]
+    detail = (torch.maximum(*rates) / scale.abs()).log2()
+    count = max(1, len(sheets))
+    return Hits(sheet // count, sheet % count, x, y, uv, detail, depth, seen.to_uv)
+
+
+def _beside(met: Hits) -> list[Tensor]:
+    """Texture coordinates, [M, 2], at the other pixel of each hit's row and at that of its column in its square of 2 x 2 pixels."""
+    rows = met.to_uv[met.view, met.sheet]
+    places = [torch.stack([x, y, torch.ones_like(x)], -1).double() for x, y in ((met.x ^ 1, met.y), (met.x, met.y ^ 1))]
+    found = [(rows @ place[:, :, None])[..., 0] for place in places]
+    return [place[:, :2] / place[:, 2:] for place in found]
+
+
+def _pieces_at_once(areas: Tensor) -> list[int]:
+    """Numbers of consecutive pieces with at most :data:`_AT_ONCE` pixels in their boxes together, or single ones."""
+    counts, total = [0], 0
+    for pixels in areas.tolist():
+        if total + pixels > _AT_ONCE and counts[-1]:
+            counts, total = [*counts, 0], 0
+        counts[-1], total = counts[-1] + 1, total + pixels
+    return counts
