@@ -21,6 +21,8 @@ search    for each folder of views: seconds of the default search for a placemen
           is not counted); only with ``--only search``
 start     starting up: ``bbfit --help`` and ``import bbfit`` (medians of five), and a fit of two steps and the first step of a fit, with an
           empty and with a filled cache of compiled kernels; only with ``--only start``
+cards     drawing the model of a short default fit as programs show it, by torch and by the kernel: four cameras, medians of five; only with
+          ``--only cards``
 render    the default views of a grown aspen, with all samples for training views and with the default number; only with ``--only render``
 run       the stages of ``bbfit run`` without a tree and without options; only with ``--only run``
 memory    the peak resident memory of a default fit of 360 views at 1024 x 1024, in a separate process
@@ -56,6 +58,7 @@ import torch
 from torch.nn.functional import interpolate
 
 import bbfit
+from bbfit.exporting.model import shipped_model
 from bbfit.fitting import fused_pass
 from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.initialize import random_textures, start_cloud
@@ -69,6 +72,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import write_png
 from bbfit.operators.adam.fused import AdamFused, rest_after
 from bbfit.operators.image_loss import fused as image_loss
+from bbfit.rendering.cards import CardRenderer
 from bbfit.views.view_set import ViewSet
 
 DATA = Path(__file__).resolve().parents[1] / "data"
@@ -78,7 +82,7 @@ WARM_STEPS = {"default": 160, "thesis": 1200}
 """Number of steps at an eighth of the size. Each finer level has half as many."""
 RAMP = AlphaMode("mask", 0.2, 4.0, antialiased=True)
 """A mask in the middle of a fit."""
-ROWS = ("grow", "steps", "quality", "placement", "search", "start", "render", "run", "memory")
+ROWS = ("grow", "steps", "quality", "placement", "search", "start", "cards", "render", "run", "memory")
 """What ``--only`` can choose."""
 Row = dict[str, Any]
 
@@ -411,6 +415,23 @@ def of_command(arguments: list[str], environment: Mapping[str, str] | None = Non
     return round(time.perf_counter() - started, 2)
 
 
+def cards() -> list[Row]:
+    """Measure the rows ``cards``."""
+    views, rows = bbfit.ViewDataset.load(DATA / "views"), []
+    model = shipped_model(bbfit.fit(views, bbfit.FitConfig(steps=100)).cloud)
+    for antialiased in (False, True):
+        shown = replace(model.cards, alpha=replace(model.cards.alpha, antialiased=antialiased))
+        renderers = {name: CardRenderer(shown, backend=name) for name in ("reference", "fused")}
+        for size in (384, 48):
+            cameras, times = views.test.cameras.resized(size, size)[:4], dict[str, list[float]]()
+            for name in [*renderers] * 6:
+                times.setdefault(name, []).append(seconds_of(partial(renderers[name].draw, cameras), torch.device("cpu")))
+            slow, fast = (statistics.median(own[1:]) for own in times.values())
+            row = {"name": "cards", "alpha": "antialiased mask" if antialiased else "mask", "size": size, "cards": len(shown.cards)}
+            rows.append(row | {"reference_s": round(slow, 4), "fused_s": round(fast, 4), "ratio": round(slow / fast, 1)})
+    return rows
+
+
 def rendering() -> list[Row]:
     """Measure the rows ``render``."""
     rows = []
@@ -481,7 +502,7 @@ def main() -> None:
         rows += searching(arguments.views or [DATA / "views"])
     if "placement" in selected:
         rows += placement(arguments.views or [DATA / "views"])
-    others = {"grow": lambda: grow(arguments.quick), "start": starting, "render": rendering, "run": whole}
+    others = {"grow": lambda: grow(arguments.quick), "start": starting, "cards": cards, "render": rendering, "run": whole}
     others["memory"] = memory
     for name, measured in others.items():
         if name in selected:
