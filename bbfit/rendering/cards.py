@@ -7,8 +7,6 @@ differences between neighboring pixels.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -20,7 +18,6 @@ from bbfit.geometry.light import Light
 from bbfit.operators.cards.reference import composited, draw_cards_reference, hits, shown
 from bbfit.operators.cards.sheets import prepared_cards, seen_axes
 from bbfit.operators.config import Backend
-from bbfit.operators.shading.reference import decode, encode
 
 
 def draw_cards(cards: Cards, camera: Camera, light: Light | None = None, *, backend: Backend = "auto") -> Tensor:
@@ -52,12 +49,12 @@ def draw_cards(cards: Cards, camera: Camera, light: Light | None = None, *, back
     light
         For cards with maps: the light of each view, or one for all. Default: ``cards.light``.
     backend
-        ``reference``: torch; ``fused``: a Warp kernel, for cards without maps; ``auto``: the kernel where it can be used.
+        ``reference``: torch; ``fused`` and ``auto``: a Warp kernel, which draws the same but for rounding.
 
     Raises
     ------
     InputError
-        If a level is not uint8 or not half as large as the level before, rounded down, or if the kernel is asked for cards with maps.
+        If a level is not uint8 or not half as large as the level before, rounded down.
     """
     return CardRenderer(cards, backend=backend).draw(camera, light)
 
@@ -67,9 +64,7 @@ class CardRenderer:
 
     def __init__(self, cards: Cards, *, backend: Backend = "auto") -> None:
         check_choice("backend", backend, ("auto", "reference", "fused"))
-        if backend == "fused" and cards.atlas.surface is not None:
-            fail("backend", "the kernel does not draw cards with maps", "choose auto")
-        self._prepared, self._fused = prepared_cards(cards), backend != "reference" and cards.atlas.surface is None
+        self._prepared, self._fused = prepared_cards(cards), backend != "reference"
 
     def draw(self, camera: Camera, light: Light | None = None) -> Tensor:
         """See :func:`draw_cards`."""
@@ -81,20 +76,10 @@ class CardRenderer:
             if self._fused:
                 from bbfit.operators.cards.fused import draw_cards_fused  # warp takes a while to start
 
-                image = draw_cards_fused(self._prepared, cameras)
-            elif light is None:
-                image = draw_cards_reference(self._prepared, cameras)
+                image = draw_cards_fused(self._prepared, cameras, light)
             else:
-                lights = light[[0] * len(cameras)] if len(light) == 1 else light
-                image = torch.cat([self._lit(cameras[[index]], lights[[index]]) for index in range(len(cameras))])
+                image = draw_cards_reference(self._prepared, cameras, light)
         return image if camera.batched else image[0]
-
-    def _lit(self, camera: Camera, light: Light) -> Tensor:
-        """What a single camera shows of cards with maps, [1, H, W, 4]."""
-        met, straight = shown(self._prepared, camera)
-        axes = seen_axes(self._prepared.sheets, camera[0])[met.sheet]
-        colors = _lit(straight[:, :3], straight[:, 4:], axes, light, traced=self._prepared.cards.traced)
-        return composited(colors, straight[:, 3], met, self._prepared, camera)
 
     def surfaces(self, camera: Camera) -> Tensor:
         """What the surfaces are that cards with maps show to a single camera, without light: premultiplied base color, display-referred,
@@ -102,7 +87,7 @@ class CardRenderer:
         with torch.no_grad():
             met, straight = shown(self._prepared, camera)
             normals = normalize(2 * straight[:, 4:7] - 1, dim=-1)
-            in_world = (normals[:, None] @ seen_axes(self._prepared.sheets, camera)[met.sheet].float())[:, 0]
+            in_world = (normals[:, None] @ seen_axes(self._prepared.sheets, camera)[0, met.sheet].float())[:, 0]
             return composited(torch.cat([straight[:, :3], in_world], -1), straight[:, 3], met, self._prepared, camera.batch())[0]
 
     def fragments(self, camera: Camera) -> int:
@@ -116,19 +101,3 @@ class CardRenderer:
 
             return count_fragments_fused(self._prepared, camera.batch())
         return len(hits(self._prepared.cards, self._prepared.sheets, camera).x)
-
-
-def _lit(colors: Tensor, maps: Tensor, axes: Tensor, light: Light, *, traced: bool) -> Tensor:
-    """Shade base colors of fragments, [M, 3], given their filtered maps, [M, 4 or 5], and the axes of the normals, [M, 3, 3].
-
-    The formula is that of :func:`~bbfit.operators.shading.reference.shade_reference`. ``traced`` light comes from the visible side of
-    the plane only: no sun from behind it, and of an even sky the share (1 + cos a) / 2 where the normal leans by the angle a.
-    """
-    normals = normalize(2 * maps[:, :3] - 1, dim=-1)
-    towards, open_sky, translucency = (axes @ light.sun_directions[0]).float(), maps[:, 3:4], maps[:, 4:] if maps.shape[1] > 4 else 0
-    cosine = (normals * towards).sum(-1, keepdim=True)
-    of_sun = (1 - translucency) * cosine.clamp_min(0) + translucency * (-cosine).clamp_min(0)
-    if traced:
-        of_sun, open_sky = of_sun * (towards[:, 2:] > 0), (1 + normals[:, 2:]) / 2
-    sun = (light.sun_colors[0] * light.sun_strengths / math.pi).float()
-    return encode(decode(colors) * (of_sun * sun + float(light.ambients) * open_sky)).clamp_max(1)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import torch
 import warp as wp
 from torch import Tensor
 
 from bbfit.geometry.camera import Camera
+from bbfit.geometry.light import Light
 from bbfit.operators.cards.kernels import Fragment, draw_rows
-from bbfit.operators.cards.sheets import PreparedCards, SeenSheets, seen_sheets
+from bbfit.operators.cards.sheets import PreparedCards, SeenSheets, seen_axes, seen_sheets
 from bbfit.operators.drawing.fused import encoded_alpha
 from bbfit.operators.launching import LEAST_PIXELS, in_parallel, pieces_of, repeated, struct_array, warp_array, worker_count
 
@@ -16,17 +20,17 @@ from bbfit.operators.launching import LEAST_PIXELS, in_parallel, pieces_of, repe
 _FRAGMENT = 10
 
 
-def draw_cards_fused(prepared: PreparedCards, camera: Camera) -> Tensor:
+def draw_cards_fused(prepared: PreparedCards, camera: Camera, light: Light | None = None) -> Tensor:
     """:func:`~bbfit.operators.cards.reference.draw_cards_reference`, but for rounding. Equal inputs give equal bytes."""
-    return _drawn(prepared, camera)[0]
+    return _drawn(prepared, camera, light)[0]
 
 
 def count_fragments_fused(prepared: PreparedCards, camera: Camera) -> int:
-    """The number of :func:`~bbfit.operators.cards.reference.hits`, of cards without maps in V cameras."""
+    """The number of :func:`~bbfit.operators.cards.reference.hits`, in V cameras."""
     return int(_drawn(prepared, camera)[1].sum())
 
 
-def _drawn(prepared: PreparedCards, camera: Camera) -> tuple[Tensor, Tensor]:
+def _drawn(prepared: PreparedCards, camera: Camera, light: Light | None = None) -> tuple[Tensor, Tensor]:
     """The pictures, float32 [V, H, W, 4], and the numbers of fragments in their rows, int32 [V, H]."""
     sheets, levels, views, height, width = prepared.sheets, prepared.levels, len(camera), camera.height, camera.width
     image, counts = torch.zeros(views, height, width, 4), torch.zeros(views, height, dtype=torch.int32)
@@ -43,12 +47,20 @@ def _drawn(prepared: PreparedCards, camera: Camera) -> tuple[Tensor, Tensor]:
         (seen.to_depth, wp.vec3d),
         (sheets.first.int(), wp.int32),
         (torch.stack([levels.starts, levels.widths, levels.heights], -1).int(), wp.vec3i),
-        (levels.texels, wp.vec4ub),
+        *((part, wp.vec4ub) for part in _channels(levels.texels)),
+        *_lights(prepared, camera, light),
     ]
-    inputs = [height, width, encoded_alpha(prepared.cards.alpha), *(warp_array(tensor.contiguous(), kind) for tensor, kind in tensors)]
+    inputs = [
+        height,
+        width,
+        encoded_alpha(prepared.cards.alpha),
+        int(prepared.cards.traced),
+        *(warp_array(tensor.contiguous(), kind) for tensor, kind in tensors),
+    ]
     on, outputs, threads = wp.device_from_torch(image.device), [warp_array(image, wp.vec4), warp_array(counts, wp.int32)], worker_count()
+    most = min(_most_fragments(seen, height), len(sheets) * width)  # a pixel sees a sheet once
     heads = warp_array(torch.empty(threads, 2, width, dtype=torch.int32), wp.int32)
-    fragments = struct_array(torch.empty(threads, _most_fragments(seen, height), _FRAGMENT, dtype=torch.int32), Fragment)
+    fragments = struct_array(torch.empty(threads, most, _FRAGMENT, dtype=torch.int32), Fragment)
     again = repeated(draw_rows, lambda thread: [thread, heads, fragments, *inputs], outputs, on)
 
     def launch(begin: int, end: int) -> None:
@@ -56,6 +68,23 @@ def _drawn(prepared: PreparedCards, camera: Camera) -> tuple[Tensor, Tensor]:
 
     in_parallel(launch, pieces_of(views * height, -(-LEAST_PIXELS // width)))
     return image, counts
+
+
+def _channels(texels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Colors with alpha, normals with occlusion, and translucency, uint8 [T, 4] each, or [0, 4] where there is none."""
+    further = [texels[:, 4:8], torch.nn.functional.pad(texels[:, 8:], (0, 3))]
+    color, normals, translucency = (part if part.shape[1] == 4 else part.new_empty(0, 4) for part in (texels[:, :4], *further))
+    return color, normals, translucency
+
+
+def _lights(prepared: PreparedCards, camera: Camera, light: Light | None) -> list[tuple[Tensor, Any]]:
+    """The direction towards the sun in the axes of each sheet, and the sun's color with the strength of the sky; or neither."""
+    if light is None:
+        return [(torch.empty(0, 0, 3), wp.vec3), (torch.empty(0, 4), wp.vec4)]
+    light = light[[0] * len(camera)] if len(light) == 1 else light
+    towards = (seen_axes(prepared.sheets, camera) @ light.sun_directions[:, None, :, None])[..., 0]
+    suns = light.sun_colors * light.sun_strengths[:, None] / math.pi
+    return [(towards.float(), wp.vec3), (torch.cat([suns, light.ambients[:, None]], -1).float(), wp.vec4)]
 
 
 def _most_fragments(seen: SeenSheets, height: int) -> int:

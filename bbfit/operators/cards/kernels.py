@@ -14,6 +14,7 @@ from bbfit.operators.cards.sheets import SLACK as SLACK_VALUE
 from bbfit.operators.drawing.compositing import HASH, LEAST_CONTRAST, TIE
 from bbfit.operators.drawing.tile_forward import BLENDED, COVERAGE, HASHED, SMOOTH
 from bbfit.operators.launching import FLAGS
+from bbfit.operators.shading.kernels import decoded, encoded
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
@@ -121,6 +122,27 @@ def opacity(alpha: float, contrast: float, test: wp.vec4) -> float:
 
 
 @wp.func
+def shaded(color: wp.vec3, surface: wp.vec4, through: float, towards: wp.vec3, sun: wp.vec4, traced: int) -> wp.vec3:
+    """A base color under a sun in the direction ``towards`` in the texture's axes, and a sky, whose strength follows the sun's color.
+
+    ``surface`` is the filtered normal and occlusion, ``through`` translucency.
+    """
+    normal = wp.normalize(wp.vec3(2.0 * surface[0] - 1.0, 2.0 * surface[1] - 1.0, 2.0 * surface[2] - 1.0))
+    cosine = wp.dot(normal, towards)
+    of_sun = (1.0 - through) * wp.max(cosine, 0.0) + through * wp.max(-cosine, 0.0)
+    of_sky = surface[3]
+    if traced != 0:
+        of_sun = wp.where(towards[2] > 0.0, of_sun, 0.0)
+        of_sky = (1.0 + normal[2]) / 2.0
+    of_sky *= sun[3]
+    return wp.vec3(
+        wp.min(encoded(decoded(color[0]) * (of_sun * sun[0] + of_sky)), 1.0),
+        wp.min(encoded(decoded(color[1]) * (of_sun * sun[1] + of_sky)), 1.0),
+        wp.min(encoded(decoded(color[2]) * (of_sun * sun[2] + of_sky)), 1.0),
+    )
+
+
+@wp.func
 def is_inside(sides: wp.array2d(dtype=wp.vec3d), piece: int, u: wp.float64, v: wp.float64) -> bool:
     """Whether texture coordinates lie in a piece."""
     for side in range(sides.shape[1]):
@@ -139,6 +161,7 @@ def draw_rows(
     height: int,
     width: int,
     test: wp.vec4,
+    traced: int,
     boxes: wp.array2d(dtype=wp.vec4i),
     of_piece: wp.array(dtype=wp.int32),
     sides: wp.array2d(dtype=wp.vec3d),
@@ -147,6 +170,10 @@ def draw_rows(
     first_texels: wp.array(dtype=wp.int32),
     levels: wp.array(dtype=wp.vec3i),
     texels: wp.array(dtype=wp.vec4ub),
+    maps: wp.array(dtype=wp.vec4ub),
+    translucency: wp.array(dtype=wp.vec4ub),
+    towards: wp.array2d(dtype=wp.vec3),
+    suns: wp.array(dtype=wp.vec4),
     image: wp.array3d(dtype=wp.vec4),
     counts: wp.array2d(dtype=wp.int32),
 ):
@@ -154,6 +181,7 @@ def draw_rows(
 
     Memory of a thread: ``heads``, the first and the latest fragment of each pixel of a row, and the ``fragments`` of a row.
     Pieces of a sheet are consecutive, and sheets ascend.
+    ``maps`` are normals and occlusion. Without ``suns``, colors are shown as they are.
     """
     line, _ = wp.tid()
     line += first_line
@@ -198,7 +226,7 @@ def draw_rows(
     last = wp.float64(levels.shape[0] - 1)
     nested = test[3] != 0.0
     for column in range(width):
-        color = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        total = wp.vec4(0.0, 0.0, 0.0, 0.0)
         hidden = float(0.0)
         at = int(heads[thread, 0, column])
         while at >= 0 and hidden < 1.0:
@@ -210,6 +238,12 @@ def draw_rows(
             rate = wp.max(wp.length(right), wp.length(down)) / wp.abs(seen.scale)
             detail = wp.clamp(wp.log2(rate), nothing, last)
             sample = trilinear(texels, levels, seen.u, seen.v, detail)
+            color = wp.vec3(sample[0], sample[1], sample[2])
+            if suns.shape[0] > 0:
+                surface, through = trilinear(maps, levels, seen.u, seen.v, detail), float(0.0)
+                if translucency.shape[0] > 0:
+                    through = trilinear(translucency, levels, seen.u, seen.v, detail)[0]
+                color = shaded(color, surface, through, towards[view, seen.sheet], suns[view], traced)
             contrast = float(0.0)
             if test[3] == IS_SMOOTH:
                 across = alpha_beside(texels, levels, rows, detail, column ^ 1, row)
@@ -219,7 +253,7 @@ def draw_rows(
             if test[0] == HASH_CUTOFF:
                 alpha = wp.where(sample[3] >= threshold(column, row, first_texels[seen.sheet]), 1.0, 0.0)
             weight = wp.where(nested, wp.max(alpha - hidden, 0.0), alpha * (1.0 - hidden))
-            color += wp.vec4(sample[0], sample[1], sample[2], 1.0) * weight
+            total += wp.vec4(color[0], color[1], color[2], 1.0) * weight
             hidden += weight
             at = seen.following
-        image[view, row, column] = color
+        image[view, row, column] = total

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
+from bbfit.geometry.light import Light
 from bbfit.operators.cards.sampling import filtered
-from bbfit.operators.cards.sheets import SLACK, PreparedCards, Sheets, seen_sheets
+from bbfit.operators.cards.sheets import SLACK, PreparedCards, Sheets, seen_axes, seen_sheets
 from bbfit.operators.drawing.compositing import composite_fragments, coverage, opacity, thresholds
+from bbfit.operators.shading.reference import decode, encode
 
 # Most pixels that are compared with polygons at once, and of cameras that are drawn together.
 _AT_ONCE, _TOGETHER = 1 << 21, 1 << 18
@@ -40,13 +43,21 @@ class Hits:
     """From a pixel (x, y, 1) to homogeneous texture coordinates of each sheet in each camera, [V, S, 3, 3]."""
 
 
-def draw_cards_reference(prepared: PreparedCards, camera: Camera) -> Tensor:
-    """Draw cards without maps for V cameras: premultiplied RGBA in [0, 1], float32 [V, H, W, 4], as :func:`~bbfit.rendering.draw_cards`."""
-    together, pictures = max(1, _TOGETHER // (camera.width * camera.height)), list[Tensor]()
+def draw_cards_reference(prepared: PreparedCards, camera: Camera, light: Light | None = None) -> Tensor:
+    """Draw cards for V cameras: premultiplied RGBA in [0, 1], float32 [V, H, W, 4], as :func:`~bbfit.rendering.cards.draw_cards`.
+
+    ``light``, for cards with maps, is that of each view, or one for all. Without it they show their base color.
+    """
+    together = 1 if light is not None else max(1, _TOGETHER // (camera.width * camera.height))
+    pictures = list[Tensor]()
     for index in range(0, len(camera), together):
         some = camera[index : index + together]
         met, straight = shown(prepared, some)
-        pictures.append(composited(straight[:, :3], straight[:, 3], met, prepared, some))
+        colors = straight[:, :3]
+        if light is not None:
+            axes, own = seen_axes(prepared.sheets, some)[0, met.sheet], light[[index if len(light) > 1 else 0]]
+            colors = _lit(colors, straight[:, 4:], axes, own, traced=prepared.cards.traced)
+        pictures.append(composited(colors, straight[:, 3], met, prepared, some))
     return torch.cat(pictures)
 
 
@@ -105,6 +116,22 @@ def hits(cards: Cards, sheets: Sheets, camera: Camera) -> Hits:
     detail = (torch.maximum(*rates) / scale.abs()).log2()
     count = max(1, len(sheets))
     return Hits(sheet // count, sheet % count, x, y, uv, detail, depth, seen.to_uv)
+
+
+def _lit(colors: Tensor, maps: Tensor, axes: Tensor, light: Light, *, traced: bool) -> Tensor:
+    """Shade base colors of fragments, [M, 3], given their filtered maps, [M, 4 or 5], and the axes of the normals, [M, 3, 3].
+
+    The formula is that of :func:`~bbfit.operators.shading.reference.shade_reference`. ``traced`` light comes from the visible side of
+    the plane only: no sun from behind it, and of an even sky the share (1 + cos a) / 2 where the normal leans by the angle a.
+    """
+    normals = normalize(2 * maps[:, :3] - 1, dim=-1)
+    towards, open_sky, translucency = (axes @ light.sun_directions[0]).float(), maps[:, 3:4], maps[:, 4:] if maps.shape[1] > 4 else 0
+    cosine = (normals * towards).sum(-1, keepdim=True)
+    of_sun = (1 - translucency) * cosine.clamp_min(0) + translucency * (-cosine).clamp_min(0)
+    if traced:
+        of_sun, open_sky = of_sun * (towards[:, 2:] > 0), (1 + normals[:, 2:]) / 2
+    sun = (light.sun_colors[0] * light.sun_strengths / math.pi).float()
+    return encode(decode(colors) * (of_sun * sun + float(light.ambients) * open_sky)).clamp_max(1)
 
 
 def _beside(met: Hits) -> list[Tensor]:

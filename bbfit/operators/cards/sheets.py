@@ -153,9 +153,9 @@ def _padded(arrays: list[NDArray[np.float64]], width: int) -> Tensor:
 
 
 def seen_axes(sheets: Sheets, camera: Camera) -> Tensor:
-    """The axes of the normals of each plane as a single camera sees them, [S, 3, 3]: from behind, those of both sides turn."""
-    behind = (_distances(sheets, camera.batch().to("cpu").to(torch.float64))[0][0] < 0) & ~sheets.culled
-    return torch.where(behind[:, None, None], -sheets.axes, sheets.axes)
+    """The axes of the normals of each plane as V cameras see them, [V, S, 3, 3]: from behind, those of both sides turn."""
+    behind = (_distances(sheets, camera.batch().to("cpu").to(torch.float64))[0] < 0) & ~sheets.culled
+    return torch.where(behind[..., None, None], -sheets.axes, sheets.axes)
 
 
 def _distances(sheets: Sheets, camera: Camera) -> tuple[Tensor, Tensor]:
