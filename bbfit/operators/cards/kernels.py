@@ -238,12 +238,6 @@ def draw_rows(
             rate = wp.max(wp.length(right), wp.length(down)) / wp.abs(seen.scale)
             detail = wp.clamp(wp.log2(rate), nothing, last)
             sample = trilinear(texels, levels, seen.u, seen.v, detail)
-            color = wp.vec3(sample[0], sample[1], sample[2])
-            if suns.shape[0] > 0:
-                surface, through = trilinear(maps, levels, seen.u, seen.v, detail), float(0.0)
-                if translucency.shape[0] > 0:
-                    through = trilinear(translucency, levels, seen.u, seen.v, detail)[0]
-                color = shaded(color, surface, through, towards[view, seen.sheet], suns[view], traced)
             contrast = float(0.0)
             if test[3] == IS_SMOOTH:
                 across = alpha_beside(texels, levels, rows, detail, column ^ 1, row)
@@ -253,6 +247,12 @@ def draw_rows(
             if test[0] == HASH_CUTOFF:
                 alpha = wp.where(sample[3] >= threshold(column, row, first_texels[seen.sheet]), 1.0, 0.0)
             weight = wp.where(nested, wp.max(alpha - hidden, 0.0), alpha * (1.0 - hidden))
+            color = wp.vec3(sample[0], sample[1], sample[2])
+            if suns.shape[0] > 0 and weight > 0.0:
+                surface, through = trilinear(maps, levels, seen.u, seen.v, detail), float(0.0)
+                if translucency.shape[0] > 0:
+                    through = trilinear(translucency, levels, seen.u, seen.v, detail)[0]
+                color = shaded(color, surface, through, towards[view, seen.sheet], suns[view], traced)
             total += wp.vec4(color[0], color[1], color[2], 1.0) * weight
             hidden += weight
             at = seen.following
