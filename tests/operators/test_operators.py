@@ -22,6 +22,7 @@ from bbfit.operators.ssim.reference import ssim_reference
 
 STEMS = {
     "adam": "Adam",
+    "cards": "draw_cards_",
     "drawing": "render_",
     "image_loss": "image_loss_",
     "shading": "shade_",
