@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -17,14 +16,6 @@ from bbfit.operators.drawing.tile_forward import BLOCK
 STEPS = 420
 BETAS = (0.9, 0.999)
 REST_AFTER = rest_after(BETAS[0])
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """Puts torch's number of threads back."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def start(count: int) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -32,14 +32,6 @@ MODES = (
     AlphaMode("coverage"),
     AlphaMode("coverage", samples=0),
 )
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """Puts torch's number of threads back."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def levelled(cloud: BillboardCloud) -> Cards:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -27,14 +27,6 @@ from bbfit.rendering.dispatch import render
 # to TYPICAL), 2.4e-4 was the most over 230 random scenes, in two where a sample lies as near as that to a kink of the filter.
 ALLOWED, TYPICAL = 5e-4, 3e-6
 NAMES = ("image", "texels", *PLACEMENT)
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """Puts torch's number of threads back."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def drawn(renderer: Callable[[BillboardCloud, Camera], Tensor], cloud: BillboardCloud, camera: Camera, seed: int = 0) -> dict[str, Tensor]:

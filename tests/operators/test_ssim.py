@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
 
 from bbfit.operators.ssim.fused import ssim_and_gradient
 from bbfit.operators.ssim.reference import ssim_reference
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """Puts torch's number of threads back."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def reference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:

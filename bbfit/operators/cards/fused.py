@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 from typing import Any
 
@@ -15,9 +16,6 @@ from bbfit.operators.cards.kernels import Fragment, draw_rows
 from bbfit.operators.cards.sheets import PreparedCards, SeenSheets, seen_axes, seen_sheets
 from bbfit.operators.drawing.fused import encoded_alpha
 from bbfit.operators.launching import LEAST_PIXELS, in_parallel, pieces_of, repeated, struct_array, warp_array, worker_count
-
-# Numbers of 32 bits in a fragment.
-_FRAGMENT = 10
 
 
 def draw_cards_fused(prepared: PreparedCards, camera: Camera, light: Light | None = None) -> Tensor:
@@ -37,17 +35,15 @@ def _drawn(prepared: PreparedCards, camera: Camera, light: Light | None = None) 
     if not len(sheets) or not views:
         return image, counts
     seen = seen_sheets(sheets, camera)
-    by_sheet = sheets.of_piece.sort(stable=True).indices
-    boxes = torch.cat([seen.low, seen.high], -1)[:, by_sheet].int()
     tensors = [
-        (boxes, wp.vec4i),
-        (sheets.of_piece[by_sheet].int(), wp.int32),
-        (sheets.sides[by_sheet], wp.vec3d),
+        (torch.cat([seen.low, seen.high], -1).int(), wp.vec4i),
+        (sheets.of_piece.int(), wp.int32),
+        (sheets.sides, wp.vec3d),
         (seen.to_uv, wp.mat33d),
         (seen.to_depth, wp.vec3d),
         (sheets.first.int(), wp.int32),
         (torch.stack([levels.starts, levels.widths, levels.heights], -1).int(), wp.vec3i),
-        *((part, wp.vec4ub) for part in _channels(levels.texels)),
+        *((part, wp.vec4ub) for part in prepared.channels),
         *_lights(prepared, camera, light),
     ]
     inputs = [
@@ -60,7 +56,8 @@ def _drawn(prepared: PreparedCards, camera: Camera, light: Light | None = None) 
     on, outputs, threads = wp.device_from_torch(image.device), [warp_array(image, wp.vec4), warp_array(counts, wp.int32)], worker_count()
     most = min(_most_fragments(seen, height), len(sheets) * width)  # a pixel sees a sheet once
     heads = warp_array(torch.empty(threads, 2, width, dtype=torch.int32), wp.int32)
-    fragments = struct_array(torch.empty(threads, most, _FRAGMENT, dtype=torch.int32), Fragment)
+    numbers = ctypes.sizeof(Fragment.ctype) // 4  # type: ignore[attr-defined]
+    fragments = struct_array(torch.empty(threads, most, numbers, dtype=torch.int32), Fragment)
     again = repeated(draw_rows, lambda thread: [thread, heads, fragments, *inputs], outputs, on)
 
     def launch(begin: int, end: int) -> None:
@@ -68,13 +65,6 @@ def _drawn(prepared: PreparedCards, camera: Camera, light: Light | None = None) 
 
     in_parallel(launch, pieces_of(views * height, -(-LEAST_PIXELS // width)))
     return image, counts
-
-
-def _channels(texels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Colors with alpha, normals with occlusion, and translucency, uint8 [T, 4] each, or [0, 4] where there is none."""
-    further = [texels[:, 4:8], torch.nn.functional.pad(texels[:, 8:], (0, 3))]
-    color, normals, translucency = (part if part.shape[1] == 4 else part.new_empty(0, 4) for part in (texels[:, :4], *further))
-    return color, normals, translucency
 
 
 def _lights(prepared: PreparedCards, camera: Camera, light: Light | None) -> list[tuple[Tensor, Any]]:

@@ -27,7 +27,7 @@ NO_CUTOFF, HASH_CUTOFF, IS_SMOOTH, IS_COVERAGE = (wp.constant(float(value)) for 
 
 @wp.struct
 class Fragment:
-    """What a pixel sees of a sheet. 40 bytes, which the host allocates."""
+    """What a pixel sees of a sheet. The host allocates its memory."""
 
     u: wp.float64
     v: wp.float64
@@ -180,7 +180,6 @@ def draw_rows(
     """Write ``image`` [V, H, W] and the number of fragments of each row, ``counts`` [V, H]; launched over rows of all views.
 
     Memory of a thread: ``heads``, the first and the latest fragment of each pixel of a row, and the ``fragments`` of a row.
-    Pieces of a sheet are consecutive, and sheets ascend.
     ``maps`` are normals and occlusion. Without ``suns``, colors are shown as they are.
     """
     line, _ = wp.tid()

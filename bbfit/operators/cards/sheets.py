@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -42,7 +43,7 @@ class Sheets:
     first: Tensor
     """Index of a texture's first texel among the texels of all textures, which seeds the mode ``hash``, int64 [S]."""
     of_piece: Tensor
-    """The plane of each piece, int64 [Q]. Pieces of a plane keep the order of the cards."""
+    """The plane of each piece, int64 [Q], ascending. Pieces of a plane keep the order of the cards."""
     corners: Tensor
     """Homogeneous, [Q, K, 4]."""
     sides: Tensor
@@ -62,6 +63,17 @@ class PreparedCards:
     """Their planes."""
     levels: MipChain
     """The levels of their atlas: colors and alpha, and the values of maps if there are any."""
+
+    @cached_property
+    def channels(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The texels of all levels: colors with alpha, normals with occlusion, and translucency in the first of four channels.
+
+        uint8 [T, 4] each, or [0, 4] where there is none.
+        """
+        texels = self.levels.texels
+        further = [texels[:, 4:8], torch.nn.functional.pad(texels[:, 8:], (0, 3))]
+        color, normals, translucency = (part if part.shape[1] == 4 else part.new_empty(0, 4) for part in (texels[:, :4], *further))
+        return color.contiguous(), normals.contiguous(), translucency
 
 
 @dataclass(frozen=True)
@@ -121,6 +133,8 @@ def sheets_of(cards: Cards) -> Sheets:
         planes[number][0].append(card)
         of_piece.append(number)
         pieces.append(card)
+    order = np.argsort(of_piece, kind="stable").tolist()
+    of_piece, pieces = [of_piece[number] for number in order], [pieces[number] for number in order]
     starts, ones = np.concatenate([[0], cards.atlas.sizes.prod(-1).cumsum()]), [own[0] for own, _ in planes]
     return Sheets(
         torch.from_numpy(np.array([to_world for _, to_world in planes], np.float64).reshape(-1, 4, 3)),
