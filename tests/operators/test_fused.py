@@ -11,6 +11,7 @@ import torch
 from scenes import CORNERS, PLACEMENT, camera_on_z, cloud_of, facing_cloud, noise, random_scene, ring, ring_of, rolled, tracked
 from torch import Tensor
 
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera, look_at, pinhole_intrinsics
 from bbfit.geometry.cloud import BillboardCloud, even_upright
 from bbfit.geometry.orbit import Orbit
@@ -86,6 +87,14 @@ def test_random_scenes(count: int, orthographic: bool) -> None:
 @pytest.mark.parametrize("orthographic", [False, True])
 def test_more_than_sixty_four_billboards(orthographic: bool) -> None:
     errors(*random_scene(3, 65, orthographic=orthographic))
+
+
+@pytest.mark.parametrize("alpha", [AlphaMode(), AlphaMode("coverage", 0.4, samples=0), AlphaMode("mask", hardness=2.0, antialiased=True)])
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_billboards_smaller_than_a_tile(alpha: AlphaMode, orthographic: bool) -> None:
+    """Most pixels of a tile meet few of its layers, which are then sorted for each pixel alone."""
+    cloud, camera = random_scene(5, 150, orthographic=orthographic)
+    errors(replace(cloud, half_extents=0.2 * cloud.half_extents, alpha=alpha), camera)
 
 
 @pytest.mark.parametrize("count", [4, 5])

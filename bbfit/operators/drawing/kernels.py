@@ -80,11 +80,11 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
             meet(tile, planes, base, column, row, orthographic, texels, texels)
             arrange(tile)
             position = int(0)
-            while position < tile.active:
+            while position < tile.depth:
                 sample(tile, position, 1, test, planes, base, column, row, texels, occupied)
                 position += 1
                 if not blend(tile, position - 1, nested):
-                    position = tile.active
+                    position = tile.depth
             store(tile, image, view, column, row)
 
     @wp.func
@@ -109,7 +109,7 @@ def kernels(capacity: int = 4, lanes: int = 1) -> SimpleNamespace:
             if anything(target, image_gradient, view, column, row, width, height) or not vacant(tile, planes, base, occupied):
                 arrange(tile)
                 position = int(0)
-                while position < tile.active:
+                while position < tile.depth:
                     sample(tile, position, 0, test, planes, base, column, row, texels, occupied)
                     blend(tile, position, nested)
                     position += 1

@@ -68,7 +68,7 @@ PULL_BACK = """
     // v_k and s_k of kernels.py. The depths have been used.
     auto& values = tile.near.data;
     float behind[LANES] = {};
-    for (int p = tile.active - 1; p >= 0; --p) {
+    for (int p = tile.depth - 1; p >= 0; --p) {
         float parts[LANES], raw[LANES];
         if (LANES == 1 || tile.same.c[p]) {
             const int k = tile.order.data[p][0];
@@ -94,7 +94,7 @@ PULL_BACK = """
             behind[l] += (nested ? shown : parts[l]) * value;
         }
     }
-    for (int p = 0; p < tile.active; ++p) {
+    for (int p = 0; p < tile.depth; ++p) {
         const float* shares = tile.shares.data[p];
         ONE_BY_ONE
         for (int l = 0; l < LANES; ++l) {

@@ -14,6 +14,8 @@ REACH = 26
 """Largest distance of the texels that a row of pixels in a tile reads, for a test of occupancy."""
 SPAN = 64
 """Pixels of a row whose tiles look for their planes together."""
+SPARSE = 0.75
+"""Least share of the layers of a tile that pixels meet, on average, for which all pixels are sorted together."""
 HASHED, BLENDED = -1.0, 0.0
 """Cutoffs of alpha modes that have none."""
 SMOOTH, COVERAGE = 1.0, 2.0
@@ -23,7 +25,7 @@ SMOOTH, COVERAGE = 1.0, 2.0
 CONSTANTS = f"""
     constexpr int MISS = -1, BORDER = -2, BLOCK = {BLOCK}, REACH = {REACH}, SPAN = {SPAN};
     constexpr unsigned HASH[] = {{{", ".join(f"{factor}u" for factor in HASH)}}};
-    constexpr float TIE = {TIE!r}f, STEEPEST = {STEEPEST!r}f, LEAST_CONTRAST = {LEAST_CONTRAST!r}f;
+    constexpr float TIE = {TIE!r}f, STEEPEST = {STEEPEST!r}f, SPARSE = {SPARSE!r}f, LEAST_CONTRAST = {LEAST_CONTRAST!r}f;
     constexpr float HASHED = {HASHED!r}f, BLENDED = {BLENDED!r}f, SMOOTH = {SMOOTH!r}f, COVERAGE = {COVERAGE!r}f;
 """
 # The four texels around a sample at texel coordinates (u, v) that may lie beyond the border, clamped to it, and their weights.
@@ -76,7 +78,7 @@ MEET = """
         const int first = plane.texture.c[0], height = plane.texture.c[1], width = plane.texture.c[2];
         const float last_u = (float)width, last_v = (float)height;
         float nears[LANES], us[LANES], vs[LANES];
-        int hits[LANES], any = 0;
+        int hits[LANES], met = 0;
         for (int l = 0; l < LANES; ++l) {
             const float w = m[2][0] * xs[l] + (m[2][1] * ys[l] + m[2][2]), scale = 1.0f / w;
             const float u = (m[0][0] * xs[l] + (m[0][1] * ys[l] + m[0][2])) * scale;
@@ -93,8 +95,8 @@ MEET = """
                 hits[l] &= nears[l] < 0.0f;
             }
         }
-        for (int l = 0; l < LANES; ++l) any |= hits[l];
-        if (!any) continue;
+        for (int l = 0; l < LANES; ++l) met |= hits[l] << l;
+        if (!met) continue;
         int places[LANES];
         for (int l = 0; l < LANES; ++l) {
             const float u = hits[l] ? us[l] : -2.0f, v = hits[l] ? vs[l] : -2.0f, left = floorf(u), top = floorf(v);
@@ -123,6 +125,7 @@ MEET = """
         tile.ids.c[k] = id;
         if (LANES > 1) {
             tile.slots.c[k] = slot;
+            tile.met.c[k] = met;
             tile.sampled.c[k] = 0;
         }
         ++k;
@@ -134,6 +137,41 @@ MEET = """
     }
 """
 ARRANGE = """
+    tile.depth = tile.active;
+#if !defined(__CUDA_ARCH__)
+    int meetings = 0;
+    for (int k = 0; k < tile.active && LANES > 1; ++k) meetings += __builtin_popcount(tile.met.c[k]);
+    if (LANES > 1 && meetings < SPARSE * (float)(tile.active * LANES)) {
+        // Sort the layers of each pixel by themselves. What is left is a layer that no pixel meets.
+        int counts[LANES] = {};
+        for (int k = 0; k < tile.active; ++k) {
+            for (int left = tile.met.c[k]; left; left &= left - 1) {
+                const int l = __builtin_ctz(left);
+                int p = counts[l]++;
+                for (const float b = tile.near.data[k][l]; p > 0; --p) {
+                    const int other = tile.order.data[p - 1][l];
+                    const float f = tile.near.data[other][l];
+                    if (!(tile.ids.c[other] < tile.ids.c[k] ? f < b - TIE * fabsf(b) : !(b < f - TIE * fabsf(f)))) break;
+                    tile.order.data[p][l] = other;
+                }
+                tile.order.data[p][l] = k;
+            }
+        }
+        const int none = tile.active;
+        tile.ids.c[none] = tile.ids.c[0];
+        tile.sampled.c[none] = 0;
+        tile.depth = 0;
+        for (int l = 0; l < LANES; ++l) {
+            tile.place.data[none][l] = MISS;
+            tile.depth = counts[l] > tile.depth ? counts[l] : tile.depth;
+        }
+        for (int p = 0; p < tile.depth; ++p) {
+            for (int l = 0; l < LANES; ++l) tile.order.data[p][l] = p < counts[l] ? tile.order.data[p][l] : none;
+            tile.same.c[p] = 0;
+        }
+        return;
+    }
+#endif
     bool moved = false;
     for (int p = 0; p < tile.active && LANES > 1; ++p) tile.same.c[p] = 1;
     for (int position = 1; position < tile.active; ++position) {
@@ -203,7 +241,7 @@ SAMPLE = """
                 most = place[l] > most ? place[l] : most;
             }
             const bool inside = least >= 0;
-            bool empty = false;
+            bool empty = least == MISS && most == MISS;
             if (inside && shown && most - least <= REACH) {
                 int any = 0;
                 for (int b = least / BLOCK; b <= (most + 1) / BLOCK; ++b) any |= occupied.data[b];

@@ -11,8 +11,8 @@ A tile has 2 rows of 8 pixels on a CPU, which fill its vector registers, and one
 
     by u: (k_1 - k_0)(1 - fy) + (k_3 - k_2) fy,    by v: (k_2 - k_0)(1 - fx) + (k_3 - k_1) fx.
 
-**Order.** Layers begin in the order that they have in the tile to the left, which is mostly right. They are sorted by insertion, all pixels
-at a time.
+**Order.** Layers begin in the order that they have in the tile to the left, which is mostly right. They are sorted by insertion: all pixels
+at a time, or, where small billboards leave out most of a tile's pixels, for each pixel only those that it meets.
 
 **Opacity** is a step or a ramp of filtered alpha (:func:`bbfit.operators.drawing.compositing.opacity`). The contrast of an antialiased mask
 compares pixels of a square of 2 x 2; a tile of a CPU has them all. Where a ramp is steeper than
@@ -72,8 +72,10 @@ def tiles(capacity: int, lanes: int) -> SimpleNamespace:
         close: int  # number of them that reach the next tiles
         span: shared  # their places in ``listed``
         active: int  # number of layers: planes that some pixel meets
+        depth: int  # number of positions: most layers of a pixel, or all layers
         slots: shared  # of each layer: its place in ``listed``
         ids: each  # its plane
+        met: shared  # the pixels that meet it, a bit for each
         sampled: shared
         same: shared  # of each position: whether all pixels have the same layer there
         place: wides_ints  # of each layer and pixel: the upper left texel, MISS or BORDER
