@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -61,10 +62,10 @@ COUNTS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Numbers of billboards that are compared."""
 LEAST_GAIN_DB = 0.3
 """Least gain at a low resolution, in dB, for which the number of billboards may double."""
-# Number of billboards that is tried first.
-_FIRST = 32
+# Numbers of billboards that are tried first and, if they are not too many, next.
+_FIRST, _SECOND = 32, 384
 # Most searches for that choice.
-_SEARCHES = 3
+_SEARCHES = 4
 # Share of bark above which a tree is bare, and all billboards are for all of its points.
 _BARE = 0.9
 # Margin around the points of a facet of bark, as a fraction of the tree's radius.
@@ -97,7 +98,7 @@ def find_placement(
     show the points there.
 
     If ``billboards`` is None, their number is chosen at the knee of the curve, within ``least_billboards`` and ``most_billboards``. What a
-    graphics card pays for is the pixels that it shades, and they grow with the number of layers before each other. Two quick
+    graphics card pays for is the pixels that it shades, and they grow with the number of layers before each other. Two or three quick
     searches with one candidate measure the layers of few and of many billboards, and the number of billboards with ``most_layers`` is
     interpolated on a logarithmic scale. If a doubling of the number would gain less than :data:`LEAST_GAIN_DB`, it is the smaller one.
 
@@ -157,29 +158,32 @@ def _of_the_crown(config: ResolvedFit, count: int) -> ResolvedFit:
 def _at_the_knee(tree: _Tree, config: ResolvedFit, on_progress: Callable[[int, int], None]) -> BillboardCloud:
     """The placement of as many billboards as pay for the tree; see :func:`find_placement`."""
 
-    def tried(number: int, count: int) -> _Trial:
+    tries = itertools.count(1)
+
+    def tried(count: int) -> _Trial:
         whole = config.counted(count)
         brief = replace(whole, restarts=1, candidates=1, refinement_rounds=0)
         cloud, search = _found(tree, brief, lambda done, total: None, QUICK)
-        on_progress(number, _SEARCHES)
+        on_progress(next(tries), _SEARCHES)
         return _Trial(count, cloud if brief == whole else None, search.layers(cloud), search.decibels(cloud))
 
     def chosen(count: int, *trials: _Trial) -> BillboardCloud:
         clouds = [trial.cloud for trial in trials if trial.count == count and trial.cloud is not None]
         return clouds[0] if clouds else _found(tree, config.counted(count), lambda done, total: None, QUICK)[0]
 
-    first = tried(1, min(max(_FIRST, config.least_billboards), config.most_billboards))
-    other = config.most_billboards if first.layers <= config.most_layers else config.least_billboards
-    if other == first.count:
-        return chosen(other, first)
-    few, many = sorted([first, tried(2, other)], key=attrgetter("count"))
-    doublings = math.log2(many.count / few.count)
-    if many.decibels - few.decibels < LEAST_GAIN_DB * doublings or few.layers >= config.most_layers:
-        return chosen(few.count, few)
-    if many.layers <= config.most_layers:
-        return chosen(many.count, many)
-    position = (config.most_layers - few.layers) / (many.layers - few.layers)
-    return chosen(round(few.count * 2 ** (doublings * position)), few, many)
+    limit, most = config.most_layers, config.most_billboards
+    trial = tried(min(max(_FIRST, config.least_billboards), most))
+    more = [count for count in (min(_SECOND, most), most) if count > trial.count]
+    for count in dict.fromkeys(more) if trial.layers <= limit else {config.least_billboards} - {trial.count}:
+        few, many = sorted([trial, tried(count)], key=attrgetter("count"))
+        doublings = math.log2(many.count / few.count)
+        if many.decibels - few.decibels < LEAST_GAIN_DB * doublings or few.layers >= limit:
+            return chosen(few.count, few)
+        if many.layers > limit:
+            position = (limit - few.layers) / (many.layers - few.layers)
+            return chosen(round(few.count * 2 ** (doublings * position)), few, many)
+        trial = many
+    return chosen(trial.count, trial)
 
 
 @dataclass(frozen=True)
