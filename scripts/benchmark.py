@@ -19,6 +19,8 @@ placement for each folder of views: the thesis preset with four two-sided billbo
           has as many vertices; only with ``--only placement``
 search    for each folder of views: seconds of the default search for a placement, in the visual hull (the median of three, after one that
           is not counted); only with ``--only search``
+levels    for each folder of views: milliseconds of a step at each resolution of a default fit, from coarse to fine, with hundreds of
+          billboards (medians); only with ``--only levels``
 start     starting up: ``bbfit --help`` and ``import bbfit`` (medians of five), and a fit of two steps and the first step of a fit, with an
           empty and with a filled cache of compiled kernels; only with ``--only start``
 cards     drawing the model of a short default fit as programs show it, by torch and by the kernel: four cameras, medians of five; only with
@@ -30,8 +32,8 @@ memory    the peak resident memory of a default fit of 360 views at 1024 x 1024,
 PSNR, SSIM and FLIP are means over four backgrounds.
 
 ``--quick`` takes less than a minute. It omits the willow, the thesis, steps of two views, most numbers of billboards, quality and memory.
-``--views`` are the folders for quality, placement and search, by default data/views. bound_s does not include the bytes that SSIM and
-sharpness move.
+``--views`` are the folders for quality, placement, search and levels, by default data/views. bound_s does not include the bytes that SSIM
+and sharpness move.
 """
 
 from __future__ import annotations
@@ -63,7 +65,7 @@ from bbfit.fitting import fused_pass
 from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.initialize import random_textures, start_cloud
 from bbfit.fitting.levels import Targets, resize_textures, shrunk_sizes
-from bbfit.fitting.loop import Step
+from bbfit.fitting.loop import Step, resolution_levels
 from bbfit.fitting.points import placement_points
 from bbfit.fitting.search import find_placement
 from bbfit.fitting.steps import BLEND, Stepper
@@ -82,7 +84,7 @@ WARM_STEPS = {"default": 160, "thesis": 1200}
 """Number of steps at an eighth of the size. Each finer level has half as many."""
 RAMP = AlphaMode("mask", 0.2, 4.0, antialiased=True)
 """A mask in the middle of a fit."""
-ROWS = ("grow", "steps", "quality", "placement", "search", "start", "cards", "render", "run", "memory")
+ROWS = ("grow", "steps", "quality", "placement", "search", "levels", "start", "cards", "render", "run", "memory")
 """What ``--only`` can choose."""
 Row = dict[str, Any]
 
@@ -389,6 +391,21 @@ def searching(folders: list[Path]) -> list[Row]:
     return rows
 
 
+def levels(folders: list[Path]) -> list[Row]:
+    """Measure the rows ``levels``."""
+    rows: list[Row] = []
+    for folder in folders:
+        views = bbfit.ViewDataset.load(folder)
+        for count in (384, 768):
+            config, ends = bbfit.FitConfig(billboards=count, steps=160).resolve(), list[float]()
+            bbfit.fit(views, config, on_step=lambda step, ends=ends: ends.append(time.perf_counter()))  # type: ignore[misc]
+            parts = np.array_split(np.diff(ends), len(resolution_levels(config, views.train.cameras)))
+            row: Row = {"name": "levels", "views": folder.name, "size": views.train.cameras.width, "billboards": count}
+            rows.append(row | {"step_ms": [round(1000 * float(np.median(part)), 1) for part in parts]})
+            show(rows[-1])
+    return rows
+
+
 def starting() -> list[Row]:
     """Measure the rows ``start``."""
     fit = ["-m", "bbfit.cli", "fit", str(DATA / "views"), "--steps", "2", "--placement", "even", "--billboards", "2"]
@@ -487,7 +504,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="take less than a minute")
     parser.add_argument("--json", type=Path, help="write the rows to this file as a JSON list")
-    parser.add_argument("--views", type=Path, nargs="*", help="folders of views for the rows quality, placement and search")
+    parser.add_argument("--views", type=Path, nargs="*", help="folders of views for the rows quality, placement, search and levels")
     parser.add_argument("--only", nargs="*", choices=ROWS, help="measure only these rows")
     arguments = parser.parse_args()
     selected = arguments.only or (["grow", "steps"] if arguments.quick else ["grow", "steps", "quality", "memory"])
@@ -498,6 +515,8 @@ def main() -> None:
         rows += steps(arguments.quick)
     if "quality" in selected:
         rows += quality(arguments.views or [DATA / "views"])
+    if "levels" in selected:
+        rows += levels(arguments.views or [DATA / "views"])
     if "search" in selected:
         rows += searching(arguments.views or [DATA / "views"])
     if "placement" in selected:

@@ -37,7 +37,7 @@ DATA = Path(__file__).resolve().parents[1] / "data"
         (["--preset", "thesis", "--auto"], "preset: 'thesis' cannot be combined with a budget"),
         (["--sides", "two", "--vertices", "4"], "vertices: 4 are too few for one billboard"),
         (["--sides", "pair"], "sides: pairs need an even placement"),
-        (["--max-texels", "3"], "max_texels: 3 are too few for 768 textures"),
+        (["--max-texels", "3"], "max_texels: 3 are too few for 384 textures"),
         (["--port", "65536"], "port: expected a value in [0, 65535], got 65536"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

@@ -153,7 +153,7 @@ class FitConfig:
     """Number of billboards. Preset: as many as pay for this tree, within least_billboards and most_billboards; thesis: 4."""
     least_billboards: Count = 16
     """Least number of billboards that the preset chooses by itself."""
-    most_billboards: Count = 768
+    most_billboards: Count = 384
     """Largest number of billboards that the preset chooses by itself."""
     most_layers: _Layers | None = None
     """How many billboards may lie before each other, on average over the rectangle around the tree, when the fit chooses their number.

@@ -52,7 +52,7 @@ BAD: dict[str, tuple[RunConfig, str]] = {
     "a budget below a billboard": (RunConfig(fit=FitConfig(sides="two"), budget=BudgetConfig(vertices=4)), "vertices: 4 are too few"),
     "pairs of clusters": (RunConfig(fit=FitConfig(sides="pair")), "sides: pairs need an even placement"),
     "pairs of clusters in a budget": (RunConfig(fit=FitConfig(sides="pair"), budget=BudgetConfig(auto=True)), "sides: pairs need"),
-    "too few texels": (RunConfig(fit=FitConfig(max_texels=1)), "max_texels: 1 are too few for 768 textures"),
+    "too few texels": (RunConfig(fit=FitConfig(max_texels=1)), "max_texels: 1 are too few for 384 textures"),
 }
 
 
