@@ -142,21 +142,26 @@ ARRANGE = """
     int meetings = 0;
     for (int k = 0; k < tile.active && LANES > 1; ++k) meetings += __builtin_popcount(tile.met.c[k]);
     if (LANES > 1 && meetings < SPARSE * (float)(tile.active * LANES)) {
-        // Sort the layers of each pixel by themselves. What is left is a layer that no pixel meets.
-        int counts[LANES] = {};
+        // Sort the layers of each pixel by themselves, and all of them for the next tile. What is left is a layer that no pixel meets.
+        auto before = [&](int k, int other, int l) -> bool {  // whether layer k is in front of an earlier one
+            const float f = tile.near.data[other][l], b = tile.near.data[k][l];
+            return tile.ids.c[other] < tile.ids.c[k] ? f < b - TIE * fabsf(b) : !(b < f - TIE * fabsf(f));
+        };
+        int counts[LANES] = {}, next[CAPACITY];
         for (int k = 0; k < tile.active; ++k) {
             for (int left = tile.met.c[k]; left; left &= left - 1) {
                 const int l = __builtin_ctz(left);
                 int p = counts[l]++;
-                for (const float b = tile.near.data[k][l]; p > 0; --p) {
-                    const int other = tile.order.data[p - 1][l];
-                    const float f = tile.near.data[other][l];
-                    if (!(tile.ids.c[other] < tile.ids.c[k] ? f < b - TIE * fabsf(b) : !(b < f - TIE * fabsf(f)))) break;
-                    tile.order.data[p][l] = other;
-                }
+                for (; p > 0 && before(k, tile.order.data[p - 1][l], l); --p) tile.order.data[p][l] = tile.order.data[p - 1][l];
                 tile.order.data[p][l] = k;
             }
+            int p = k;
+            for (; p > 0 && before(k, next[p - 1], LANES - 1); --p) next[p] = next[p - 1];
+            next[p] = k;
         }
+        int sorted[CAPACITY];
+        for (int p = 0; p < tile.active; ++p) sorted[p] = tile.ids.c[next[p]];
+        for (int k = 0; k < tile.active; ++k) tile.listed.c[tile.slots.c[k]] = sorted[k];
         const int none = tile.active;
         tile.ids.c[none] = tile.ids.c[0];
         tile.sampled.c[none] = 0;
