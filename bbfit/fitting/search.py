@@ -173,8 +173,8 @@ def _at_the_knee(tree: _Tree, config: ResolvedFit, on_progress: Callable[[int, i
 
     limit, most = config.most_layers, config.most_billboards
     trial = tried(min(max(_FIRST, config.least_billboards), most))
-    more = [count for count in (min(_SECOND, most), most) if count > trial.count]
-    for count in dict.fromkeys(more) if trial.layers <= limit else {config.least_billboards} - {trial.count}:
+    further = {min(max(_SECOND, trial.count), most), most} if trial.layers <= limit else {config.least_billboards}
+    for count in sorted(further - {trial.count}):
         few, many = sorted([trial, tried(count)], key=attrgetter("count"))
         doublings = math.log2(many.count / few.count)
         if many.decibels - few.decibels < LEAST_GAIN_DB * doublings or few.layers >= limit:

@@ -81,9 +81,10 @@ def test_both_trees_are_in_the_same_place_of_their_panes(opened: Opened) -> None
 
 
 def test_both_trees_have_the_same_brightness(opened: Opened) -> None:
-    """The mean colors differ by at most 3.5 (CIE76) as the page begins, and by 3 over four sides.
+    """The mean colors differ by at most 2.5 (CIE76) over four sides, and by 3.5 as the page begins.
 
-    Measured: 2.7 and 1.7, on another processor 3.0 and 1.8. Kernels round as the processor does, which changes so small a fit.
+    Measured: 1.7 and 2.7, on another processor 1.8 and 3.0. Kernels round as the processor does, and so small a fit then has other errors
+    in a single view.
     """
     _, tab = opened
     means = []
@@ -91,7 +92,7 @@ def test_both_trees_have_the_same_brightness(opened: Opened) -> None:
         tab.evaluate("degrees => { bbfit.viewer.orbit.azimuth = degrees * Math.PI / 180; bbfit.viewer.orbit.update(); }", degrees)
         means.append([(picture[colored(picture)] / 255).mean(0) for picture in map(tab.picture, ("left", "right"))])
     found = [float(np.linalg.norm(np.subtract(*map(rgb2lab, pair)))) for pair in (means[0], np.mean(means, 0))]
-    assert found[0] <= 3.5 and found[1] <= 3
+    assert found[0] <= 3.5 and found[1] <= 2.5
     sun, dull, bright = tab.evaluate("bbfit.viewer.shares")
     assert sun < 1.5 and 0.1 < dull + bright < 1, "less of the sky's light comes out of the crown than reaches it"
 

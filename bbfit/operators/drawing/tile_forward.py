@@ -137,15 +137,16 @@ MEET = """
     }
 """
 ARRANGE = """
+    // Whether a layer of depth b, behind one of depth f, is to be in front of it. Of layers of equal depth that of the lower plane is.
+    auto misplaced = [](float f, float b, bool lower) { return lower ? f < b - TIE * fabsf(b) : !(b < f - TIE * fabsf(f)); };
     tile.depth = tile.active;
 #if !defined(__CUDA_ARCH__)
     int meetings = 0;
     for (int k = 0; k < tile.active && LANES > 1; ++k) meetings += __builtin_popcount(tile.met.c[k]);
     if (LANES > 1 && meetings < SPARSE * (float)(tile.active * LANES)) {
         // Sort the layers of each pixel by themselves, and all of them for the next tile. What is left is a layer that no pixel meets.
-        auto before = [&](int k, int other, int l) -> bool {  // whether layer k is in front of an earlier one
-            const float f = tile.near.data[other][l], b = tile.near.data[k][l];
-            return tile.ids.c[other] < tile.ids.c[k] ? f < b - TIE * fabsf(b) : !(b < f - TIE * fabsf(f));
+        auto before = [&](int k, int other, int l) {  // whether layer k is in front of an earlier one
+            return misplaced(tile.near.data[other][l], tile.near.data[k][l], tile.ids.c[other] < tile.ids.c[k]);
         };
         int counts[LANES] = {}, next[CAPACITY];
         for (int k = 0; k < tile.active; ++k) {
@@ -159,9 +160,7 @@ ARRANGE = """
             for (; p > 0 && before(k, next[p - 1], LANES - 1); --p) next[p] = next[p - 1];
             next[p] = k;
         }
-        int sorted[CAPACITY];
-        for (int p = 0; p < tile.active; ++p) sorted[p] = tile.ids.c[next[p]];
-        for (int k = 0; k < tile.active; ++k) tile.listed.c[tile.slots.c[k]] = sorted[k];
+        for (int k = 0; k < tile.active; ++k) tile.listed.c[tile.slots.c[k]] = tile.ids.c[next[k]];
         const int none = tile.active;
         tile.ids.c[none] = tile.ids.c[0];
         tile.sampled.c[none] = 0;
@@ -189,9 +188,7 @@ ARRANGE = """
             for (int l = 0; l < LANES; ++l) {
                 const float f = front[l], b = back[l];
                 const int of_f = i[l], of_b = j[l];
-                // Of layers of equal depth that of the lower plane is in front.
-                const bool lower = tile.ids.c[of_f] < tile.ids.c[of_b];
-                const bool swap = lower ? f < b - TIE * fabsf(b) : !(b < f - TIE * fabsf(f));
+                const bool swap = misplaced(f, b, tile.ids.c[of_f] < tile.ids.c[of_b]);
                 front[l] = swap ? b : f;
                 back[l] = swap ? f : b;
                 i[l] = swap ? of_b : of_f;
@@ -211,9 +208,7 @@ ARRANGE = """
         }
     }
     if (moved && LANES > 1) {
-        int sorted[CAPACITY];
-        for (int p = 0; p < tile.active; ++p) sorted[p] = tile.ids.c[tile.order.data[p][LANES - 1]];
-        for (int k = 0; k < tile.active; ++k) tile.listed.c[tile.slots.c[k]] = sorted[k];
+        for (int k = 0; k < tile.active; ++k) tile.listed.c[tile.slots.c[k]] = tile.ids.c[tile.order.data[k][LANES - 1]];
     }
 """
 SAMPLE = """
