@@ -19,7 +19,7 @@ Schedule = Literal["cosine", "growth"]
 Colors = Literal["views", "matched", "joint"]
 Lighting = Literal["baked", "maps"]
 Trunk = Literal["mesh", "crossed"]
-_Binarization = Annotated[float, Range(0, 10)]
+_OfAlpha = Annotated[float, Range(0, 10)]
 _Density = Annotated[float, Range(0, 16, open_low=True)]
 _Rate = Annotated[float, Range(0, 10, open_low=True)]
 _Palette = Annotated[int, Range(0, 256)]
@@ -230,9 +230,12 @@ class FitConfig:
     sharpness_weight: _Sharpness | None = None
     """Weight of the sharpness loss: the squared difference in mean contrast between neighboring pixels, at full resolution.
     Preset: 4 (mask), 0.2 (blend, coverage) or 1 (hash); thesis: 0."""
-    binarization_weight: _Binarization | None = None
+    binarization_weight: _OfAlpha | None = None
     """Weight that pushes alpha to 0 or 1: of alpha * (1 - alpha), summed over texels, over a view's pixels, at full resolution.
     Preset: 0.02 (mask), 0.03 (hash) or 0 (blend, coverage); thesis: 0."""
+    sparsity_weight: _OfAlpha = 0.0
+    """Weight of alpha, summed over texels, over a view's pixels, at full resolution. It clears texels that views hardly need.
+    With a mask of a dense tree 0.005 is better than 0; a tree of needles or thin leaves loses by it."""
     levels: Count | None = None
     """Number of resolutions, from coarse to fine; each doubles the sides of the one before. Steps are divided evenly among them.
     Preset: 4; thesis: 1."""
@@ -262,7 +265,7 @@ class FitConfig:
 
     def coarse(self: _Config) -> _Config:
         """The same for less than full resolution: without the weights that count only there."""
-        return replace(self, sharpness_weight=0.0, binarization_weight=0.0)
+        return replace(self, sharpness_weight=0.0, binarization_weight=0.0, sparsity_weight=0.0)
 
     def resolve(self) -> ResolvedFit:
         """Replace every ``None`` by the value of the preset; a :class:`ResolvedFit` returns itself.
@@ -326,7 +329,7 @@ class ResolvedFit(FitConfig):
     palette: _Palette
     ssim_weight: _Unit
     sharpness_weight: _Sharpness
-    binarization_weight: _Binarization
+    binarization_weight: _OfAlpha
     levels: Count
     steps: Count
     views_per_step: Count

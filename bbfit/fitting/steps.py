@@ -42,7 +42,8 @@ class Stepper:
         self, cloud: BillboardCloud, targets: Targets, config: ResolvedFit, movement: Movement | None = None, *, groups: int = 1
     ) -> None:
         self._cloud, self._movement, self._betas = cloud.without_textures(), movement, (config.beta1, config.beta2)
-        self._binarization = config.binarization_weight / (targets.cameras.width * targets.cameras.height)
+        pixels = targets.cameras.width * targets.cameras.height
+        self._of_alpha = config.binarization_weight / pixels, config.sparsity_weight / pixels
         self._pass: Any = pass_of(config)(self._cloud, targets, config, movement, groups)
         self._begin, self.steps = self._pass.adam.padded(cloud.texels), 0
 
@@ -75,7 +76,7 @@ class Stepper:
             if movement is not None and of_parameters is not None:
                 movement.update(of_parameters, placement_learning_rate)
             self.steps += 1
-            self.state.update(self.steps, rate, self._betas, self._binarization, alpha_rate(alpha))
+            self.state.update(self.steps, rate, self._betas, *self._of_alpha, alpha_rate(alpha))
         return loss
 
     def tensors(self) -> dict[str, Tensor]:

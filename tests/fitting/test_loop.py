@@ -297,12 +297,13 @@ def test_bad_configurations_are_refused_by_name(fields: dict[str, object]) -> No
 
 
 @pytest.mark.parametrize("preset", ["default", "thesis"])
-def test_at_less_than_full_resolution_sharpness_and_crispness_have_no_weight(preset: str) -> None:
+def test_at_less_than_full_resolution_sharpness_and_alpha_have_no_weight(preset: str) -> None:
     """All else stays, and so does the configuration itself."""
-    config = FitConfig(preset=preset, billboards=5, sharpness_weight=7.0, binarization_weight=0.5, ssim_weight=0.03, seed=4)
+    weights = {"sharpness_weight": 7.0, "binarization_weight": 0.5, "sparsity_weight": 0.2}
+    config = FitConfig(preset=preset, billboards=5, ssim_weight=0.03, seed=4, **weights)  # type: ignore[arg-type]
     coarse = config.coarse()
-    assert (coarse.sharpness_weight, coarse.binarization_weight) == (0.0, 0.0)
-    assert dataclasses.replace(coarse, sharpness_weight=7.0, binarization_weight=0.5) == config
+    assert [getattr(coarse, name) for name in weights] == [0.0, 0.0, 0.0]
+    assert dataclasses.replace(coarse, **weights) == config
     assert config.resolve().coarse() == coarse.resolve() and FitConfig(preset=preset).coarse().resolve().sharpness_weight == 0.0
 
 

@@ -16,7 +16,7 @@ from bbfit.fitting.movement import Movement
 from bbfit.fitting.steps import Stepper
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.adam.fused import AdamFused
-from bbfit.operators.adam.reference import AdamReference, binarization_loss
+from bbfit.operators.adam.reference import AdamReference, alpha_loss
 from bbfit.operators.drawing import fused
 from bbfit.operators.drawing.fused import schedule
 from bbfit.operators.drawing.projection import project
@@ -232,7 +232,7 @@ def test_the_backend_selects_the_operators(displaced: BillboardCloud, views: Vie
 
 
 GROUPED = CONFIGS | {
-    "all weights": FitConfig(ssim_weight=0.05, sharpness_weight=20, binarization_weight=0.1),
+    "all weights": FitConfig(ssim_weight=0.05, sharpness_weight=20, binarization_weight=0.1, sparsity_weight=0.05),
     "only sharpness": FitConfig(preset="thesis", sharpness_weight=20),
 }
 
@@ -298,17 +298,20 @@ def test_clouds_side_by_side_step_as_each_alone(
 
 
 @pytest.mark.parametrize("backend", ["reference", "fused"])
-def test_crispness_is_the_same_side_by_side(several: list[BillboardCloud], views: ViewSet, backend: str) -> None:
-    """It is a sum over texels and no mean over views: beside others a cloud becomes as crisp as alone, and crisper than without."""
+@pytest.mark.parametrize(("weight", "measured"), [("binarization_weight", (1.0, 0.0)), ("sparsity_weight", (0.0, 1.0))])
+def test_the_loss_of_alpha_is_the_same_side_by_side(
+    several: list[BillboardCloud], views: ViewSet, backend: str, weight: str, measured: tuple[float, float]
+) -> None:
+    """It is a sum over texels and no mean over views: beside others a cloud becomes as crisp or sparse as alone, and more than without."""
     clouds = []
-    for weight in (1.0, 0.0):
-        config = FitConfig(preset="thesis", binarization_weight=weight, backend=backend).resolve()
+    for value in (1.0, 0.0):
+        config = FitConfig(preset="thesis", backend=backend, **{weight: value}).resolve()  # type: ignore[arg-type]
         for joined, groups in (([several[2], several[0], several[1]], 3), ([several[2]], 1)):
             stepper = Stepper(BillboardCloud.joined(joined), Targets.at(views, 0), config, groups=groups)
             advance(stepper, views, range(10), 60, rate=0.02)
             clouds.append(of_group(stepper.cloud, 0))
-    blends = [float(binarization_loss(cloud.texels)) for cloud in clouds]
-    assert blends[0] == blends[1] < 0.9 * blends[2] and blends[2] == blends[3]
+    losses = [float(alpha_loss(cloud.texels, *measured)) for cloud in clouds]
+    assert losses[0] == losses[1] < 0.9 * losses[2] and losses[2] == losses[3]
 
 
 @pytest.mark.parametrize("backend", ["reference", "fused"])

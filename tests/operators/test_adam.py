@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bbfit.operators.adam.fused import AdamFused, rest_after
-from bbfit.operators.adam.reference import EPSILON
+from bbfit.operators.adam.reference import EPSILON, alpha_loss
 from bbfit.operators.drawing.fused import occupancy
 from bbfit.operators.drawing.tile_forward import BLOCK
 
@@ -133,7 +133,15 @@ def test_same_bytes_with_any_number_of_threads() -> None:
         assert torch.equal(states[0].occupied, other.occupied)
 
 
-def test_crispness_is_a_gradient_of_alphas_that_are_not_zero() -> None:
+def test_the_loss_of_alpha_has_no_derivative_where_there_is_nothing() -> None:
+    texels = torch.tensor([[0.0, 0, 0, 0], [0, 0, 0, 0.25], [0, 0, 0, 1]], requires_grad=True)
+    value = alpha_loss(texels, 2.0, 0.5)
+    value.backward()
+    assert value.item() == pytest.approx(2 * 0.25 * 0.75 + 0.5 * 1.25)
+    assert texels.grad is not None and texels.grad[:, 3].tolist() == pytest.approx([0, 1.5, -1.5]) and not texels.grad[:, :3].any()
+
+
+def test_the_loss_of_alpha_adds_to_the_gradient() -> None:
     texels = start(40)
     plain, crisp = AdamFused.start(AdamFused.padded(texels)), AdamFused.start(AdamFused.padded(texels))
     for step in range(1, 4):
@@ -142,9 +150,9 @@ def test_crispness_is_a_gradient_of_alphas_that_are_not_zero() -> None:
         alpha = plain.texels[:40, 3]
         plain.gradient[:40] = gradient
         woken = (gradient.view(-1, BLOCK, 4) != 0).flatten(1).any(-1) | (step - plain.last <= REST_AFTER)
-        plain.gradient[:40, 3] += torch.where((alpha > 0) & woken.repeat_interleave(BLOCK), 0.3 * (1 - 2 * alpha), 0)
+        plain.gradient[:40, 3] += torch.where((alpha > 0) & woken.repeat_interleave(BLOCK), 0.3 * (1 - 2 * alpha) + 0.2, 0)
         plain.update(step, 0.05, BETAS)
-        crisp.update(step, 0.05, BETAS, binarization=0.3)
+        crisp.update(step, 0.05, BETAS, binarization=0.3, sparsity=0.2)
     torch.testing.assert_close(crisp.texels, plain.texels, atol=1e-6, rtol=0)
     untouched = AdamFused.start(AdamFused.padded(texels))
     for step in range(1, 4):

@@ -76,7 +76,7 @@ def test_adam() -> None:
         gradient = torch.randn(50, 4, generator=generator)
         for state in states:
             state.gradient[:50] += gradient
-            state.update(step, 0.02, (0.8, 0.95), binarization=0.5, alpha_rate=0.4)
+            state.update(step, 0.02, (0.8, 0.95), binarization=0.5, sparsity=0.2, alpha_rate=0.4)
             assert not state.gradient.any()
     torch.testing.assert_close(states[0].texels, states[1].texels[:50], atol=1e-6, rtol=0)
     assert float((states[0].texels - texels).abs().max()) > 0.05

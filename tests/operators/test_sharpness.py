@@ -7,7 +7,6 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from bbfit.images import premultiply
-from bbfit.operators.adam.reference import binarization_loss
 from bbfit.operators.sharpness.fused import add_sharpness_gradient
 from bbfit.operators.sharpness.reference import BLOCK, sharpness_reference
 
@@ -66,11 +65,3 @@ def test_equal_bytes_whatever_the_number_of_threads() -> None:
     finally:
         torch.set_num_threads(before)
     assert torch.equal(results[0][0], results[1][0]) and torch.equal(results[0][1], results[1][1])
-
-
-def test_blending_has_no_derivative_where_there_is_nothing() -> None:
-    texels = torch.tensor([[0.0, 0, 0, 0], [0, 0, 0, 0.25], [0, 0, 0, 1]], requires_grad=True)
-    value = binarization_loss(texels)
-    value.backward()
-    assert value.item() == pytest.approx(0.25 * 0.75)
-    assert texels.grad is not None and texels.grad[:, 3].tolist() == pytest.approx([0, 0.5, -1]) and not texels.grad[:, :3].any()

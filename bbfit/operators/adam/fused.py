@@ -59,14 +59,23 @@ class AdamFused(AdamReference):
         kept = {name: tensor.to(self.texels.device) for name, tensor in tensors.items()}
         return replace(AdamFused.start(kept["texels"]), **kept)
 
-    def update(self, step: int, rate: float, betas: tuple[float, float], binarization: float = 0.0, alpha_rate: float = 1.0) -> None:
-        """As of the reference, up to rounding and :func:`rest_after`; binarization does not wake blocks that rest."""
+    def update(
+        self,
+        step: int,
+        rate: float,
+        betas: tuple[float, float],
+        binarization: float = 0.0,
+        sparsity: float = 0.0,
+        alpha_rate: float = 1.0,
+    ) -> None:
+        """As of the reference, up to rounding and :func:`rest_after`; the loss of alpha does not wake blocks that rest."""
         beta1, beta2 = betas
         run = 1 if self.texels.is_cuda else RUN
         numbers = Step()
         numbers.index, numbers.beta1, numbers.beta2, numbers.epsilon = step, beta1, beta2, EPSILON
         numbers.rate, numbers.correction = rate / (1 - beta1**step), (1 - beta2**step) ** -0.5
-        numbers.rest_after, numbers.binarization, numbers.alpha_rate = rest_after(beta1), binarization, alpha_rate
+        numbers.rest_after, numbers.alpha_rate = rest_after(beta1), alpha_rate
+        numbers.binarization, numbers.sparsity = binarization, sparsity
         blocks = (self.texels, self.gradient, self.first_moment, self.second_moment)
         arrays = [warp_array(tensor.view(-1, 4 * BLOCK), texel_block) for tensor in blocks]
         arrays += [warp_array(self.last, wp.int32), warp_array(self.occupied, wp.uint8)]

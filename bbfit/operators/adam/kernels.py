@@ -9,7 +9,8 @@ Step t of Adam (Kingma and Ba 2015, algorithm 1, with the corrections of section
 moments are left alone. When it has a gradient again, the moments are multiplied by the powers of beta1 and beta2 that were left out:
 memory is read for blocks that some view shows, and not for all.
 
-**Binarization.** The sum of alpha (1 - alpha) over texels with alpha > 0 has the derivative 1 - 2 alpha, which is added to the gradient.
+**Alpha's own loss.** Over texels with alpha > 0, the sum of binarization alpha (1 - alpha) + sparsity alpha has the derivative
+binarization (1 - 2 alpha) + sparsity, which is added to the gradient.
 """
 
 # mypy: ignore-errors
@@ -37,6 +38,7 @@ class Step:
     epsilon: float
     rest_after: int
     binarization: float
+    sparsity: float
     alpha_rate: float
 
 
@@ -62,8 +64,8 @@ class Step:
     }}
     for (int c = 0; c < SIZE; ++c) {{
         const bool alpha = (c & 3) == 3;
-        const float ambiguous = step.binarization * (1.0f - 2.0f * p[c]);
-        slope[c] += (alpha & (p[c] > 0.0f)) ? ambiguous : 0.0f;
+        const float own = step.binarization * (1.0f - 2.0f * p[c]) + step.sparsity;
+        slope[c] += (alpha & (p[c] > 0.0f)) ? own : 0.0f;
         first[c] = m[c] * decay1 + slope[c] * (1.0f - step.beta1);
         second[c] = v[c] * decay2 + slope[c] * slope[c] * (1.0f - step.beta2);
         const float rate = alpha ? step.rate * step.alpha_rate : step.rate;

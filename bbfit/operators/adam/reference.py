@@ -11,10 +11,10 @@ from torch.optim.adam import adam
 EPSILON = 1e-8
 
 
-def binarization_loss(texels: Tensor) -> Tensor:
-    """Sum of alpha (1 - alpha) over texels [P, 4]; the derivative is zero where alpha is 0. A scalar."""
+def alpha_loss(texels: Tensor, binarization: float, sparsity: float) -> Tensor:
+    """Sum of binarization alpha (1 - alpha) + sparsity alpha over texels [P, 4], a scalar; the derivative is zero where alpha is 0."""
     alpha = texels[:, 3]
-    return torch.where(alpha > 0, alpha * (1 - alpha), 0).sum()
+    return torch.where(alpha > 0, binarization * alpha * (1 - alpha) + sparsity * alpha, 0).sum()
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,15 @@ class AdamReference:
         """The state that :meth:`tensors` returned."""
         return replace(self.start(self.texels), **{name: tensor.to(self.texels.device) for name, tensor in tensors.items()})
 
-    def update(self, step: int, rate: float, betas: tuple[float, float], binarization: float = 0.0, alpha_rate: float = 1.0) -> None:
+    def update(
+        self,
+        step: int,
+        rate: float,
+        betas: tuple[float, float],
+        binarization: float = 0.0,
+        sparsity: float = 0.0,
+        alpha_rate: float = 1.0,
+    ) -> None:
         """Take a step of Adam (Kingma and Ba 2015, algorithm 1) and clamp texels to [0, 1].
 
         Parameters
@@ -57,14 +65,14 @@ class AdamReference:
             Number of the step, from 1.
         rate, betas
             Learning rate, and decay of the two moments in a step.
-        binarization
-            Factor of :func:`binarization_loss`, whose gradient is added.
+        binarization, sparsity
+            Weights of :func:`alpha_loss`, whose gradient is added.
         alpha_rate
             Factor of the change of alpha.
         """
         leaf = self.texels.detach().requires_grad_()
-        if binarization:
-            self.gradient.add_(torch.autograd.grad(binarization * binarization_loss(leaf), leaf)[0])
+        if binarization or sparsity:
+            self.gradient.add_(torch.autograd.grad(alpha_loss(leaf, binarization, sparsity), leaf)[0])
         texels, alpha, steps = self.texels.detach(), self.texels[:, 3].clone(), torch.tensor(step - 1.0, device=self.texels.device)
         adam(
             [texels], [self.gradient], [self.first_moment], [self.second_moment], [], [steps],
