@@ -235,7 +235,7 @@ class FitConfig:
     Preset: 0.02 (mask), 0.03 (hash) or 0 (blend, coverage); thesis: 0."""
     sparsity_weight: _OfAlpha = 0.0
     """Weight of alpha, summed over texels, over a view's pixels, at full resolution. It clears texels that views hardly need.
-    With a mask of a dense tree 0.005 is better than 0; a tree of needles or thin leaves loses by it."""
+    Masks of dense trees with alpha to coverage look better with 0.005; trees of needles lose by it."""
     levels: Count | None = None
     """Number of resolutions, from coarse to fine; each doubles the sides of the one before. Steps are divided evenly among them.
     Preset: 4; thesis: 1."""
