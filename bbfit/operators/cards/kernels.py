@@ -14,7 +14,7 @@ from bbfit.operators.cards.sheets import SLACK as SLACK_VALUE
 from bbfit.operators.drawing.compositing import HASH, LEAST_CONTRAST, TIE
 from bbfit.operators.drawing.tile_forward import BLENDED, COVERAGE, HASHED, SMOOTH
 from bbfit.operators.launching import FLAGS
-from bbfit.operators.shading.kernels import decoded, encoded
+from bbfit.operators.shading.kernels import lit
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 
@@ -134,12 +134,8 @@ def shaded(color: wp.vec3, surface: wp.vec4, through: float, towards: wp.vec3, s
     if traced != 0:
         of_sun = wp.where(towards[2] > 0.0, of_sun, 0.0)
         of_sky = (1.0 + normal[2]) / 2.0
-    of_sky *= sun[3]
-    return wp.vec3(
-        wp.min(encoded(decoded(color[0]) * (of_sun * sun[0] + of_sky)), 1.0),
-        wp.min(encoded(decoded(color[1]) * (of_sun * sun[1] + of_sky)), 1.0),
-        wp.min(encoded(decoded(color[2]) * (of_sun * sun[2] + of_sky)), 1.0),
-    )
+    shown = lit(wp.vec4(color[0], color[1], color[2], 0.0), of_sun * sun + wp.vec4(of_sky * sun[3]))
+    return wp.vec3(shown[0], shown[1], shown[2])
 
 
 @wp.func
