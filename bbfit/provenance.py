@@ -22,7 +22,7 @@ VERSIONS: Mapping[str, int] = {
     "convert": 1,
     "views": 7,
     "budget": 10,
-    "fit": 26,
+    "fit": 27,
     "export": 14,
     "evaluate": 16,
     "report": 9,
