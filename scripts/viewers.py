@@ -50,7 +50,7 @@ class Program:
     """A program and how it is set."""
 
     page: str | None
-    """Its page of tests/viewers; None: Blender's Cycles."""
+    """Its page of tests/viewers; None: Blender."""
     query: str = ""
     """Settings of the page."""
     lights: bool = False
@@ -72,7 +72,7 @@ class Program:
         return version_of(self.page) if self.page else metadata.version("bpy")
 
 
-AS_IT_COMES = "Cycles as it comes"
+AS_IT_COMES, EEVEE = "Cycles as it comes", "EEVEE"
 # By the name in the table.
 PROGRAMS = {
     "three.js": Program("three", lights=True),
@@ -87,6 +87,7 @@ PROGRAMS = {
     "Filament, smooth edges": Program("filament", smooth=True),
     "Cycles": Program(None, lights=True),
     AS_IT_COMES: Program(None, lights=True),
+    EEVEE: Program(None, lights=True, mipmaps=True),
 }
 NOT_TRIED = ("Godot 4", "Unity", "Unreal")
 # Cycles chooses at random whether a path passes a layer that is half transparent.
@@ -102,7 +103,7 @@ def shown(name: str, glb: Path, camera: Camera, light: Light | None, alpha: str,
     if program.page:
         with open_program(*browser, program.page, program.query) as viewer:
             return viewer.render(glb, camera, light=light)
-    return render_blender(glb, camera, samples=SAMPLES[alpha], light=light, as_it_comes=name == AS_IT_COMES)
+    return render_blender(glb, camera, samples=SAMPLES[alpha], light=light, as_it_comes=name == AS_IT_COMES, eevee=name == EEVEE)
 
 
 def held_out(views: Path, cloud: bbfit.BillboardCloud, every: int) -> tuple[Camera, Light | None, Pictures]:

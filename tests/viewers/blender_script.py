@@ -1,4 +1,4 @@
-"""Runs in a process of its own, started by blender_viewer.py: imports one model as a user does and renders it with Cycles.
+"""Runs in a process of its own, started by blender_viewer.py: imports one model as a user does and renders it with Cycles or EEVEE.
 
 Standard input holds the job as JSON. Pictures are 16-bit PNGs, 0000.png, 0001.png, ... in the job's folder.
 """
@@ -115,6 +115,9 @@ def set_up(job: dict[str, Any]) -> None:
     render.use_persistent_data = True
     image.file_format, image.color_mode, image.color_depth = "PNG", "RGBA", "16"
     scene.view_settings.view_transform, scene.view_settings.look = "Standard", "None"
+    if job["eevee"]:
+        render.engine, scene.eevee.taa_render_samples, render.filter_size = "BLENDER_EEVEE_NEXT", job["samples"], 0.0
+        bpy.context.preferences.system.anisotropic_filter = "FILTER_0"
 
 
 if __name__ == "__main__":

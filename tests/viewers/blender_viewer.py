@@ -1,4 +1,4 @@
-"""What the real Blender shows of a GLB or an OBJ: its importer's materials, rendered by Cycles, in a process of its own."""
+"""What the real Blender shows of a GLB or an OBJ: its importer's materials, rendered by Cycles or EEVEE, in a process of its own."""
 
 from __future__ import annotations
 
@@ -26,7 +26,14 @@ CLIP = (1e-2, 1e2)
 
 
 def render_blender(
-    model: Path, camera: Camera, *, samples: int = 1, light: Light | None = None, panorama: Path | None = None, as_it_comes: bool = False
+    model: Path,
+    camera: Camera,
+    *,
+    samples: int = 1,
+    light: Light | None = None,
+    panorama: Path | None = None,
+    as_it_comes: bool = False,
+    eevee: bool = False,
 ) -> NDArray[np.float64]:
     """Display-referred RGB over white in [0, 1] of a batch of V cameras, in V lights or in one panorama if given, [V, H, W, 3];
     view transform Standard.
@@ -35,7 +42,8 @@ def render_blender(
     correction of bumps; ``as_it_comes`` leaves both on. A panorama is an equirectangular picture in linear light.
 
     Every sample lies at the center of its pixel, so more than one only matters where Cycles chooses at random. Blender blends layers in
-    linear light; the picture over the white is composited as bbfit does its own, display-referred.
+    linear light; the picture over the white is composited as bbfit does its own, display-referred. ``eevee`` needs OpenGL, and always uses
+    mip levels.
 
     The test fails where Blender is not installed; what Blender says is the message of an ``AssertionError`` where it fails itself.
     """
@@ -54,6 +62,7 @@ def render_blender(
             "lights": None if light is None else [_lamp(light[[index]]) for index in range(len(light))],
             "panorama": None if panorama is None else str(panorama),
             "as_it_comes": as_it_comes,
+            "eevee": eevee,
         }
         # Its own folder for what Blender leaves behind, and no settings or add-ons of the user's.
         environment = os.environ | dict.fromkeys(("TMPDIR", "TEMP", "TMP", "BLENDER_USER_RESOURCES"), folder)
