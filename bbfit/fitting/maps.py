@@ -69,7 +69,7 @@ def fit_maps(
     # Half of the exposures are in the baked light, however many suns there are.
     own = list(range(len(views.train))) * max(1, round(len(others) / len(views.train)))
     exposures, cloud = ViewSet.joined([views.train.take(own), sunny.take(others)]), cloud.to(config.device)
-    config = replace(config.coarse(), ssim_weight=0.0)
+    config = replace(config, ssim_weight=0.0, sharpness_weight=0.0)
     assert exposures.light is not None
     texels, surface = baked_maps(cloud, views.lit_train, config.backend)
     shade, pull_back = _shading(config.backend)

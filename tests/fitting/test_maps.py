@@ -94,13 +94,20 @@ def views(known: BillboardCloud) -> ViewDataset:
     return ViewDataset(None, train_views, test_views, lit_train=lit_train, lit_test=lit_test)
 
 
-CONFIG = FitConfig(alpha="blend", light="maps", map_steps=200, sharpness_weight=0.0, ssim_weight=0.0).resolve()
+CONFIG = FitConfig(alpha="blend", light="maps", map_steps=300).resolve()
+
+
+def test_masks_with_maps_have_more_layers() -> None:
+    """By default, and only masks; what is given counts."""
+    assert FitConfig().resolve().most_layers < FitConfig(light="maps").resolve().most_layers
+    assert FitConfig(alpha="blend").resolve().most_layers == FitConfig(alpha="blend", light="maps").resolve().most_layers
+    assert FitConfig(light="maps", most_layers=1.5).resolve().most_layers == 1.5
 
 
 def test_known_maps_are_found(known: BillboardCloud, views: ViewDataset) -> None:
-    """From plain normals, with the right alpha. Measured under held-out suns: 51.1 dB and R2 .996; at the start 29.5 dB and .82.
+    """From plain normals, with the right alpha. Measured under held-out suns: 48.0 dB and R2 .991; at the start 29.5 dB and .82.
 
-    Normals are off by 1.7 degrees, occlusion by .03.
+    Normals are off by 3.3 degrees, occlusion by .03.
     """
     start = known.baked(known.texels)
     fitted = fit_maps(start, views, CONFIG)
@@ -121,9 +128,9 @@ def test_known_maps_are_found(known: BillboardCloud, views: ViewDataset) -> None
 
 
 def test_known_translucency_is_found(known: BillboardCloud, views: ViewDataset) -> None:
-    """One disk transmits half of the light, the other none. Measured under held-out suns: 44.2 dB; opaque disks have 32.1 dB.
+    """One disk transmits half of the light, the other none. Measured under held-out suns: 41.0 dB; opaque disks have 32.5 dB.
 
-    Translucency is off by .06 of the half and by .0003 of nothing.
+    Translucency is off by .07 of the half and by .002 of nothing.
     """
     assert known.surface is not None and views.lit_train is not None and views.lit_test is not None
     half = torch.cat([torch.full((len(known.texels) // 2, 1), share) for share in (0.5, 0.0)])
@@ -187,7 +194,7 @@ def test_transparent_texels_get_the_maps_of_their_neighbors(known: BillboardClou
 
 
 def test_whole_fit_has_maps_and_scores_better_than_baked(known: BillboardCloud, views: ViewDataset) -> None:
-    """A fit of everything, its palettes included, under held-out suns. Measured: 37.1 dB and R2 .977; baked 24.1 dB."""
+    """A fit of everything, its palettes included, under held-out suns. Measured: 36.8 dB and R2 .974; baked 24.1 dB."""
     scores = {}
     for light in ("baked", "maps"):
         config = FitConfig(alpha="blend", billboards=2, placement="even", steps=120, map_steps=80, light=light, texel_density=1.0)

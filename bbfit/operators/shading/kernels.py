@@ -156,9 +156,9 @@ def differentiate(
             n = tangent_normal(maps)
             sun = suns[texture[i]]
             c = n[0] * sun[0] + n[1] * sun[1] + n[2] * sun[2]
-            lit = wp.max(c, 0.0)
+            facing = wp.max(c, 0.0)
             through = wp.max(-c, 0.0)
-            of_sun = (1.0 - maps[3]) * lit + maps[3] * through
+            of_sun = (1.0 - maps[3]) * facing + maps[3] * through
             base = texels[i]
             linear = decoded(base)
             light = strengths * of_sun + wp.vec4(strengths[3] * maps[2])
@@ -182,4 +182,4 @@ def differentiate(
                 along = across * n[0] + up * n[1]
                 across = n[3] * (across - along * n[0])
                 up = n[3] * (up - along * n[1])
-            of_surface[i] += wp.vec4(2.0 * across, 2.0 * up, from_sky, from_sun * (through - lit))
+            of_surface[i] += wp.vec4(2.0 * across, 2.0 * up, from_sky, from_sun * (through - facing))
