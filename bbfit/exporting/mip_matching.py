@@ -95,6 +95,17 @@ def reduced(cards: Cards, halvings: int) -> Cards:
     return replace(cards, atlas=atlas)
 
 
+def densities(cards: Cards, chain: Sequence[NDArray[np.uint8]], levels: Sequence[int]) -> list[float]:
+    """How dense cards are from afar with the mip levels of a chain, relative to level 0, where half of their pixels use each of ``levels``.
+
+    Nothing is returned for cards of which nothing shows.
+    """
+    visible, _ = _visible_texels(cards, _around(cards))
+    alphas = [level[..., 3:] for level in chain]
+    near = _coverage(visible, alphas[:1], 0, cards.alpha)
+    return [_coverage(visible, alphas, level, cards.alpha) / near for level in levels] if near else []
+
+
 def _chain(cards: Cards) -> list[NDArray[np.uint8]]:
     return mip_chain(cards.atlas, cards.alpha.cutoff if cards.alpha.kind == "mask" else None)
 

@@ -14,6 +14,7 @@ from bbfit.checks import fail
 from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.description import Description, described_glb
+from bbfit.exporting.gaps import with_filled_gaps
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.hulls import overdraw, with_hulls
 from bbfit.exporting.mip_matching import reduced, with_mips
@@ -83,6 +84,7 @@ class ShippedModel:
             return with_mips(cards, partial(self.on_progress, "mip levels"))
         if not self.config.mipmapped(cards.alpha):
             return cards
+        cards = with_filled_gaps(cards, partial(self.on_progress, "mip levels"))
         surface = None if cards.atlas.surface is None else tuple(surface_chain(cards.atlas.surface, None))
         return replace(cards, chain=tuple(plain_chain(cards.atlas.image)), surface_chain=surface)
 

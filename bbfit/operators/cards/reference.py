@@ -73,7 +73,7 @@ def composited(values: Tensor, alphas: Tensor, met: Hits, prepared: PreparedCard
     if alpha.kind == "hash":
         alphas = (alphas >= thresholds(met.x, met.y, prepared.sheets.first[met.sheet])).to(alphas)
     elif alpha.antialiased:
-        across, down = ((filtered(prepared.levels, uv, met.detail)[:, 3] / 255 - alphas).abs() for uv in _beside(met))
+        across, down = ((filtered(prepared.levels, uv, met.detail)[:, 3] / 255 - alphas).abs() for uv in beside(met))
         alphas = coverage(alphas, across + down, alpha)
     else:
         alphas = opacity(alphas, alpha)
@@ -134,7 +134,7 @@ def _lit(colors: Tensor, maps: Tensor, axes: Tensor, light: Light, *, traced: bo
     return encode(decode(colors) * (of_sun * sun + float(light.ambients) * open_sky)).clamp_max(1)
 
 
-def _beside(met: Hits) -> list[Tensor]:
+def beside(met: Hits) -> list[Tensor]:
     """Texture coordinates, [M, 2], at the other pixel of each hit's row and at that of its column in its square of 2 x 2 pixels."""
     rows = met.to_uv[met.view, met.sheet]
     places = [torch.stack([x, y, torch.ones_like(x)], -1).double() for x, y in ((met.x ^ 1, met.y), (met.x, met.y ^ 1))]

@@ -1,0 +1,207 @@
+"""Alpha of the texels between an atlas's pictures, so that the mip levels that programs compute show the tree from afar.
+
+Programs compute the mip levels of a PNG as plain means. A texel of a coarse level mixes the picture of a card with the transparent texels
+around it, so small cards fade: an acer of 384 masked billboards keeps 0.69 of its density at an eighth of the views' size, and 0.09 at a
+sixteenth. From near, no card shows the texels around its outline. So their alpha is free, and coarse levels show it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from bbfit.exporting.mip_matching import densities
+from bbfit.exporting.mips import plain_chain
+from bbfit.fitting.palette import nearest_means
+from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cards import Cards
+from bbfit.geometry.orbit import Orbit
+from bbfit.geometry.polygons import sides
+from bbfit.images import PALETTE, distinct, shrunk
+from bbfit.operators.cards.reference import Hits, beside, hits
+from bbfit.operators.cards.sampling import Footprint, joined, sampled
+from bbfit.operators.cards.sampling import footprint as footprint_of
+from bbfit.operators.cards.sheets import sheets_of
+from bbfit.operators.drawing.compositing import composite_fragments, coverage, opacity
+from bbfit.rendering.cards import CardRenderer
+from bbfit.threads import one_thread
+
+# Cameras, the number of groups of which a step compares one, and the largest side of the near pictures in pixels.
+_ORBIT, _GROUPS, _NEAR = Orbit(12, (0.0, 25.0, 50.0)), 3, 256
+# How often the size at which a texel is a pixel is halved for pictures from afar, and the smallest of them in pixels.
+_HALVINGS, _LEAST_SIDE = (3, 4, 5), 8
+# Level of detail whose texels have an alpha of their own. Coarser texels are their means; finer ones are not needed from so far.
+_LEVEL = 2
+# Steps of Adam, its rate, its decay rates, and the alpha to start from.
+_STEPS, _RATE, _DECAY, _START = 40, 0.12, (0.9, 0.95), 0.2
+# Weights beside the squared error: of the error's change when the camera turns by a degree, and of the error in density.
+_TURN, _DENSITY = 20.0, 1.0
+# Share of the density from near; gaps stay empty if all sizes have it.
+_ENOUGH = 0.9
+# Width in texels of the rim around a card that filtering may show at level 0.
+_RIM = 2
+# Fewest colors that a palette must have left.
+_LEAST_COLORS = 4
+
+
+@dataclass(frozen=True)
+class _View:
+    """What some cameras see from afar, whatever alpha is: M hits in V pictures. The second half of the cameras is the first, turned."""
+
+    hits: Hits
+    footprint: Footprint
+    beside: tuple[Footprint, ...]
+    """Those of the pixels beside each hit, whose difference of alpha is the width of a smooth edge."""
+    colors: Tensor
+    """[M, 3]."""
+    target: Tensor
+    """The near pictures, averaged to this size, premultiplied RGBA [V, h, w, 4]."""
+
+
+def with_filled_gaps(cards: Cards, on_step: Callable[[int, int], None] = lambda done, total: None) -> Cards:
+    """Cards that look from afar, with the mip levels that programs compute, as they do from near.
+
+    Only texels change that no card shows at level 0: their alpha, and their colors where a palette needs fewer of them. Cards that keep
+    nine tenths of their density from afar stay as they are, as do those of an atlas whose palette has no room.
+
+    Adam (Kingma and Ba 2015) finds the alpha of blocks of 4 x 4 such texels. It compares the cards with their own near pictures, averaged
+    to an eighth, a sixteenth and a thirty-second of the size at which a texel is a pixel, without the sizes before the last one at which
+    nothing fades. The loss is the squared difference over backgrounds, that of its change when the camera turns by a degree, because cards
+    that come and go flicker, and that of the mean alpha. Masks are drawn with smooth edges. ``on_step`` is called after each step with its
+    number and their total.
+    """
+    with one_thread():
+        return _filled(cards, on_step)
+
+
+def _filled(cards: Cards, on_step: Callable[[int, int], None]) -> Cards:
+    image, chain = cards.atlas.image, plain_chain(cards.atlas.image)
+    fades = [density < _ENOUGH for density in densities(cards, chain, _HALVINGS)]
+    if not any(fades):
+        return cards
+    free, shapes = _free(cards), [level.shape[:2] for level in chain[_LEVEL:]]
+    # A hash shows on average what a blend shows.
+    mode = AlphaMode() if cards.alpha.kind == "hash" else replace(cards.alpha, antialiased=cards.alpha.kind == "mask")
+    alpha, share = torch.from_numpy(image[..., 3] / np.float32(255)), torch.from_numpy(free.astype(np.float32))
+    fixed, share = _means(alpha * (1 - share), shapes[0]), _means(share, shapes[0])
+
+    def levels(values: Tensor) -> Tensor:
+        """Alpha of all texels of all levels from :data:`_LEVEL` on, [T, 1], for that of the blocks."""
+        parts = [fixed + share * values]
+        for shape in shapes[1:]:
+            parts.append(_means(parts[-1], shape))
+        return torch.cat([part.flatten() for part in parts])[:, None]
+
+    sizes = _views(cards, mode, chain, _HALVINGS[max(0, fades.index(True) - 1) :])
+    values = torch.full(shapes[0], _START, requires_grad=True)
+    adam = torch.optim.Adam([values], betas=_DECAY)
+    for step in range(_STEPS):
+        adam.param_groups[0]["lr"] = _RATE * 0.5 * (1 + math.cos(math.pi * step / _STEPS))
+        texels, loss = levels(values), torch.zeros(())
+        for views in sizes:
+            view = views[step % len(views)]
+            error = _drawn(texels, view, mode) - view.target
+            here, turned = error.chunk(2)
+            loss = loss + _visible(error) + _TURN * _visible(here - turned) + _DENSITY * error[..., 3].mean((1, 2)).square().mean()
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        with torch.no_grad():
+            values.clamp_(0, 1)
+        on_step(step + 1, _STEPS)
+    blocks = (values.detach() * 255).round().to(torch.uint8).numpy().repeat(1 << _LEVEL, 0).repeat(1 << _LEVEL, 1)
+    filled = np.concatenate([image[..., :3], np.where(free, blocks, image[..., 3])[..., None]], -1)
+    return replace(cards, atlas=replace(cards.atlas, image=_within_palette(filled, image)))
+
+
+def _within_palette(filled: NDArray[np.uint8], image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A filled picture, [H, W, 4], with few colors in its gaps if ``image``, without them, fits into the palette of a PNG."""
+    changed = filled[..., 3] != image[..., 3]
+    if len(distinct(image)) > PALETTE or len(distinct(filled)) <= PALETTE:
+        return filled
+    left = PALETTE - len(distinct(image[~changed]))
+    if left < _LEAST_COLORS:
+        return image
+    gaps = torch.from_numpy(filled[changed])
+    filled[changed] = np.rint(nearest_means(gaps, torch.ones(len(gaps), dtype=torch.bool), left).numpy()).astype(np.uint8)
+    return filled
+
+
+def _free(cards: Cards) -> NDArray[np.bool_]:
+    """The texels that no card shows at level 0, bool [H, W]."""
+    height, width = cards.atlas.image.shape[:2]
+    free = np.ones((height, width), np.bool_)
+    for card in cards.cards:
+        polygon = card.uvs * (width, height) - 0.5
+        left, top = np.floor(polygon.min(0) - _RIM).astype(np.int64).clip(0).tolist()
+        right, bottom = np.ceil(polygon.max(0) + _RIM).astype(np.int64).tolist()
+        around = free[top : bottom + 1, left : right + 1]
+        normals, offsets = sides(polygon)
+        beyond = (np.indices(around.shape).T[..., ::-1] + (left, top)) @ normals.T - offsets
+        around &= (beyond > _RIM).any(-1).T
+    return free
+
+
+def _views(cards: Cards, mode: AlphaMode, chain: list[NDArray[np.uint8]], halvings: Sequence[int]) -> list[list[_View]]:
+    """What is compared at each size, for each group of cameras."""
+    points = np.concatenate([card.corners for card in cards.cards])
+    center, sheets = torch.from_numpy((points.min(0) + points.max(0)) / 2), sheets_of(cards)
+    cameras = _ORBIT.frame(points, target=center, width=_LEAST_SIDE << 3, height=_LEAST_SIDE << 3)
+    detail = float(hits(cards, sheets, cameras).detail.median())
+    side = max(_LEAST_SIDE, round(cameras.width * 2.0 ** (detail - halvings[0])))
+    near = side * 2 ** max(0, min(halvings[0], math.floor(math.log2(_NEAR / side))))
+    plain = replace(cards, atlas=replace(cards.atlas, surface=None), chain=None, surface_chain=None, light=None, alpha=mode)
+    both = [cameras, cameras.turned(1.0, center)]
+    pictures = [CardRenderer(plain).draw(each.resized(near, near)).double() for each in both]
+    levels = joined([np.ascontiguousarray(level[..., :3]) for level in chain[_LEVEL:]], (*chain[_LEVEL].shape[:2], 3))
+    colors = levels.texels.float() / 255
+    sizes = []
+    for width in (side >> (halving - halvings[0]) for halving in halvings):
+        views = []
+        for some in (list(range(first, len(cameras), _GROUPS)) for first in range(_GROUPS)):
+            camera = _joined([each.resized(width, width)[some] for each in both])
+            met = hits(cards, sheets, camera)
+            footprint, *neighbors = (footprint_of(levels, uv, met.detail - _LEVEL) for uv in (met.uv, *beside(met)))
+            target = torch.stack([shrunk(picture[index], width, width) for picture in pictures for index in some]).float()
+            views.append(_View(met, footprint, tuple(neighbors), sampled(colors, footprint), target))
+        if width >= _LEAST_SIDE:
+            sizes.append(views)
+    return sizes
+
+
+def _joined(cameras: list[Camera]) -> Camera:
+    poses, intrinsics = (torch.cat([getattr(each, name) for each in cameras]) for name in ("world_to_camera", "intrinsics"))
+    return replace(cameras[0], world_to_camera=poses, intrinsics=intrinsics)
+
+
+def _drawn(alphas: Tensor, view: _View, mode: AlphaMode) -> Tensor:
+    """The pictures, [V, h, w, 4], for the alpha of all texels, [T, 1]."""
+    opaque = sampled(alphas, view.footprint)[:, 0]
+    if mode.antialiased:
+        with torch.no_grad():
+            across, down = ((sampled(alphas, place)[:, 0] - opaque).abs() for place in view.beside)
+        opaque = coverage(opaque, across + down, mode)
+    else:
+        opaque = opacity(opaque, mode)
+    met, (count, height, width, _) = view.hits, view.target.shape
+    shown, pixels = opaque > 0, (met.view * height + met.y) * width + met.x
+    fragments = view.colors[shown], opaque[shown], met.depth[shown], pixels[shown]
+    return composite_fragments(*fragments, count * height * width, nested=mode.nested).unflatten(0, (count, height, width))
+
+
+def _visible(error: Tensor) -> Tensor:
+    """The mean squared difference of pictures over uniform gray backgrounds, given that of their premultiplied values, [..., 4]."""
+    return (error[..., :3] - error[..., 3:] / 2).square().mean() + error[..., 3].square().mean() / 12
+
+
+def _means(values: Tensor, size: tuple[int, ...]) -> Tensor:
+    """Means over the areas of the texels of a coarser level, [H, W] -> ``size``."""
+    return interpolate(values[None, None], size, mode="area")[0, 0]
