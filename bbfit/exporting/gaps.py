@@ -37,7 +37,7 @@ from bbfit.threads import one_thread
 # Cameras, the number of groups of which a step compares one, and the largest side of the near pictures in pixels.
 _ORBIT, _GROUPS, _NEAR = Orbit(12, (0.0, 25.0, 50.0)), 3, 256
 # How often the size at which a texel is a pixel is halved for pictures from afar, and the smallest of them in pixels.
-_HALVINGS, _LEAST_SIDE = (3, 4, 5), 8
+_HALVINGS, _LEAST_SIDE = (3, 4), 8
 # Level of detail whose texels have an alpha of their own. Coarser texels are their means; finer ones are not needed from so far.
 _LEVEL = 2
 # Steps of Adam, its rate, its decay rates, and the alpha to start from.
@@ -45,9 +45,9 @@ _STEPS, _RATE, _DECAY, _START = 40, 0.12, (0.9, 0.95), 0.2
 # Weights beside the squared error: of the error's change when the camera turns by a degree, and of the error in density.
 _TURN, _DENSITY = 20.0, 1.0
 # Share of the density from near; gaps stay empty if all sizes have it.
-_ENOUGH = 0.9
-# Width in texels of the rim around a card that filtering may show at level 0.
-_RIM = 2
+_ENOUGH = 0.85
+# Width in texels of the rim around a card that stays empty, because filtering shows it at fine levels.
+_RIM = 3
 # Fewest colors that a palette must have left.
 _LEAST_COLORS = 4
 
@@ -70,21 +70,23 @@ def with_filled_gaps(cards: Cards, on_step: Callable[[int, int], None] = lambda 
     """Cards that look from afar, with the mip levels that programs compute, as they do from near.
 
     Only texels change that no card shows at level 0: their alpha, and their colors where a palette needs fewer of them. Cards that keep
-    nine tenths of their density from afar stay as they are, as do those of an atlas whose palette has no room.
+    0.85 of their density from afar stay as they are, as do those that would look worse at some size, and those of an atlas whose
+    palette has no room.
 
     Adam (Kingma and Ba 2015) finds the alpha of blocks of 4 x 4 such texels. It compares the cards with their own near pictures, averaged
-    to an eighth, a sixteenth and a thirty-second of the size at which a texel is a pixel, without the sizes before the last one at which
-    nothing fades. The loss is the squared difference over backgrounds, that of its change when the camera turns by a degree, because cards
-    that come and go flicker, and that of the mean alpha. Masks are drawn with smooth edges. ``on_step`` is called after each step with its
-    number and their total.
+    to an eighth and a sixteenth of the size at which a texel is a pixel. The loss is the squared difference over backgrounds, that of its
+    change when the camera turns by a degree, because cards that come and go flicker, and that of the mean alpha. Masks are drawn with
+    smooth edges. ``on_step`` is called after each step with its number and their total.
     """
-    with one_thread():
+    with one_thread(), torch.enable_grad():
         return _filled(cards, on_step)
 
 
 def _filled(cards: Cards, on_step: Callable[[int, int], None]) -> Cards:
     image, chain = cards.atlas.image, plain_chain(cards.atlas.image)
-    fades = [density < _ENOUGH for density in densities(cards, chain, _HALVINGS)]
+    cameras, side = _around(cards)
+    halvings = [count for count in _HALVINGS if side >> count >= _LEAST_SIDE]
+    fades = [density < _ENOUGH for density in densities(cards, chain, halvings)] if halvings else []
     if not any(fades):
         return cards
     free, shapes = _free(cards), [level.shape[:2] for level in chain[_LEVEL:]]
@@ -100,7 +102,7 @@ def _filled(cards: Cards, on_step: Callable[[int, int], None]) -> Cards:
             parts.append(_means(parts[-1], shape))
         return torch.cat([part.flatten() for part in parts])[:, None]
 
-    sizes = _views(cards, mode, chain, _HALVINGS[max(0, fades.index(True) - 1) :])
+    sizes = _views(cards, mode, chain, cameras, [side >> count for count in halvings])
     values = torch.full(shapes[0], _START, requires_grad=True)
     adam = torch.optim.Adam([values], betas=_DECAY)
     for step in range(_STEPS):
@@ -112,11 +114,21 @@ def _filled(cards: Cards, on_step: Callable[[int, int], None]) -> Cards:
             here, turned = error.chunk(2)
             loss = loss + _visible(error) + _TURN * _visible(here - turned) + _DENSITY * error[..., 3].mean((1, 2)).square().mean()
         adam.zero_grad()
-        loss.backward()
-        adam.step()
+        if loss.requires_grad:  # otherwise nothing shows
+            loss.backward()
+            adam.step()
         with torch.no_grad():
             values.clamp_(0, 1)
         on_step(step + 1, _STEPS)
+
+    @torch.no_grad()
+    def errors(values: Tensor) -> list[float]:
+        """The squared error at each size, over all cameras."""
+        texels = levels(values)
+        return [sum(float(_visible(_drawn(texels, view, mode) - view.target)) for view in views) for views in sizes]
+
+    if any(after > before for before, after in zip(errors(torch.zeros_like(values)), errors(values), strict=True)):
+        return cards
     blocks = (values.detach() * 255).round().to(torch.uint8).numpy().repeat(1 << _LEVEL, 0).repeat(1 << _LEVEL, 1)
     filled = np.concatenate([image[..., :3], np.where(free, blocks, image[..., 3])[..., None]], -1)
     return replace(cards, atlas=replace(cards.atlas, image=_within_palette(filled, image)))
@@ -150,21 +162,29 @@ def _free(cards: Cards) -> NDArray[np.bool_]:
     return free
 
 
-def _views(cards: Cards, mode: AlphaMode, chain: list[NDArray[np.uint8]], halvings: Sequence[int]) -> list[list[_View]]:
-    """What is compared at each size, for each group of cameras."""
+def _around(cards: Cards) -> tuple[Camera, int]:
+    """Cameras around the cards, and the side of their pictures at which a pixel is as large as a texel; 0 if they see nothing."""
     points = np.concatenate([card.corners for card in cards.cards])
-    center, sheets = torch.from_numpy((points.min(0) + points.max(0)) / 2), sheets_of(cards)
-    cameras = _ORBIT.frame(points, target=center, width=_LEAST_SIDE << 3, height=_LEAST_SIDE << 3)
-    detail = float(hits(cards, sheets, cameras).detail.median())
-    side = max(_LEAST_SIDE, round(cameras.width * 2.0 ** (detail - halvings[0])))
-    near = side * 2 ** max(0, min(halvings[0], math.floor(math.log2(_NEAR / side))))
+    cameras = _ORBIT.frame(points, target=_center(points), width=64, height=64)
+    detail = hits(cards, sheets_of(cards), cameras).detail
+    return cameras, round(cameras.width * 2.0 ** float(detail.median())) if len(detail) else 0
+
+
+def _center(points: NDArray[np.float64]) -> Tensor:
+    return torch.from_numpy((points.min(0) + points.max(0)) / 2)
+
+
+def _views(cards: Cards, mode: AlphaMode, chain: list[NDArray[np.uint8]], cameras: Camera, widths: Sequence[int]) -> list[list[_View]]:
+    """What is compared in pictures of each width, for each group of cameras."""
+    near = widths[0] * 2 ** max(0, math.floor(math.log2(_NEAR / widths[0])))
     plain = replace(cards, atlas=replace(cards.atlas, surface=None), chain=None, surface_chain=None, light=None, alpha=mode)
-    both = [cameras, cameras.turned(1.0, center)]
+    center = _center(np.concatenate([card.corners for card in cards.cards]))
+    both, sheets = [cameras, cameras.turned(1.0, center)], sheets_of(cards)
     pictures = [CardRenderer(plain).draw(each.resized(near, near)).double() for each in both]
     levels = joined([np.ascontiguousarray(level[..., :3]) for level in chain[_LEVEL:]], (*chain[_LEVEL].shape[:2], 3))
     colors = levels.texels.float() / 255
     sizes = []
-    for width in (side >> (halving - halvings[0]) for halving in halvings):
+    for width in widths:
         views = []
         for some in (list(range(first, len(cameras), _GROUPS)) for first in range(_GROUPS)):
             camera = _joined([each.resized(width, width)[some] for each in both])
@@ -172,8 +192,7 @@ def _views(cards: Cards, mode: AlphaMode, chain: list[NDArray[np.uint8]], halvin
             footprint, *neighbors = (footprint_of(levels, uv, met.detail - _LEVEL) for uv in (met.uv, *beside(met)))
             target = torch.stack([shrunk(picture[index], width, width) for picture in pictures for index in some]).float()
             views.append(_View(met, footprint, tuple(neighbors), sampled(colors, footprint), target))
-        if width >= _LEAST_SIDE:
-            sizes.append(views)
+        sizes.append(views)
     return sizes
 
 
