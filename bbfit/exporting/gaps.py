@@ -70,8 +70,8 @@ def with_filled_gaps(cards: Cards, on_step: Callable[[int, int], None] = lambda 
     """Cards that look from afar, with the mip levels that programs compute, as they do from near.
 
     Only texels change that no card shows at level 0: their alpha, and their colors where a palette needs fewer of them. Cards that keep
-    0.85 of their density from afar stay as they are, as do those that would look worse at some size, and those of an atlas whose
-    palette has no room.
+    0.85 of their density from afar stay as they are, as do those that would not look better, and those of an atlas whose palette has no
+    room.
 
     Adam (Kingma and Ba 2015) finds the alpha of blocks of 4 x 4 such texels. It compares the cards with their own near pictures, averaged
     to an eighth and a sixteenth of the size at which a texel is a pixel. The loss is the squared difference over backgrounds, that of its
@@ -121,13 +121,12 @@ def _filled(cards: Cards, on_step: Callable[[int, int], None]) -> Cards:
             values.clamp_(0, 1)
         on_step(step + 1, _STEPS)
 
-    @torch.no_grad()
-    def errors(values: Tensor) -> list[float]:
-        """The squared error at each size, over all cameras."""
-        texels = levels(values)
-        return [sum(float(_visible(_drawn(texels, view, mode) - view.target)) for view in views) for views in sizes]
-
-    if any(after > before for before, after in zip(errors(torch.zeros_like(values)), errors(values), strict=True)):
+    with torch.no_grad():
+        before, after = (
+            sum(float(_visible(_drawn(texels, view, mode) - view.target)) for views in sizes for view in views)
+            for texels in (levels(torch.zeros_like(values)), levels(values))
+        )
+    if after >= before:
         return cards
     blocks = (values.detach() * 255).round().to(torch.uint8).numpy().repeat(1 << _LEVEL, 0).repeat(1 << _LEVEL, 1)
     filled = np.concatenate([image[..., :3], np.where(free, blocks, image[..., 3])[..., None]], -1)
