@@ -107,7 +107,8 @@ class ShippedModel:
     def described(self, description: Description) -> ShippedModel:
         """The same model with names and facts in its GLB."""
         model = replace(self, description=description)
-        vars(model).update(cards=self.cards, _plain_glb=self._plain_glb)  # so that they are not computed twice
+        computed = vars(self)
+        vars(model).update((name, computed[name]) for name in ("cards", "_plain_glb") if name in computed)  # so that nothing is twice
         return model
 
     @property
