@@ -42,7 +42,7 @@ from bbfit.exporting.config import Profile  # noqa: E402
 from bbfit.exporting.model import ShippedModel, shipped_model  # noqa: E402
 from bbfit.geometry.camera import Camera  # noqa: E402
 from bbfit.geometry.light import SUNNY, Light  # noqa: E402
-from bbfit.images import over_color  # noqa: E402
+from bbfit.images import over_color, shrunk  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -106,24 +106,30 @@ def shown(name: str, glb: Path, camera: Camera, light: Light | None, alpha: str,
     return render_blender(glb, camera, samples=SAMPLES[alpha], light=light, as_it_comes=name == AS_IT_COMES, eevee=name == EEVEE)
 
 
-def held_out(views: Path, cloud: bbfit.BillboardCloud, every: int) -> tuple[Camera, Light | None, Pictures]:
-    """Held-out cameras, the light of each for a cloud with maps, and the views over white."""
+def held_out(views: Path, cloud: bbfit.BillboardCloud, every: int, reduction: int) -> tuple[Camera, Light | None, Pictures]:
+    """Held-out cameras, the light of each for a cloud with maps, and the views over white, ``reduction`` times as small as they are."""
     dataset = bbfit.ViewDataset.load(views)
     if cloud.surface is None:
         chosen = list(range(0, len(dataset.test), every))
-        return dataset.test.cameras[chosen], None, over_color(dataset.test.targets(chosen, torch.float64)).numpy()
+        return reduced(dataset.test.cameras[chosen], None, dataset.test.targets(chosen, torch.float64), reduction)
     lit, baked = dataset.lit_test, dataset.test.light
     if lit is None or baked is None:
         sys.exit("a model with maps needs views with suns")
     sunny, chosen = lit.under(*SUNNY), lit.other_suns(baked[[0]])[::every]
     assert sunny.light is not None
-    return sunny.cameras[chosen], sunny.light[chosen], over_color(sunny.targets(chosen, torch.float64)).numpy()
+    return reduced(sunny.cameras[chosen], sunny.light[chosen], sunny.targets(chosen, torch.float64), reduction)
 
 
-def measure(views: Path, run: Path, every: int, programs: list[str], browser: Chromium) -> None:
+def reduced(cameras: Camera, light: Light | None, targets: torch.Tensor, reduction: int) -> tuple[Camera, Light | None, Pictures]:
+    """The result of :func:`held_out` for premultiplied RGBA views, [V, H, W, 4]."""
+    width, height = cameras.width // reduction, cameras.height // reduction
+    return cameras.resized(width, height), light, over_color(torch.stack([shrunk(target, width, height) for target in targets])).numpy()
+
+
+def measure(views: Path, run: Path, every: int, reduction: int, programs: list[str], browser: Chromium) -> None:
     """Print the rows of one fitted model."""
     cloud = bbfit.BillboardCloud.load(run / "cloud.safetensors")
-    camera, light, target = held_out(views, cloud, every)
+    camera, light, target = held_out(views, cloud, every, reduction)
 
     def score(pictures: Pictures) -> float:
         return float(np.mean([psnr(*pair) for pair in zip(target, pictures, strict=True)]))
@@ -192,6 +198,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folders", nargs="+", type=Path, help="views folder and run folder, in turn")
     parser.add_argument("--every", type=int, default=1, help="take every n-th picture")
+    parser.add_argument("--reduction", type=int, default=1, help="see the tree from so many times as far, in smaller pictures")
     parser.add_argument("--programs", nargs="+", choices=PROGRAMS, default=list(PROGRAMS))
     parser.add_argument("--panorama", action="store_true", help="light by a panorama, and compare three.js with Cycles")
     options = parser.parse_args()
@@ -207,7 +214,7 @@ def main() -> None:
         print("| model | program | version | pictures | vertices | from bbfit's drawing | bbfit's score | program's score |")
         print("| --- | --- | --- | --- | --- | --- | --- | --- |")
         for views, run in pairs:
-            measure(views, run, options.every, options.programs, browser)
+            measure(views, run, options.every, options.reduction, options.programs, browser)
         for name in NOT_TRIED:
             print(f"| | {name} | not tried | | | | | |")
 

@@ -66,14 +66,7 @@ def change(first: Tensor, second: Tensor) -> float:
 
 def _drawn(draw: Draw, pairs: TurnedViews, index: int, width: int, height: int) -> Tensor:
     """The renders of a view and of the turned one, float64 [2, h, w, 4]."""
-    both = [part.cameras.resized(width, height)[index] for part in (pairs.views, pairs.turned)]
-    camera = Camera(
-        torch.stack([one.world_to_camera for one in both]),
-        torch.stack([one.intrinsics for one in both]),
-        width,
-        height,
-        both[0].orthographic,
-    )
+    camera = Camera.joined([part.cameras.resized(width, height)[index] for part in (pairs.views, pairs.turned)])
     with torch.no_grad():
         images = draw(camera).detach().cpu().double()
     name = pairs.views.names[index]

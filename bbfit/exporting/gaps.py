@@ -1,7 +1,7 @@
 """Alpha of the texels between an atlas's pictures, so that the mip levels that programs compute show the tree from afar.
 
 Programs compute the mip levels of a PNG as plain means. A texel of a coarse level mixes the picture of a card with the transparent texels
-around it, so small cards fade: an acer of 384 masked billboards keeps 0.69 of its density at an eighth of the views' size, and 0.09 at a
+around it, so small cards fade: an acer of 384 masked billboards keeps 0.70 of its density at an eighth of the views' size, and 0.08 at a
 sixteenth. From near, no card shows the texels around its outline. So their alpha is free, and coarse levels show it.
 """
 
@@ -26,11 +26,11 @@ from bbfit.geometry.cards import Cards
 from bbfit.geometry.orbit import Orbit
 from bbfit.geometry.polygons import sides
 from bbfit.images import PALETTE, distinct, shrunk
-from bbfit.operators.cards.reference import Hits, beside, hits
+from bbfit.operators.cards.reference import Hits, beside, hits, pictures
 from bbfit.operators.cards.sampling import Footprint, joined, sampled
 from bbfit.operators.cards.sampling import footprint as footprint_of
 from bbfit.operators.cards.sheets import sheets_of
-from bbfit.operators.drawing.compositing import composite_fragments, coverage, opacity
+from bbfit.operators.drawing.compositing import coverage, opacity
 from bbfit.rendering.cards import CardRenderer
 from bbfit.threads import one_thread
 
@@ -67,7 +67,9 @@ class _View:
 
 
 def with_filled_gaps(cards: Cards, on_step: Callable[[int, int], None] = lambda done, total: None) -> Cards:
-    """Cards that look from afar, with the mip levels that programs compute, as they do from near.
+    """Cards with the mip levels that programs compute, which look with them from afar as they do from near.
+
+    ``cards`` have the levels of :func:`~bbfit.exporting.mips.plain_chain`, and so do the returned ones.
 
     Only texels change that no card shows at level 0: their alpha, and their colors where a palette needs fewer of them. Cards that keep
     0.85 of their density from afar stay as they are, as do those that would not look better, and those of an atlas whose palette has no
@@ -83,7 +85,8 @@ def with_filled_gaps(cards: Cards, on_step: Callable[[int, int], None] = lambda 
 
 
 def _filled(cards: Cards, on_step: Callable[[int, int], None]) -> Cards:
-    image, chain = cards.atlas.image, plain_chain(cards.atlas.image)
+    assert cards.chain is not None
+    image, chain = cards.atlas.image, cards.chain
     cameras, side = _around(cards)
     halvings = [count for count in _HALVINGS if side >> count >= _LEAST_SIDE]
     fades = [density < _ENOUGH for density in densities(cards, chain, halvings)] if halvings else []
@@ -130,7 +133,8 @@ def _filled(cards: Cards, on_step: Callable[[int, int], None]) -> Cards:
         return cards
     blocks = (values.detach() * 255).round().to(torch.uint8).numpy().repeat(1 << _LEVEL, 0).repeat(1 << _LEVEL, 1)
     filled = np.concatenate([image[..., :3], np.where(free, blocks, image[..., 3])[..., None]], -1)
-    return replace(cards, atlas=replace(cards.atlas, image=_within_palette(filled, image)))
+    filled = _within_palette(filled, image)
+    return replace(cards, atlas=replace(cards.atlas, image=filled), chain=tuple(plain_chain(filled)))
 
 
 def _within_palette(filled: NDArray[np.uint8], image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -173,31 +177,25 @@ def _center(points: NDArray[np.float64]) -> Tensor:
     return torch.from_numpy((points.min(0) + points.max(0)) / 2)
 
 
-def _views(cards: Cards, mode: AlphaMode, chain: list[NDArray[np.uint8]], cameras: Camera, widths: Sequence[int]) -> list[list[_View]]:
+def _views(cards: Cards, mode: AlphaMode, chain: Sequence[NDArray[np.uint8]], cameras: Camera, widths: Sequence[int]) -> list[list[_View]]:
     """What is compared in pictures of each width, for each group of cameras."""
     near = widths[0] * 2 ** max(0, math.floor(math.log2(_NEAR / widths[0])))
     plain = replace(cards, atlas=replace(cards.atlas, surface=None), chain=None, surface_chain=None, light=None, alpha=mode)
     center = _center(np.concatenate([card.corners for card in cards.cards]))
     both, sheets = [cameras, cameras.turned(1.0, center)], sheets_of(cards)
-    pictures = [CardRenderer(plain).draw(each.resized(near, near)).double() for each in both]
+    close = [CardRenderer(plain).draw(each.resized(near, near)).double() for each in both]
     levels = joined([np.ascontiguousarray(level[..., :3]) for level in chain[_LEVEL:]], (*chain[_LEVEL].shape[:2], 3))
     colors = levels.texels.float() / 255
     sizes = []
     for width in widths:
         views = []
         for some in (list(range(first, len(cameras), _GROUPS)) for first in range(_GROUPS)):
-            camera = _joined([each.resized(width, width)[some] for each in both])
-            met = hits(cards, sheets, camera)
+            met = hits(cards, sheets, Camera.joined([each.resized(width, width)[some] for each in both]))
             footprint, *neighbors = (footprint_of(levels, uv, met.detail - _LEVEL) for uv in (met.uv, *beside(met)))
-            target = torch.stack([shrunk(picture[index], width, width) for picture in pictures for index in some]).float()
+            target = torch.stack([shrunk(picture[index], width, width) for picture in close for index in some]).float()
             views.append(_View(met, footprint, tuple(neighbors), sampled(colors, footprint), target))
         sizes.append(views)
     return sizes
-
-
-def _joined(cameras: list[Camera]) -> Camera:
-    poses, intrinsics = (torch.cat([getattr(each, name) for each in cameras]) for name in ("world_to_camera", "intrinsics"))
-    return replace(cameras[0], world_to_camera=poses, intrinsics=intrinsics)
 
 
 def _drawn(alphas: Tensor, view: _View, mode: AlphaMode) -> Tensor:
@@ -209,10 +207,8 @@ def _drawn(alphas: Tensor, view: _View, mode: AlphaMode) -> Tensor:
         opaque = coverage(opaque, across + down, mode)
     else:
         opaque = opacity(opaque, mode)
-    met, (count, height, width, _) = view.hits, view.target.shape
-    shown, pixels = opaque > 0, (met.view * height + met.y) * width + met.x
-    fragments = view.colors[shown], opaque[shown], met.depth[shown], pixels[shown]
-    return composite_fragments(*fragments, count * height * width, nested=mode.nested).unflatten(0, (count, height, width))
+    count, height, width, _ = view.target.shape
+    return pictures(view.colors, opaque, view.hits, (count, height, width), nested=mode.nested)
 
 
 def _visible(error: Tensor) -> Tensor:

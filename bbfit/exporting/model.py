@@ -84,9 +84,9 @@ class ShippedModel:
             return with_mips(cards, partial(self.on_progress, "mip levels"))
         if not self.config.mipmapped(cards.alpha):
             return cards
-        cards = with_filled_gaps(cards, partial(self.on_progress, "mip levels"))
         surface = None if cards.atlas.surface is None else tuple(surface_chain(cards.atlas.surface, None))
-        return replace(cards, chain=tuple(plain_chain(cards.atlas.image)), surface_chain=surface)
+        cards = replace(cards, chain=tuple(plain_chain(cards.atlas.image)), surface_chain=surface)
+        return with_filled_gaps(cards, partial(self.on_progress, "mip levels"))
 
     @cached_property
     def _renderer(self) -> CardRenderer:
@@ -108,7 +108,9 @@ class ShippedModel:
         """The same model with names and facts in its GLB."""
         model = replace(self, description=description)
         computed = vars(self)
-        vars(model).update((name, computed[name]) for name in ("cards", "_plain_glb") if name in computed)  # so that nothing is twice
+        vars(model).update(
+            (name, computed[name]) for name in ("cards", "_plain_glb") if name in computed
+        )  # so that nothing is computed twice
         return model
 
     @property

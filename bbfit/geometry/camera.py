@@ -54,6 +54,13 @@ class Camera:
         check_count("width", self.width)
         check_count("height", self.height)
 
+    @staticmethod
+    def joined(cameras: Sequence[Camera]) -> Camera:
+        """The views of one or more cameras or batches, which must have one size and one projection, in one batch."""
+        batches, first = [camera.batch() for camera in cameras], cameras[0]
+        transforms, intrinsics = (torch.cat([getattr(batch, name) for batch in batches]) for name in ("world_to_camera", "intrinsics"))
+        return Camera(transforms, intrinsics, first.width, first.height, first.orthographic)
+
     @property
     def batched(self) -> bool:
         """Whether there is a leading view dimension."""

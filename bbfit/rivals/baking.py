@@ -124,7 +124,7 @@ def bake(
     cameras, clips = _facing(slabs, size, config.texels_per_meter)
     if config.two_sided:
         back, behind = _facing(_turned(slabs), size, config.texels_per_meter)
-        cameras = Camera(torch.cat([cameras.world_to_camera, back.world_to_camera]), cameras.intrinsics.repeat(2, 1, 1), size, size, True)
+        cameras = Camera.joined([cameras, back])
         clips += behind
     paths = render_pictures(tree, cameras, folder, config.views, clips=clips, on_progress=on_progress)
     count = len(slabs)

@@ -66,13 +66,11 @@ class ViewSet:
     @staticmethod
     def joined(sets: Sequence[ViewSet]) -> ViewSet:
         """The views of several sets, whose pictures have one size and different paths, in one; the light is known if that of all is."""
-        first = sets[0].cameras
-        transforms, intrinsics = (torch.cat([getattr(each.cameras, name) for each in sets]) for name in ("world_to_camera", "intrinsics"))
         readers = {path: each.read for each in sets for path in each.paths}
         lights = [each.light for each in sets if each.light is not None]
         return ViewSet(
             tuple(path for each in sets for path in each.paths),
-            Camera(transforms, intrinsics, first.width, first.height, first.orthographic),
+            Camera.joined([each.cameras for each in sets]),
             lambda path: readers[path](path),
             Light.joined(lights) if len(lights) == len(sets) else None,
         )

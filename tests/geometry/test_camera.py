@@ -220,3 +220,14 @@ def test_resizing_is_making_a_camera_of_that_size() -> None:
     ours = Camera(pose, orthographic_intrinsics(6, 36, 24), 36, 24, True).resized(12, 8)
     assert (ours.intrinsics - orthographic_intrinsics(6, 12, 8)).abs().max() < EXACT
     assert Camera(pose, pinhole_intrinsics(40, 8, 8), 8, 8).to(torch.float32).resized(3, 5).intrinsics.dtype == torch.float32
+
+
+def test_cameras_and_batches_are_joined() -> None:
+    """In their order, with the first one's size."""
+    targets = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+    world_to_camera = look_at(targets + torch.tensor([0.0, 0, 5], dtype=torch.float64), targets)
+    cameras = Camera(world_to_camera, pinhole_intrinsics(40.0, 32, 24).repeat(3, 1, 1), 32, 24)
+    joined = Camera.joined([cameras[[1, 2]], cameras[0]])
+    assert (joined.width, joined.height, joined.orthographic) == (32, 24, False)
+    assert torch.equal(joined.world_to_camera, world_to_camera[[1, 2, 0]])
+    assert joined.intrinsics.shape == (3, 3, 3)

@@ -77,10 +77,14 @@ def composited(values: Tensor, alphas: Tensor, met: Hits, prepared: PreparedCard
         alphas = coverage(alphas, across + down, alpha)
     else:
         alphas = opacity(alphas, alpha)
-    shape = len(camera), camera.height, camera.width
-    visible, pixels, count = alphas > 0, (met.view * camera.height + met.y) * camera.width + met.x, math.prod(shape)
-    image = composite_fragments(values[visible], alphas[visible], met.depth[visible], pixels[visible], count, nested=alpha.nested)
-    return image.unflatten(0, shape)
+    return pictures(values, alphas, met, (len(camera), camera.height, camera.width), nested=alpha.nested)
+
+
+def pictures(values: Tensor, opacities: Tensor, met: Hits, shape: tuple[int, int, int], *, nested: bool) -> Tensor:
+    """The pictures of places with values [M, C] and opacities [M] in V cameras of H x W pixels, [V, H, W, C + 1]; ``shape`` is V, H, W."""
+    visible, pixels = opacities > 0, (met.view * shape[1] + met.y) * shape[2] + met.x
+    fragments = values[visible], opacities[visible], met.depth[visible], pixels[visible]
+    return composite_fragments(*fragments, math.prod(shape), nested=nested).unflatten(0, shape)
 
 
 def hits(cards: Cards, sheets: Sheets, camera: Camera) -> Hits:
