@@ -43,6 +43,7 @@ from bbfit.exporting.model import ShippedModel, shipped_model  # noqa: E402
 from bbfit.geometry.camera import Camera  # noqa: E402
 from bbfit.geometry.light import SUNNY, Light  # noqa: E402
 from bbfit.images import over_color, shrunk  # noqa: E402
+from bbfit.rendering.cards import draw_cards  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Program:
     lights: bool = False
     """Whether it lights models with maps as bbfit does."""
     smooth: bool = False
-    """Whether it smooths the edges of masks."""
+    """Whether a pixel has four samples, and masks have smooth edges."""
     mipmaps: bool | None = None
     """As :class:`bbfit.ExportConfig` has it."""
 
@@ -76,6 +77,7 @@ AS_IT_COMES, EEVEE = "Cycles as it comes", "EEVEE"
 # By the name in the table.
 PROGRAMS = {
     "three.js": Program("three", lights=True),
+    "three.js, smooth edges": Program("three", "smooth=centered", smooth=True),
     "Babylon.js": Program("babylon", "anisotropy=1", lights=True),
     "Babylon.js, anisotropic": Program("babylon", lights=True),
     "PlayCanvas": Program("playcanvas"),
@@ -149,9 +151,10 @@ def measure(views: Path, run: Path, every: int, reduction: int, programs: list[s
         if same not in models:
             models[same] = shipped_model(cloud, config)
         model = models[same]
-        drawer = model.antialiased() if program.smooth and cloud.alpha.kind == "mask" else model
-        if (drawn := (same, drawer is model)) not in drawings:
-            drawings[drawn] = over_color(drawer.draw(camera, light).double().clamp(0, 1)).numpy()
+        if (drawn := (same, program.smooth)) not in drawings:
+            alpha = replace(model.cloud.alpha, antialiased=program.smooth and cloud.alpha.kind == "mask")
+            drawing = draw_cards(replace(model.cards, alpha=alpha), camera, light, multisampled=program.smooth)
+            drawings[drawn] = over_color(drawing.double().clamp(0, 1)).numpy()
         own = drawings[drawn]
         with tempfile.TemporaryDirectory() as folder:
             (glb,) = model.save(Path(folder) / "model.glb")

@@ -26,11 +26,10 @@ from bbfit.geometry.cards import Cards
 from bbfit.geometry.orbit import Orbit
 from bbfit.geometry.polygons import sides
 from bbfit.images import PALETTE, distinct, shrunk
-from bbfit.operators.cards.reference import Hits, beside, hits, pictures
+from bbfit.operators.cards.reference import Hits, beside, hits, opacities, pictures
 from bbfit.operators.cards.sampling import Footprint, joined, sampled
 from bbfit.operators.cards.sampling import footprint as footprint_of
 from bbfit.operators.cards.sheets import sheets_of
-from bbfit.operators.drawing.compositing import coverage, opacity
 from bbfit.rendering.cards import CardRenderer
 from bbfit.threads import one_thread
 
@@ -42,8 +41,9 @@ _HALVINGS, _LEAST_SIDE = (3, 4), 8
 _LEVEL = 2
 # Steps of Adam, its rate, its decay rates, and the alpha to start from.
 _STEPS, _RATE, _DECAY, _START = 40, 0.12, (0.9, 0.95), 0.2
-# Weights beside the squared error: of the error's change when the camera turns by a degree, and of the error in density.
-_TURN, _DENSITY = 20.0, 1.0
+# Weights beside the squared error: of the error's change when the camera turns by a degree, for masks, whose cutoff makes them flicker
+# more, and for the rest, and of the error in density.
+_TURN_OF_MASK, _TURN, _DENSITY = 20.0, 5.0, 1.0
 # Share of the density from near; gaps stay empty if all sizes have it.
 _ENOUGH = 0.85
 # Width in texels of the rim around a card that stays empty, because filtering shows it at fine levels.
@@ -59,7 +59,7 @@ class _View:
     hits: Hits
     footprint: Footprint
     beside: tuple[Footprint, ...]
-    """Those of the pixels beside each hit, whose difference of alpha is the width of a smooth edge."""
+    """Those of the pixels beside each hit, whose difference of alpha is the width of a mask's smooth edge; otherwise none."""
     colors: Tensor
     """[M, 3]."""
     target: Tensor
@@ -106,7 +106,7 @@ def _filled(cards: Cards, on_step: Callable[[int, int], None]) -> Cards:
         return torch.cat([part.flatten() for part in parts])[:, None]
 
     sizes = _views(cards, mode, chain, cameras, [side >> count for count in halvings])
-    values = torch.full(shapes[0], _START, requires_grad=True)
+    values, turn = torch.full(shapes[0], _START, requires_grad=True), _TURN_OF_MASK if mode.kind == "mask" else _TURN
     adam = torch.optim.Adam([values], betas=_DECAY)
     for step in range(_STEPS):
         adam.param_groups[0]["lr"] = _RATE * 0.5 * (1 + math.cos(math.pi * step / _STEPS))
@@ -115,7 +115,7 @@ def _filled(cards: Cards, on_step: Callable[[int, int], None]) -> Cards:
             view = views[step % len(views)]
             error = _drawn(texels, view, mode) - view.target
             here, turned = error.chunk(2)
-            loss = loss + _visible(error) + _TURN * _visible(here - turned) + _DENSITY * error[..., 3].mean((1, 2)).square().mean()
+            loss = loss + _visible(error) + turn * _visible(here - turned) + _DENSITY * error[..., 3].mean((1, 2)).square().mean()
         adam.zero_grad()
         if loss.requires_grad:  # otherwise nothing shows
             loss.backward()
@@ -190,8 +190,10 @@ def _views(cards: Cards, mode: AlphaMode, chain: Sequence[NDArray[np.uint8]], ca
     for width in widths:
         views = []
         for some in (list(range(first, len(cameras), _GROUPS)) for first in range(_GROUPS)):
-            met = hits(cards, sheets, Camera.joined([each.resized(width, width)[some] for each in both]))
-            footprint, *neighbors = (footprint_of(levels, uv, met.detail - _LEVEL) for uv in (met.uv, *beside(met)))
+            far = Camera.joined([each.resized(width, width)[some] for each in both])
+            met = hits(cards, sheets, far, multisampled=mode.multisampled)
+            places = [met.uv, *(beside(met) if mode.antialiased else [])]
+            footprint, *neighbors = (footprint_of(levels, uv, met.detail - _LEVEL) for uv in places)
             target = torch.stack([shrunk(picture[index], width, width) for picture in close for index in some]).float()
             views.append(_View(met, footprint, tuple(neighbors), sampled(colors, footprint), target))
         sizes.append(views)
@@ -200,15 +202,9 @@ def _views(cards: Cards, mode: AlphaMode, chain: Sequence[NDArray[np.uint8]], ca
 
 def _drawn(alphas: Tensor, view: _View, mode: AlphaMode) -> Tensor:
     """The pictures, [V, h, w, 4], for the alpha of all texels, [T, 1]."""
-    opaque = sampled(alphas, view.footprint)[:, 0]
-    if mode.antialiased:
-        with torch.no_grad():
-            across, down = ((sampled(alphas, place)[:, 0] - opaque).abs() for place in view.beside)
-        opaque = coverage(opaque, across + down, mode)
-    else:
-        opaque = opacity(opaque, mode)
+    here, *near = (sampled(alphas, place)[:, 0] for place in (view.footprint, *view.beside))
     count, height, width, _ = view.target.shape
-    return pictures(view.colors, opaque, view.hits, (count, height, width), nested=mode.nested)
+    return pictures(view.colors, opacities(here, near, view.hits, mode), view.hits, (count, height, width), nested=mode.nested)
 
 
 def _visible(error: Tensor) -> Tensor:

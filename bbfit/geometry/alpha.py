@@ -51,3 +51,8 @@ class AlphaMode:
     def nested(self) -> bool:
         """Whether all layers cover the same samples of a pixel first (:func:`bbfit.operators.drawing.compositing.layer_weights`)."""
         return self.antialiased or self.kind == "coverage"
+
+    @property
+    def multisampled(self) -> bool:
+        """Whether a pixel has several samples, so that edges of cards are smooth. Hard masks and hash are drawn with one."""
+        return self.kind == "blend" or self.nested

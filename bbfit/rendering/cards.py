@@ -20,13 +20,15 @@ from bbfit.operators.cards.sheets import prepared_cards, seen_axes
 from bbfit.operators.config import Backend
 
 
-def draw_cards(cards: Cards, camera: Camera, light: Light | None = None, *, backend: Backend = "auto") -> Tensor:
-    """Draw cards on the CPU as a graphics card does, with one sample per pixel: premultiplied RGBA in [0, 1], float32 [H, W, 4] for one
-    camera and [V, H, W, 4] for a batch.
+def draw_cards(
+    cards: Cards, camera: Camera, light: Light | None = None, *, backend: Backend = "auto", multisampled: bool | None = None
+) -> Tensor:
+    """Draw cards on the CPU as a graphics card does: premultiplied RGBA in [0, 1], float32 [H, W, 4] for one camera and [V, H, W, 4] for a
+    batch.
 
-    Without mip levels, and for cards that show their whole rectangles, the picture equals that of :func:`~bbfit.rendering.dispatch.render`
-    up to the rounding of textures to 8 bits. Filtering and blending use display-referred values, as fits do. Programs that filter in linear
-    light show slightly lighter colors and the same alpha.
+    Without mip levels, with one sample a pixel, and for cards that show their whole rectangles, the picture equals that of
+    :func:`~bbfit.rendering.dispatch.render` up to the rounding of textures to 8 bits. Filtering and blending use display-referred values,
+    as fits do. Programs that filter in linear light show slightly lighter colors and the same alpha.
 
     With mip levels the level of detail is log2 of the larger norm of the texel coordinates' derivatives along the screen's two axes (OpenGL
     4.6, section 8.14.1), exact for every pixel and clamped to the existing levels. The bilinear samples of the two nearest levels are
@@ -36,7 +38,8 @@ def draw_cards(cards: Cards, camera: Camera, light: Light | None = None, *, back
     Cards with maps are shaded after filtering, per pixel, as graphics cards do (:mod:`bbfit.operators.shading` shades texels instead), or
     as a path tracer does (``cards.traced``). From behind, a card that shows both sides has opposite normals.
 
-    A pixel shows a card if its center lies in the polygon. Layers are ordered by depth in every pixel, as in
+    A sample of a pixel shows a card if it lies in the polygon. Texture coordinates are those of the pixel's center, even if it lies
+    outside, as graphics cards compute them (OpenGL 4.6, section 14.3.1). Layers are ordered by their depth at the center, as in
     :func:`~bbfit.operators.drawing.compositing.composite`. A plane shows nothing edge-on and behind the camera.
 
     Parameters
@@ -50,21 +53,24 @@ def draw_cards(cards: Cards, camera: Camera, light: Light | None = None, *, back
         For cards with maps: the light of each view, or one for all. Default: ``cards.light``.
     backend
         ``reference``: torch; ``fused`` and ``auto``: a Warp kernel, which draws the same but for rounding.
+    multisampled
+        Whether a pixel is the mean of four samples, as in programs with multisampling, and not that of its center alone. By default not
+        for hard masks and hash (:attr:`~bbfit.geometry.alpha.AlphaMode.multisampled`).
 
     Raises
     ------
     InputError
         If a level is not uint8 or not half as large as the level before, rounded down.
     """
-    return CardRenderer(cards, backend=backend).draw(camera, light)
+    return CardRenderer(cards, backend=backend, multisampled=multisampled).draw(camera, light)
 
 
 class CardRenderer:
     """Draws cards as :func:`draw_cards` does, for many cameras: what does not depend on the camera is computed once."""
 
-    def __init__(self, cards: Cards, *, backend: Backend = "auto") -> None:
+    def __init__(self, cards: Cards, *, backend: Backend = "auto", multisampled: bool | None = None) -> None:
         check_choice("backend", backend, ("auto", "reference", "fused"))
-        self._prepared, self._fused = prepared_cards(cards), backend != "reference"
+        self._prepared, self._fused = prepared_cards(cards, multisampled=multisampled), backend != "reference"
 
     def draw(self, camera: Camera, light: Light | None = None) -> Tensor:
         """See :func:`draw_cards`."""

@@ -143,7 +143,7 @@ def test_the_picture_is_that_of_the_rectangles(kind: str, orbit: Camera, tmp_pat
     cards = of_kind(cards_of(angle(), leaf(0.6), apart()), kind)
     made = with_pieces(cards, 4, 8, cards.outlined_alpha)
     assert len(made.cards) > len(cards.cards)
-    assert torch.equal(draw_cards(made, orbit), draw_cards(cards, orbit))
+    assert torch.equal(*(draw_cards(each, orbit, multisampled=False) for each in (made, cards)))
     pictures = []
     for name, drawn in (("rectangles", cards), ("pieces", made)):
         (tmp_path / f"{name}.glb").write_bytes(glb_bytes(drawn, ExportConfig()))

@@ -46,14 +46,17 @@ def around(pixels: int) -> Camera:
 
 
 def compare(alone: Cards, shared: Cards, pixels: int, safe: int) -> int:
-    """Require equal pictures wherever only safe mip levels show; return the number of pixels that show a card there."""
+    """Require equal pictures wherever only safe mip levels show; return the number of pixels that show a card there.
+
+    A pixel has one sample. With more, edges show what lies beyond a card, however far that is at a slant.
+    """
     cameras, compared = around(pixels), 0
     for index in range(len(cameras)):
         met = hits(alone, sheets_of(alone), cameras[index])
         coarse, seen = torch.zeros(pixels, pixels, dtype=torch.bool), torch.zeros(pixels, pixels, dtype=torch.bool)
         far = met.detail > safe if alone.chain is not None else torch.zeros_like(met.detail, dtype=torch.bool)
         coarse[met.y[far], met.x[far]], seen[met.y, met.x] = True, True
-        one, other = (CardRenderer(cards).draw(cameras[index])[~coarse] for cards in (alone, shared))
+        one, other = (CardRenderer(cards, multisampled=False).draw(cameras[index])[~coarse] for cards in (alone, shared))
         np.testing.assert_allclose(other, one, atol=1e-5)
         compared += int((seen & ~coarse).sum())
     return compared

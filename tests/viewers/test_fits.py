@@ -189,7 +189,9 @@ def test_web_programs_cover_samples(
     with open_program(*chromium, program, "smooth=coverage") as viewer:
         small, large = viewer.render(files["coverage"], views.test.cameras), viewer.render(files["coverage"], cameras)
     assert metrics.psnr(drawn, large) >= 26
-    monkeypatch.setattr("bbfit.operators.cards.reference.opacity", lambda alpha, mode: (alpha * 5).floor().clamp(max=4) / 4)
+    monkeypatch.setattr(
+        "bbfit.operators.cards.reference.covered_samples", lambda alpha, _: (5 * alpha[:, None] >= torch.arange(1, 5)).float()
+    )
     monkeypatch.setattr("bbfit.exporting.model.CardRenderer", partial(CardRenderer, backend="reference"))
     fifths = replace(model)
     assert metrics.psnr(twice(fifths, views)[1], large) >= LEAST

@@ -9,25 +9,30 @@ a masked model 5 to 10 dB, so that tests of all the rest switch them off (:func:
 from __future__ import annotations
 
 import struct
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from browser_viewer import BrowserViewer
+from browser_viewer import BrowserViewer, open_program
 from glb_edit import edit_glb, with_min_filter
 from glb_viewer import read_glb
 from noise_scene import expected, noise_cloud
 from numpy.typing import NDArray
+from playwright.sync_api import Browser
 
 from bbfit.evaluation.metrics import psnr
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import export
+from bbfit.exporting.gltf import glb_bytes
+from bbfit.exporting.model import export, shipped_model
 from bbfit.geometry.camera import Camera, orthographic_intrinsics
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import encode_png, over_color
 from bbfit.operators.drawing.reference import render_reference
+from bbfit.rendering.cards import draw_cards
 
 BILINEAR = 9729
 ALPHA_TEST = 0.5
@@ -83,6 +88,26 @@ def test_three_shows_a_parallel_projection(three: BrowserViewer, around: Camera,
     (glb,) = export(cloud, tmp_path / "model.glb", ExportConfig(alpha="blend"))
     target = over_color(render_reference(cloud, camera)).numpy()
     assert psnr(target, three.render(with_min_filter(glb, BILINEAR), camera)) >= 45  # measured 55.3; half a pixel of shift leaves 35
+
+
+def test_three_smooths_the_edges_of_cards(chromium: tuple[Browser, ThreadPoolExecutor], around: Camera, tmp_path: Path) -> None:
+    """With multisampling it shows bbfit's four samples of a pixel. Measured 41.4 dB; a drawing with one sample is at 32.0 dB."""
+    noise = noise_cloud(1, texels=32)
+    cloud = replace(noise, texels=torch.cat([noise.texels[:, :3], torch.ones_like(noise.texels[:, 3:])], 1))
+    config = ExportConfig(alpha="blend").comparable()
+    cards = replace(shipped_model(cloud, config).cards, chain=None)
+    inner = [replace(card, corners=halved(card.corners), uvs=halved(card.uvs)) for card in cards.cards]  # with edges of opaque texels
+    cards = cards.with_cards(inner)
+    (tmp_path / "model.glb").write_bytes(glb_bytes(cards, config.resolve()))
+    with open_program(*chromium, "three", "smooth=own") as smooth:
+        images = smooth.render(with_min_filter(tmp_path / "model.glb", BILINEAR), around)
+    four, one = (psnr(over_color(draw_cards(cards, around, multisampled=each)).numpy(), images) for each in (True, False))
+    assert four >= 40 > one + 6
+
+
+def halved(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points moved half of the way to their mean."""
+    return (points + points.mean(0)) / 2
 
 
 def test_three_shows_one_node_alone(three: BrowserViewer, around: Camera, tmp_path: Path) -> None:

@@ -20,15 +20,15 @@ from bbfit.operators.launching import LEAST_PIXELS, in_parallel, pieces_of, repe
 
 def draw_cards_fused(prepared: PreparedCards, camera: Camera, light: Light | None = None) -> Tensor:
     """:func:`~bbfit.operators.cards.reference.draw_cards_reference`, but for rounding. Equal inputs give equal bytes."""
-    return _drawn(prepared, camera, light)[0]
+    return _drawn(prepared, camera, light, multisampled=prepared.multisampled)[0]
 
 
 def count_fragments_fused(prepared: PreparedCards, camera: Camera) -> int:
-    """The number of :func:`~bbfit.operators.cards.reference.hits`, in V cameras."""
-    return int(_drawn(prepared, camera)[1].sum())
+    """The number of :func:`~bbfit.operators.cards.reference.hits` with one sample a pixel, in V cameras."""
+    return int(_drawn(prepared, camera, multisampled=False)[1].sum())
 
 
-def _drawn(prepared: PreparedCards, camera: Camera, light: Light | None = None) -> tuple[Tensor, Tensor]:
+def _drawn(prepared: PreparedCards, camera: Camera, light: Light | None = None, *, multisampled: bool) -> tuple[Tensor, Tensor]:
     """The pictures, float32 [V, H, W, 4], and the numbers of fragments in their rows, int32 [V, H]."""
     sheets, levels, views, height, width = prepared.sheets, prepared.levels, len(camera), camera.height, camera.width
     image, counts = torch.zeros(views, height, width, 4), torch.zeros(views, height, dtype=torch.int32)
@@ -50,6 +50,7 @@ def _drawn(prepared: PreparedCards, camera: Camera, light: Light | None = None) 
         height,
         width,
         encoded_alpha(prepared.cards.alpha),
+        int(multisampled),
         int(prepared.cards.traced),
         *(warp_array(tensor.contiguous(), kind) for tensor, kind in tensors),
     ]

@@ -1,8 +1,8 @@
 """Warp kernel that draws cards: rows of pixels, whose fragments are kept in lists until all pieces have been visited.
 
-A row visits the pieces that it crosses. Every pixel of a piece whose center lies in the polygon adds a fragment to the pixel's linked list,
+A row visits the pieces that it crosses. Every pixel of a piece with a sample in the polygon adds a fragment to the pixel's linked list,
 which is ordered front to back (an A-buffer; Carpenter 1984, "The A-buffer, an Antialiased Hidden Surface Method"). Then the lists are
-blended. Textures are filtered only now, so what opaque fragments hide costs nothing.
+blended, for each sample. Textures are filtered only now, so what opaque fragments hide costs nothing.
 """
 
 # mypy: ignore-errors
@@ -10,6 +10,7 @@ blended. Textures are filtered only now, so what opaque fragments hide costs not
 
 import warp as wp
 
+from bbfit.operators.cards.sheets import SAMPLES
 from bbfit.operators.cards.sheets import SLACK as SLACK_VALUE
 from bbfit.operators.drawing.compositing import HASH, LEAST_CONTRAST, TIE
 from bbfit.operators.drawing.tile_forward import BLENDED, COVERAGE, HASHED, SMOOTH
@@ -21,6 +22,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FLAGS})
 TIED = wp.constant(wp.float64(1 + TIE))
 SLACK = wp.constant(wp.float64(SLACK_VALUE))
 LEAST = wp.constant(LEAST_CONTRAST)
+RIGHT, DOWN = (wp.constant(wp.vec4d(*offsets)) for offsets in zip(*SAMPLES, strict=True))
 OF_X, OF_Y, OF_TEXTURE, FIRST_ROUND, SECOND_ROUND = (wp.constant(wp.uint32(factor)) for factor in HASH)
 NO_CUTOFF, HASH_CUTOFF, IS_SMOOTH, IS_COVERAGE = (wp.constant(float(value)) for value in (BLENDED, HASHED, SMOOTH, COVERAGE))
 
@@ -35,6 +37,8 @@ class Fragment:
     """The third homogeneous coordinate of (u, v)."""
     depth: wp.float64
     sheet: int
+    covered: int
+    """The pixel's samples in polygons of the sheet, a bit each."""
     following: int
     """Index of the next fragment of the pixel, farther away; -1 after the last."""
 
@@ -139,8 +143,18 @@ def shaded(color: wp.vec3, surface: wp.vec4, through: float, towards: wp.vec3, s
 
 
 @wp.func
-def is_inside(sides: wp.array2d(dtype=wp.vec3d), piece: int, u: wp.float64, v: wp.float64) -> bool:
+def seen_at(matrix: wp.mat33d, x: wp.float64, y: wp.float64) -> wp.vec3d:
+    """Texture coordinates of a plane in a point of the screen, and their divisor."""
+    scale = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]
+    u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]) / scale
+    v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]) / scale
+    return wp.vec3d(u, v, scale)
+
+
+@wp.func
+def is_inside(sides: wp.array2d(dtype=wp.vec3d), piece: int, place: wp.vec3d) -> bool:
     """Whether texture coordinates lie in a piece."""
+    u, v = place[0], place[1]
     for side in range(sides.shape[1]):
         edge = sides[piece, side]
         if edge[0] * u + edge[1] * v > edge[2] + SLACK:
@@ -157,6 +171,7 @@ def draw_rows(
     height: int,
     width: int,
     test: wp.vec4,
+    multisampled: int,
     traced: int,
     boxes: wp.array2d(dtype=wp.vec4i),
     of_piece: wp.array(dtype=wp.int32),
@@ -176,7 +191,7 @@ def draw_rows(
     """Write ``image`` [V, H, W] and the number of fragments of each row, ``counts`` [V, H]; launched over rows of all views.
 
     Memory of a thread: ``heads``, the first and the latest fragment of each pixel of a row, and the ``fragments`` of a row.
-    ``maps`` are normals and occlusion. Without ``suns``, colors are shown as they are.
+    ``maps`` are normals and occlusion. Without ``suns``, colors are shown as they are. A pixel has one sample, its center, or four.
     """
     line, _ = wp.tid()
     line += first_line
@@ -193,23 +208,29 @@ def draw_rows(
         sheet = of_piece[piece]
         matrix, away = to_uv[view, sheet], to_depth[view, sheet]
         for column in range(box[0], box[2]):
-            x = wp.float64(column)
-            scale = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]
-            u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]) / scale
-            v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]) / scale
-            depth = away[0] * u + away[1] * v + away[2]
-            if depth > nothing and wp.isfinite(depth) and is_inside(sides, piece, u, v):
+            x, covered = wp.float64(column), int(0)
+            center = seen_at(matrix, x, y)
+            depth = away[0] * center[0] + away[1] * center[1] + away[2]
+            if depth > nothing and wp.isfinite(depth):
+                if multisampled == 0:
+                    covered = wp.where(is_inside(sides, piece, center), 1, 0)
+                else:
+                    for point in range(4):
+                        if is_inside(sides, piece, seen_at(matrix, x + RIGHT[point], y + DOWN[point])):
+                            covered |= 1 << point
+            if covered != 0:
                 latest = heads[thread, 1, column]
                 if latest >= 0:
-                    if fragments[thread, latest].sheet == sheet:
-                        continue  # where pieces of a sheet overlap, the first one shows
+                    if fragments[thread, latest].sheet == sheet:  # pieces of a sheet meet in this pixel, or overlap
+                        fragments[thread, latest].covered |= covered
+                        continue
                 before, after = int(-1), int(heads[thread, 0, column])
                 while after >= 0:
                     if fragments[thread, after].depth > depth * TIED:
                         break
                     before = after
                     after = int(fragments[thread, after].following)
-                fragments[thread, used] = Fragment(u, v, scale, depth, sheet, after)
+                fragments[thread, used] = Fragment(center[0], center[1], center[2], depth, sheet, covered, after)
                 if before < 0:
                     heads[thread, 0, column] = used
                 else:
@@ -219,12 +240,16 @@ def draw_rows(
     counts[view, row] = used
     size = wp.vec2d(wp.float64(levels[0][1]), wp.float64(levels[0][2]))
     last = wp.float64(levels.shape[0] - 1)
-    nested = test[3] != 0.0
+    nested, share = test[3] != 0.0, wp.where(multisampled != 0, 0.25, 1.0)
+    whole = multisampled != 0 and test[3] == IS_COVERAGE and test[1] == 4.0
     for column in range(width):
         total = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        hidden = float(0.0)
+        # How much of each sample fragments in front hide.
+        hidden = wp.vec4(0.0, 1.0, 1.0, 1.0)
+        if multisampled != 0:
+            hidden = wp.vec4(0.0, 0.0, 0.0, 0.0)
         at = int(heads[thread, 0, column])
-        while at >= 0 and hidden < 1.0:
+        while at >= 0 and wp.min(hidden) < 1.0:
             seen = fragments[thread, at]
             rows = to_uv[view, seen.sheet]
             # d(a / c) = (da - (a / c) dc) / c, in x and in y
@@ -241,7 +266,15 @@ def draw_rows(
             alpha = opacity(sample[3], contrast, test)
             if test[0] == HASH_CUTOFF:
                 alpha = wp.where(sample[3] >= threshold(column, row, first_texels[seen.sheet]), 1.0, 0.0)
-            weight = wp.where(nested, wp.max(alpha - hidden, 0.0), alpha * (1.0 - hidden))
+            shown = wp.vec4(0.0, 0.0, 0.0, 0.0)
+            for point in range(4):
+                if (seen.covered >> point) & 1 != 0:
+                    part = alpha
+                    if whole:  # of coverage, the first samples are covered, and the rest are not
+                        part = wp.where(4.0 * alpha > float(point) + 0.5, 1.0, 0.0)
+                    shown[point] = wp.where(nested, wp.max(part - hidden[point], 0.0), part * (1.0 - hidden[point]))
+            hidden += shown
+            weight = share * (shown[0] + shown[1] + shown[2] + shown[3])
             color = wp.vec3(sample[0], sample[1], sample[2])
             if suns.shape[0] > 0 and weight > 0.0:
                 surface, through = trilinear(maps, levels, seen.u, seen.v, detail), float(0.0)
@@ -249,6 +282,5 @@ def draw_rows(
                     through = trilinear(translucency, levels, seen.u, seen.v, detail)[0]
                 color = shaded(color, surface, through, towards[view, seen.sheet], suns[view], traced)
             total += wp.vec4(color[0], color[1], color[2], 1.0) * weight
-            hidden += weight
             at = seen.following
         image[view, row, column] = total

@@ -19,6 +19,11 @@ from bbfit.operators.drawing.reference import EDGE_ON
 
 SLACK = 1e-9
 """Distance outside a polygon, as a share of the atlas, at which a pixel's center counts as inside, so that rounding opens no seams."""
+CENTER = ((0.0, 0.0),)
+"""The sample of a pixel without multisampling."""
+SAMPLES = ((-2 / 16, -6 / 16), (6 / 16, -2 / 16), (-6 / 16, 2 / 16), (2 / 16, 6 / 16))
+"""Four samples of a pixel, to the right of its center and below it, where graphics cards have them (Vulkan 1.3, section 25.1, standard
+sample locations)."""
 # Relative error of corners up to which a card belongs to a sheet.
 _SAME = 1e-6
 
@@ -63,6 +68,8 @@ class PreparedCards:
     """Their planes."""
     levels: MipChain
     """The levels of their atlas: colors and alpha, and the values of maps if there are any."""
+    multisampled: bool
+    """Whether a pixel has :data:`SAMPLES`, and not its center alone."""
 
     @cached_property
     def channels(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -102,9 +109,12 @@ def seen_sheets(sheets: Sheets, camera: Camera) -> SeenSheets:
     return SeenSheets(to_uv, to_depth, *_boxes(sheets, camera, shown))
 
 
-def prepared_cards(cards: Cards) -> PreparedCards:
-    """Prepare cards for drawing. Raises InputError if a level is not uint8 or not half as large as the level before, rounded down."""
-    return PreparedCards(cards, sheets_of(cards), _levels(cards))
+def prepared_cards(cards: Cards, *, multisampled: bool | None = None) -> PreparedCards:
+    """Prepare cards for drawing; ``multisampled`` is by default what their alpha mode says.
+
+    Raises InputError if a level is not uint8 or not half as large as the level before, rounded down.
+    """
+    return PreparedCards(cards, sheets_of(cards), _levels(cards), cards.alpha.multisampled if multisampled is None else multisampled)
 
 
 def _levels(cards: Cards) -> MipChain:

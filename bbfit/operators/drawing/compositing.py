@@ -115,6 +115,13 @@ def opacity(alpha: Tensor, mode: AlphaMode) -> Tensor:
     return ramp + (hard - ramp).detach()
 
 
+def covered_samples(alpha: Tensor, count: int) -> Tensor:
+    """How much of each of a pixel's samples alpha covers, in the mode ``coverage``: 1 of the first ones, which are as many as alpha times
+    their number, rounded, and 0 of the rest. The derivative is 1. From [...] it is [..., count]."""
+    first = (alpha.detach()[..., None] * count >= torch.arange(count, device=alpha.device) + 0.5).to(alpha)
+    return first + (alpha - alpha.detach())[..., None]
+
+
 def coverage(alpha: Tensor, contrast: Tensor, mode: AlphaMode) -> Tensor:
     """The share of a pixel that an antialiased mask covers, for the filtered alpha at its center and the :func:`contrast`, of one shape."""
     rate = (1 / contrast.clamp_min(LEAST_CONTRAST)).clamp_max(mode.hardness)
