@@ -41,9 +41,9 @@ _HALVINGS, _LEAST_SIDE = (3, 4), 8
 _LEVEL = 2
 # Steps of Adam, its rate, its decay rates, and the alpha to start from.
 _STEPS, _RATE, _DECAY, _START = 40, 0.12, (0.9, 0.95), 0.2
-# Weights beside the squared error: of the error's change when the camera turns by a degree, for masks, whose cutoff makes them flicker
-# more, and for the rest, and of the error in density.
-_TURN_OF_MASK, _TURN, _DENSITY = 20.0, 5.0, 1.0
+# Weights beside the squared error: of the error's change when the camera turns by a degree, where alpha is tested, so that it flickers
+# more, and where it is blended; and of the error in density.
+_TURN_TESTED, _TURN_BLENDED, _DENSITY = 20.0, 5.0, 1.0
 # Share of the density from near; gaps stay empty if all sizes have it.
 _ENOUGH = 0.85
 # Width in texels of the rim around a card that stays empty, because filtering shows it at fine levels.
@@ -106,7 +106,7 @@ def _filled(cards: Cards, on_step: Callable[[int, int], None]) -> Cards:
         return torch.cat([part.flatten() for part in parts])[:, None]
 
     sizes = _views(cards, mode, chain, cameras, [side >> count for count in halvings])
-    values, turn = torch.full(shapes[0], _START, requires_grad=True), _TURN_OF_MASK if mode.kind == "mask" else _TURN
+    values, turn = torch.full(shapes[0], _START, requires_grad=True), _TURN_TESTED if mode.tested else _TURN_BLENDED
     adam = torch.optim.Adam([values], betas=_DECAY)
     for step in range(_STEPS):
         adam.param_groups[0]["lr"] = _RATE * 0.5 * (1 + math.cos(math.pi * step / _STEPS))
