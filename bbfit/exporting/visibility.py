@@ -134,8 +134,8 @@ def sample_visibility(cards: Cards, cameras: Rig, across: int = 32) -> Visibilit
     largest: dict[int, Card] = {}
     for card in sorted(cards.cards, key=_extent):
         largest[card.rectangle] = card
-    depth, alpha, points = [], [], []
-    for card in largest.values():
+    hits = []
+    for number, card in enumerate(largest.values()):
         middle, at = card.corners.mean(0), texel_corners(cards, card)
         to_texel = np.linalg.pinv(card.corners - middle) @ (at - at.mean(0))
         normal, facing = card.normal, (eyes - middle) @ card.normal
@@ -146,11 +146,11 @@ def sample_visibility(cards: Cards, cameras: Rig, across: int = 32) -> Visibilit
         from_behind = any(not other.culled or other.normal @ normal < 0 for other in others)
         shown = (t > 0) & np.isfinite(t) & (facing != 0 if from_behind else facing > 0)[:, None]
         opacity = np.where(shown, bilinear(rimmed_alpha(cards, card.rectangle), places), 0.0)
-        depth.append(np.where(opacity > 0, t, np.inf).astype(np.float32))
-        alpha.append(opacity.astype(np.float32))
-        points.append(np.where((opacity > 0)[..., None], places, 0.0).astype(np.float32))
-    rectangle = np.array(list(largest))
-    return _paired(cameras, cell, rectangle, np.stack(depth), np.stack(alpha), np.stack(points))
+        ray = np.flatnonzero(opacity > 0)
+        values = (part[ray].astype(np.float32) for part in (t.ravel(), opacity.ravel(), places.reshape(-1, 2)))
+        hits.append((np.full(len(ray), number), ray, *values))
+    sheet, ray, depth, alpha, points = (np.concatenate(parts) for parts in zip(*hits, strict=True))
+    return _paired(cameras, cell, across, np.array(list(largest))[sheet], points, ray, depth, alpha)
 
 
 def _extent(card: Card) -> float:
@@ -179,12 +179,26 @@ def _rays(points: NDArray, cameras: Rig, across: int) -> tuple[NDArray, NDArray]
     return rays.reshape(len(eyes), -1, 3), cell
 
 
-def _paired(cameras: Rig, cell: NDArray, rectangle: NDArray, depth: NDArray, alpha: NDArray, points: NDArray) -> VisibilitySamples:
-    """Sort the layers of each ray, [S, V, R] (and [S, V, R, 2]) for S sheets and R rays of V cameras, and list the pairs."""
-    camera, ray = np.nonzero((alpha > 0).any(0))
-    depth, alpha, points, cell = depth[:, camera, ray], alpha[:, camera, ray], points[:, camera, ray], cell[camera]
-    order = np.argsort(depth, 0, kind="stable")
-    depth, alpha = np.take_along_axis(depth, order, 0), np.take_along_axis(alpha, order, 0)
+def _paired(
+    cameras: Rig, cell: NDArray, across: int, rectangle: NDArray, points: NDArray, ray: NDArray, depth: NDArray, alpha: NDArray
+) -> VisibilitySamples:
+    """Sort the hits of each ray into layers, and list the pairs.
+
+    Rays are numbered from camera to camera. Hits have a texture [H], a place [H, 2], a ray, a depth and an opacity [H]. Those of one depth
+    keep their order.
+    """
+    order = np.lexsort((depth, ray))
+    rays, first, column = np.unique(ray[order], return_index=True, return_inverse=True)
+    layer = np.arange(len(order)) - first[column]
+    most = int(layer.max(initial=0)) + 1
+
+    def layered(values: NDArray) -> NDArray:
+        made = np.zeros((most, len(rays)), values.dtype)
+        made[layer, column] = values[order]
+        return made
+
+    hit, depth, alpha, camera = layered(np.arange(len(ray))), layered(depth), layered(alpha), rays // across**2
+    cell = cell[camera]
     through = np.cumprod(1.0 - alpha, 0)
     visible = max(float(((1 - through[-1]) * cell).sum()), 1e-300)
     before = np.concatenate([np.ones_like(through[:1]), through[:-1]])
@@ -201,8 +215,8 @@ def _paired(cameras: Rig, cell: NDArray, rectangle: NDArray, depth: NDArray, alp
     used, index = np.unique(np.stack([front, back]) * len(camera) + ray, return_inverse=True)
     index = index.reshape(2, -1)
     layer, at = np.divmod(used, max(len(camera), 1))
-    sheet = order[layer, at]
-    return VisibilitySamples(cameras, rectangle[sheet], points[sheet, at], camera[at], camera[ray], index[0], index[1], weight)
+    seen = hit[layer, at]
+    return VisibilitySamples(cameras, rectangle[seen], points[seen], camera[at], camera[ray], index[0], index[1], weight)
 
 
 def visible_cards(cards: Cards, samples: VisibilitySamples) -> NDArray[np.int64]:
