@@ -36,7 +36,7 @@ def score_sizes(
     by area, of the part of the view that it covers. The mean is taken of premultiplied display-referred values, as in all scores, without
     conversion to linear light; so coverage is the same at all sizes.
 
-    With one sample per pixel the coverage of a small picture of a tree varies by some percent at random. Below the full size the coverage
+    With few samples per pixel the coverage of a small picture of a tree varies by some percent at random. Below the full size the coverage
     of a render is therefore the mean of several renders, 4 at half the size and 16 below, shifted by fractions of a pixel.
     """
     check_count("halvings", halvings, 0)

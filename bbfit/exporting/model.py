@@ -107,10 +107,8 @@ class ShippedModel:
     def described(self, description: Description) -> ShippedModel:
         """The same model with names and facts in its GLB."""
         model = replace(self, description=description)
-        computed = vars(self)
-        vars(model).update(
-            (name, computed[name]) for name in ("cards", "_plain_glb") if name in computed
-        )  # so that nothing is computed twice
+        # What is known of this model is not computed again.
+        vars(model).update((name, vars(self)[name]) for name in ("cards", "_plain_glb") if name in vars(self))
         return model
 
     @property
@@ -122,8 +120,8 @@ class ShippedModel:
         """Draw what the files show: premultiplied RGBA over nothing in [0, 1], [H, W, 4], or [V, H, W, 4] for a batch of cameras.
 
         ``light`` is for a cloud with maps: that of each view, or one for all; by default the cloud's own. Without mip levels and maps the
-        polygons show what the cloud's renderer shows, but for the rounding of textures to 8 bits; the renderer is faster and draws them.
-        Trimmed outlines cut off nothing visible.
+        polygons show what the cloud's renderer shows, but for the rounding of textures to 8 bits and the edges of what is not transparent
+        there; the renderer is faster and draws them, with one sample a pixel. Trimmed outlines cut off nothing visible.
         """
         if self.cloud.surface is not None or self.config.has_mips or self.halvings or self.config.mipmapped(self.cloud.alpha):
             return self._renderer.draw(camera, light)

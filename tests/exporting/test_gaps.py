@@ -88,7 +88,7 @@ def test_from_afar_cards_show_what_they_show_from_near(both: tuple[Cards, Cards]
     before, after = (float((drawn(cards, FAR) - near).square().mean()) for cards in both)
     assert after < 0.5 * before
     fewer, dense = (densities(cards, cards.chain or (), (4,))[0] for cards in both)
-    assert 2 * fewer < dense < 1.1
+    assert 2 * fewer < dense < 1
 
 
 def test_dense_cards_keep_empty_gaps() -> None:
