@@ -23,9 +23,10 @@ levels    for each folder of views: milliseconds of a step at each resolution of
           billboards (medians); only with ``--only levels``
 start     starting up: ``bbfit --help`` and ``import bbfit`` (medians of five), and a fit of two steps and the first step of a fit, with an
           empty and with a filled cache of compiled kernels; only with ``--only start``
-cards     drawing the model of a short default fit as programs show it, by torch and by the kernel: four cameras, medians of five; only with
-          ``--only cards``
-render    the default views of a grown aspen, with all samples for training views and with the default number; only with ``--only render``
+cards     drawing the model of a short default fit as programs show it, by torch and by the kernel: four cameras, medians of five; with
+          alpha to coverage also by the kernel with one sample a pixel; and filling the gaps of its texture; only with ``--only cards``
+render    the default views of a grown aspen, with all samples for training views, with the default number, and under a sun for each; only
+          with ``--only render``
 run       the stages of ``bbfit run`` without a tree and without options; only with ``--only run``
 memory    the peak resident memory of a default fit of 360 views at 1024 x 1024, in a separate process
 
@@ -60,6 +61,8 @@ import torch
 from torch.nn.functional import interpolate
 
 import bbfit
+from bbfit.exporting.gaps import with_filled_gaps
+from bbfit.exporting.mips import plain_chain
 from bbfit.exporting.model import shipped_model
 from bbfit.fitting import fused_pass
 from bbfit.fitting.config import ResolvedFit
@@ -436,29 +439,36 @@ def cards() -> list[Row]:
     """Measure the rows ``cards``."""
     views, rows = bbfit.ViewDataset.load(DATA / "views"), []
     model = shipped_model(bbfit.fit(views, bbfit.FitConfig(steps=100)).cloud)
+    empty = shipped_model(model.cloud, bbfit.ExportConfig(mipmaps=False)).cards
+    empty = replace(empty, chain=tuple(plain_chain(empty.atlas.image)))
+    seconds = seconds_of(lambda: with_filled_gaps(empty), torch.device("cpu"))
+    rows.append({"name": "cards", "what": "gaps", "cards": len(empty.cards), "seconds": round(seconds, 2)})
     for antialiased in (False, True):
         shown = replace(model.cards, alpha=replace(model.cards.alpha, antialiased=antialiased))
         renderers = {name: CardRenderer(shown, backend=name) for name in ("reference", "fused")}
+        renderers["one sample"] = CardRenderer(shown, multisampled=False)
         for size in (384, 48):
             cameras, times = views.test.cameras.resized(size, size)[:4], dict[str, list[float]]()
             for name in [*renderers] * 6:
                 times.setdefault(name, []).append(seconds_of(partial(renderers[name].draw, cameras), torch.device("cpu")))
-            slow, fast = (statistics.median(own[1:]) for own in times.values())
+            slow, fast, single = (statistics.median(own[1:]) for own in times.values())
             row = {"name": "cards", "alpha": "antialiased mask" if antialiased else "mask", "size": size, "cards": len(shown.cards)}
-            rows.append(row | {"reference_s": round(slow, 4), "fused_s": round(fast, 4), "ratio": round(slow / fast, 1)})
+            rows.append(row | {"reference_s": round(slow, 4), "fused_s": round(fast, 4), "one_sample_s": round(single, 4)})
+            rows[-1]["ratio"] = round(slow / fast, 1)
     return rows
 
 
 def rendering() -> list[Row]:
     """Measure the rows ``render``."""
-    rows = []
+    rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         tree = bbfit.write_tree(bbfit.grow("quaking_aspen"), Path(folder) / "tree.glb")[0]
-        for samples in (bbfit.ViewsConfig().samples, bbfit.ViewsConfig().samples_of_training):
-            started, config = time.perf_counter(), bbfit.ViewsConfig(training_samples=samples)
-            bbfit.render_views(tree, Path(folder) / str(samples), config)
-            seconds = round(time.perf_counter() - started, 2)
-            rows.append({"name": "render", "pictures": config.count + config.turned, "training_samples": samples, "seconds": seconds})
+        all_samples = bbfit.ViewsConfig().samples
+        for config in (bbfit.ViewsConfig(training_samples=all_samples), bbfit.ViewsConfig(), bbfit.ViewsConfig(suns=1)):
+            started, row = time.perf_counter(), {"name": "render", "pictures": config.count + config.turned, "suns": config.suns}
+            row["training_samples"] = config.samples_of_training
+            bbfit.render_views(tree, Path(folder) / str(len(rows)), config)
+            rows.append(row | {"seconds": round(time.perf_counter() - started, 2)})
     return rows
 
 

@@ -46,7 +46,7 @@ class ViewsConfig:
     samples: Count = 16
     """Light paths per pixel: more are slower and less noisy; training views have half of them."""
     training_samples: Count | None = None
-    """The same for training views, whose noise averages out in a fit. Default: half of --samples; with --suns, all of them."""
+    """The same for training views, whose noise averages out in a fit. Default: half of --samples."""
     denoise: bool = True
     """Denoise the pictures with Open Image Denoise, which makes a few samples look like many."""
     sun_strength: _Strength = 2.5
@@ -86,7 +86,7 @@ class ViewsConfig:
         """Light paths per pixel of training views, with the default filled in."""
         if self.training_samples is not None:
             return self.training_samples
-        return self.samples if self.suns else (self.samples + 1) // 2
+        return (self.samples + 1) // 2
 
     @property
     def rings(self) -> tuple[float, ...]:

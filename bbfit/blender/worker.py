@@ -258,7 +258,7 @@ def render(frame: dict[str, Any], settings: dict[str, Any]) -> None:
     scene.cycles.seed, scene.cycles.samples = frame["seed"], frame["samples"]
     part = path.with_name(f".bbfit-{path.stem}.part")
     scene.render.filepath = str(part).replace("{", "{{").replace("}", "}}")  # Blender would replace {names}
-    parts = LIGHTS.aim(frame["lights"], path, settings) if "lights" in frame else {}
+    parts = LIGHTS.aim(frame, settings) if "lights" in frame else {}
     if "depth" in frame:
         parts = DEPTH.aim(Path(frame["depth"]), frame["clip"])
     try:

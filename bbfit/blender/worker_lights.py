@@ -3,7 +3,8 @@
 ``worker.py`` imports it by path, so it does not import bbfit.
 
 Cycles separates the light of groups of lamps ("light groups"), but its denoiser then covers only their sum. So the compositor denoises each
-group, with the guides of all of them. The view's own picture is the sum of the denoised groups.
+group, with the guides of all of them, in the part of the picture that is rendered. The view's own picture is the sum of the denoised
+groups.
 """
 
 from __future__ import annotations
@@ -36,17 +37,18 @@ def set_up(settings: dict[str, Any]) -> None:
     scene.use_nodes = True
 
 
-def aim(lights: dict[str, Any], path: Path, settings: dict[str, Any]) -> dict[str, str]:
-    """Aim the suns, and connect the passes to files beside ``path``. Return the final path of each of those files."""
+def aim(frame: dict[str, Any], settings: dict[str, Any]) -> dict[str, str]:
+    """Aim the suns, and connect the passes to files beside the picture. Return the final path of each of those files."""
     import bpy
     from mathutils import Vector
 
+    lights = frame["lights"]
     for number in range(settings["suns"]):
         sun = bpy.data.objects[f"bbfit sun {number}"]
         sun.hide_render = number >= len(lights["suns"])
         if not sun.hide_render:
             sun.rotation_euler = Vector(lights["suns"][number]).to_track_quat("Z", "Y").to_euler()
-    graph = _Graph(path, settings["denoise"])
+    graph = _Graph(frame, settings)
     ambient = graph.light(_AMBIENT)
     has_sun = settings["sun_strength"] > 0
     suns = [graph.light(f"sun{number}") for number in range(max(int(has_sun), len(lights["of_suns"])))]
@@ -63,19 +65,32 @@ def aim(lights: dict[str, Any], path: Path, settings: dict[str, Any]) -> dict[st
     return graph.files
 
 
+def _pixels(low: float, high: float, size: int) -> tuple[int, int]:
+    """The first pixel and the number of pixels between two edges, in [0, 1], of a picture.
+
+    The compositor centers what it crops. So that a whole number of pixels leads back, a side is odd if that of the picture is odd.
+    """
+    first, end = round(low * size), round(high * size)
+    if (end - first - size) % 2:
+        first, end = (first, end + 1) if end < size else (first - 1, end)
+    return first, end - first
+
+
 class _Graph:
     """The nodes of the compositor for one picture."""
 
-    def __init__(self, path: Path, denoise: bool) -> None:
+    def __init__(self, frame: dict[str, Any], settings: dict[str, Any]) -> None:
         import bpy
 
         self.nodes, self.links, self.files = bpy.context.scene.node_tree.nodes, bpy.context.scene.node_tree.links, dict[str, str]()
-        self._denoise = denoise
+        self._denoise, self._size = settings["denoise"], settings["size"]
+        left, bottom, right, top = frame["border"] or (0.0, 0.0, 1.0, 1.0)
+        self._rendered = [("X", "Width", *_pixels(left, right, self._size)), ("Y", "Height", *_pixels(bottom, top, self._size))]
         self.nodes.clear()
         self.render = self.nodes.new("CompositorNodeRLayers")
         self._composite = self.nodes.new("CompositorNodeComposite")
         self._output = self.nodes.new("CompositorNodeOutputFile")
-        self._output.base_path = str(path.parent).replace("{", "{{").replace("}", "}}")
+        self._output.base_path = str(Path(frame["path"]).parent).replace("{", "{{").replace("}", "}}")
         form = self._output.format
         form.file_format, form.color_mode, form.color_depth = "PNG", "RGBA", "8"
         self._output.file_slots.clear()
@@ -88,7 +103,24 @@ class _Graph:
         node = self.nodes.new("CompositorNodeDenoise")
         node.prefilter, node.use_hdr = "FAST", True
         for name, source in (("Image", noisy), ("Normal", self._guide("Normal")), ("Albedo", self._guide("Albedo"))):
-            self.links.new(source, node.inputs[name])
+            self.links.new(self._cropped(source), node.inputs[name])
+        return self._mixed("MIX", noisy, self._moved(node.outputs[0]))
+
+    def _cropped(self, color: Any) -> Any:
+        """The part of a picture that is rendered, around the center of the frame."""
+        node = self.nodes.new("CompositorNodeCrop")
+        self.links.new(color, node.inputs["Image"])
+        for axis, side, first, count in self._rendered:
+            node.inputs[axis].default_value, node.inputs[side].default_value = first, count
+        node.inputs["Alpha Crop"].default_value = False
+        return node.outputs[0]
+
+    def _moved(self, color: Any) -> Any:
+        """A cropped picture at its place in the frame."""
+        node = self.nodes.new("CompositorNodeTranslate")
+        self.links.new(color, node.inputs["Image"])
+        for axis, _, first, count in self._rendered:
+            node.inputs[axis].default_value = first + (count - self._size) / 2
         return node.outputs[0]
 
     def _guide(self, name: str) -> Any:

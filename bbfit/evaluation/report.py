@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -60,13 +60,9 @@ class RingScore:
 
 
 @dataclass(frozen=True)
-class SizeScore:
-    """The exported model against the held-out views in pictures of one size (:mod:`bbfit.evaluation.sizes`)."""
+class SizeMeasures:
+    """A model against the held-out views in pictures of one size."""
 
-    width: int
-    """Width of the pictures in pixels."""
-    height: int
-    """Height of the pictures in pixels."""
     psnr: float
     """Peak signal-to-noise ratio in dB, at most 120, the mean over views and :data:`bbfit.evaluation.backgrounds.BACKGROUNDS`."""
     coverage: float | None
@@ -74,6 +70,31 @@ class SizeScore:
     ``None`` if the targets are empty."""
     alpha: float
     """Root mean squared difference of alpha over all pixels of all views, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class SizeScore:
+    """The exported model against the held-out views in pictures of one size (:mod:`bbfit.evaluation.sizes`)."""
+
+    width: int
+    """Width of the pictures in pixels."""
+    height: int
+    """Height of the pictures in pixels."""
+    measures: SizeMeasures
+    antialiased: SizeMeasures | None = None
+    """The same with alpha to coverage, as in :class:`ViewScore`."""
+
+    def to_json(self) -> dict[str, Any]:
+        """The size and the measures in one dictionary."""
+        antialiased = None if self.antialiased is None else asdict(self.antialiased)
+        return {"width": self.width, "height": self.height} | asdict(self.measures) | {"antialiased": antialiased}
+
+    @staticmethod
+    def from_json(content: Mapping[str, Any]) -> SizeScore:
+        """Read what :meth:`to_json` made. Raises KeyError or TypeError if something is missing."""
+        names, antialiased = [entry.name for entry in fields(SizeMeasures)], content["antialiased"]
+        measures = SizeMeasures(**{name: content[name] for name in names})
+        return SizeScore(content["width"], content["height"], measures, None if antialiased is None else SizeMeasures(**antialiased))
 
 
 @dataclass(frozen=True)
@@ -217,7 +238,7 @@ class Report:
             "alpha": {"mode", "cutoff"}, "seconds": {stage: ..},
             "distances": {"silhouette_pixels", "near_meters", "far_meters"} or None,
             "subject": {"tree", "bounds", "sun_direction", "sun_strength", "ambient", "cloud"},
-            "sizes": [{"width", "height", "psnr", "coverage", "alpha"}],
+            "sizes": [{"width", "height", "psnr", "coverage", "alpha", "antialiased": {the last three} or None}],
             "shimmer": [{"width", "height", "tree", "ratio", "antialiased"}],
             "rings": [{"elevation_degrees", "views", and the same measures, with "antialiased"}],
             "views": [{"name", "azimuth_degrees", "elevation_degrees", and the same measures, with "antialiased"}]}``
@@ -233,7 +254,7 @@ class Report:
             "seconds": dict(self.seconds),
             "distances": None if self.distances is None else asdict(self.distances),
             "subject": self.subject.to_json(),
-            "sizes": [asdict(size) for size in self.sizes],
+            "sizes": [size.to_json() for size in self.sizes],
             "shimmer": [asdict(size) for size in self.shimmer],
             "rings": [ring.to_json() for ring in self.rings],
             "views": [view.to_json() for view in self.views],
@@ -267,7 +288,7 @@ class Report:
                 )
                 for view in content["views"]
             )
-            afar = tuple(SizeScore(**size) for size in content["sizes"])
+            afar = tuple(SizeScore.from_json(size) for size in content["sizes"])
             shaded = content["shaded"]
             trunk = None if content["trunk"] is None else TrunkScore.from_json(content["trunk"])
             shimmer = tuple(ShimmerScore(**size) for size in content["shimmer"])

@@ -121,7 +121,7 @@ def evaluate_model(
         antialiased=None if smooth is None else lambda index: held_out(smooth, views, index)[1],
         on_view=lambda done, _: on_progress(done, total),
     )
-    sizes = score_sizes(model.draw, views, on_size=lambda done, _: on_progress(len(views) + done, total))
+    sizes = score_sizes(model.draw, views, antialiased=smooth, on_size=lambda done, _: on_progress(len(views) + done, total))
     shimmer: tuple[ShimmerScore, ...] = ()
     if turned is not None:
         shimmer = score_shimmer(model.draw, turned, smooth)
@@ -151,7 +151,7 @@ def _distances(silhouette_pixels: float, views: ViewSet, sizes: Sequence[SizeSco
         scale = float(pixels_per_meter(views.cameras))
     except InputError:  # they all look the same way
         return None
-    return viewing_distances(silhouette_pixels, scale, [(size.width, size.coverage) for size in sizes])
+    return viewing_distances(silhouette_pixels, scale, [(size.width, size.measures.coverage) for size in sizes])
 
 
 def score_model_light(

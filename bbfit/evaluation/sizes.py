@@ -12,25 +12,31 @@ from torch import Tensor
 from bbfit.checks import check_count, check_shape, fail
 from bbfit.evaluation import metrics
 from bbfit.evaluation.backgrounds import mean_psnr
-from bbfit.evaluation.report import SizeScore
+from bbfit.evaluation.report import SizeMeasures, SizeScore
 from bbfit.geometry.camera import Camera
 from bbfit.images import shrunk
 from bbfit.views.view_set import ViewSet
 
+Draw = Callable[[Camera], Tensor]
 HALVINGS = 4
 """How many times an evaluation halves the views' size."""
 
 
 def score_sizes(
-    draw: Callable[[Camera], Tensor], views: ViewSet, halvings: int = HALVINGS, *, on_size: Callable[[int, int], None] | None = None
+    draw: Draw,
+    views: ViewSet,
+    halvings: int = HALVINGS,
+    *,
+    antialiased: Draw | None = None,
+    on_size: Callable[[int, int], None] | None = None,
 ) -> tuple[SizeScore, ...]:
     """Compare renders at the views' size, at half of it and so on with the views averaged to the same size.
 
     Returns at most ``halvings + 1`` scores, the largest size first; sizes with a side below 11 pixels
     (:data:`bbfit.evaluation.metrics.SSIM_WINDOW`) are left out. ``draw`` returns what a batch of B cameras sees: premultiplied RGBA over
-    nothing, [B, H, W, 4], which is then clamped to [0, 1]. ``on_size`` is called after each size with the number of finished sizes and
-    their total. Raises InputError if there are no views, they are too small, ``halvings`` is negative, or a render has another shape or
-    values that are not finite.
+    nothing, [B, H, W, 4], which is then clamped to [0, 1]. ``antialiased`` is the same for the mask drawn with alpha to coverage.
+    ``on_size`` is called after each size with the number of finished sizes and their total. Raises InputError if there are no views, they
+    are too small, ``halvings`` is negative, or a render has another shape or values that are not finite.
 
     A smaller camera covers the same field of view with fewer pixels, as if the tree were farther away. A pixel of the target is the mean,
     by area, of the part of the view that it covers. The mean is taken of premultiplied display-referred values, as in all scores, without
@@ -47,13 +53,14 @@ def score_sizes(
     for halving in range(halvings + 1):
         width, height = views.cameras.width >> halving, views.cameras.height >> halving
         if min(width, height) >= metrics.SSIM_WINDOW:
-            scores.append(_score(draw, views, halving, width, height))
+            smooth = None if antialiased is None else _measures(antialiased, views, halving, width, height)
+            scores.append(SizeScore(width, height, _measures(draw, views, halving, width, height), smooth))
         if on_size is not None:
             on_size(halving + 1, halvings + 1)
     return tuple(scores)
 
 
-def _score(draw: Callable[[Camera], Tensor], views: ViewSet, halving: int, width: int, height: int) -> SizeScore:
+def _measures(draw: Draw, views: ViewSet, halving: int, width: int, height: int) -> SizeMeasures:
     cameras = views.cameras.resized(width, height)
     psnrs, squares, render_cover, target_cover = [], [], 0.0, 0.0
     for index, name in enumerate(views.names):
@@ -71,7 +78,7 @@ def _score(draw: Callable[[Camera], Tensor], views: ViewSet, halving: int, width
         render_cover += sum(covers) / len(covers)
         target_cover += float(target[..., 3].sum())
     mean_square = sum(squares) / len(views)
-    return SizeScore(width, height, sum(psnrs) / len(views), render_cover / target_cover if target_cover else None, mean_square**0.5)
+    return SizeMeasures(sum(psnrs) / len(views), render_cover / target_cover if target_cover else None, mean_square**0.5)
 
 
 def _shifted(camera: Camera, halvings: int) -> Camera:

@@ -32,7 +32,6 @@ from bbfit.geometry.light import Light
 from bbfit.images import encode_png
 from bbfit.model_files import check_model_path, normals_path
 from bbfit.rendering.cards import CardRenderer
-from bbfit.rendering.dispatch import render
 
 OnExport = Callable[[str, int, int], None]
 """Called with a kind of work (``"mip levels"``, ``"textures"``), the number of the finished parts and their total."""
@@ -119,13 +118,10 @@ class ShippedModel:
     def draw(self, camera: Camera, light: Light | None = None) -> Tensor:
         """Draw what the files show: premultiplied RGBA over nothing in [0, 1], [H, W, 4], or [V, H, W, 4] for a batch of cameras.
 
-        ``light`` is for a cloud with maps: that of each view, or one for all; by default the cloud's own. Without mip levels and maps the
-        polygons show what the cloud's renderer shows, but for the rounding of textures to 8 bits and the edges of what is not transparent
-        there; the renderer is faster and draws them, with one sample a pixel. Trimmed outlines cut off nothing visible.
+        ``light`` is for a cloud with maps: that of each view, or one for all; by default the cloud's own. See
+        :func:`~bbfit.rendering.cards.draw_cards`.
         """
-        if self.cloud.surface is not None or self.config.has_mips or self.halvings or self.config.mipmapped(self.cloud.alpha):
-            return self._renderer.draw(camera, light)
-        return render(self.cloud, camera.to(self.cloud.texels.device))
+        return self._renderer.draw(camera, light)
 
     def surfaces(self, camera: Camera) -> Tensor:
         """What the files show of the surfaces of a cloud with maps: see :meth:`~bbfit.rendering.cards.CardRenderer.surfaces`."""

@@ -168,21 +168,24 @@ def plan_chart(cloud: BillboardCloud) -> Chart:
 
 
 def sizes_chart(sizes: Sequence[SizeScore]) -> Chart:
-    """PSNR and coverage of the exported model in pictures of the views' size, half of it and so on."""
+    """PSNR and coverage of the exported model in pictures of the views' size, half of it and so on.
+
+    Dashed lines are those of a mask with alpha to coverage.
+    """
     figure = _figure(3.9, 2)
     panels = figure.subplots(2, 1, sharex=True)
     ticks = [f"{size.width}" if number == 0 else f"1/{round(sizes[0].width / size.width)}" for number, size in enumerate(sizes)]
-    places = list(range(len(sizes)))
-    panels[0].plot(places, [size.psnr for size in sizes], "o-", color=_ACCENT)
+    panels[1].axhline(1, color=_FAINT, linewidth=1, linestyle=":")
+    smooth = [size.antialiased for size in sizes if size.antialiased is not None]
+    for measures, style in (([size.measures for size in sizes], "o-"), (smooth, "o--")):
+        panels[0].plot(range(len(measures)), [one.psnr for one in measures], style, color=_ACCENT)
+        known = [(place, one.coverage) for place, one in enumerate(measures) if one.coverage is not None]
+        panels[1].plot([place for place, _ in known], [coverage for _, coverage in known], style, color=_ACCENT)
     panels[0].set_title("PSNR, dB", loc="left", fontsize=10, color=_INK, pad=9)
-    known = [(place, size.coverage) for place, size in zip(places, sizes, strict=True) if size.coverage is not None]
-    panels[1].axhline(1, color=_FAINT, linewidth=1, linestyle="--")
-    if known:
-        panels[1].plot(*zip(*known, strict=True), "o-", color=_ACCENT)
     low, high = panels[1].get_ylim()
     panels[1].set_ylim(min(low, 0.9), max(high, 1.1))
     panels[1].set_title("coverage, 1 is as much as the tree's", loc="left", fontsize=10, color=_INK, pad=9)
-    panels[1].set_xticks(places, ticks)
+    panels[1].set_xticks(range(len(sizes)), ticks)
     panels[1].set_xlabel("width of the pictures in pixels, and parts of it")
     for axes in panels:
         axes.margins(y=0.25)

@@ -103,9 +103,13 @@ def report_table(report: Report, title: str = "Held-out views", *, thesis: bool 
 
     if report.sizes:
         table.add_section()
-        table.add_row("as exported", "", "PSNR, dB", "", "coverage", "", style="bold")
-        for size in report.sizes:
-            table.add_row(f"{size.width} x {size.height} pixels", f"{_UP} {_ONE}", f"{size.psnr:.2f}", "", _share(size.coverage), "")
+        for title, each in (("as exported", "measures"), ("... with alpha to coverage", "antialiased")):
+            if getattr(report.sizes[0], each) is None:
+                continue
+            table.add_row(title, "", "PSNR, dB", "", "coverage", "", style="bold")
+            for size in report.sizes:
+                one = getattr(size, each)
+                table.add_row(f"{size.width} x {size.height} pixels", f"{_UP} {_ONE}", f"{one.psnr:.2f}", "", _share(one.coverage), "")
 
     if report.shimmer:
         table.add_section()

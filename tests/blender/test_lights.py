@@ -84,6 +84,20 @@ def test_a_picture_under_a_sun_is_that_of_a_render_with_that_sun(folder: Path, t
         assert got.mean() == pytest.approx(expected.mean(), rel=0.02)
 
 
+@pytest.mark.parametrize("size", [47, 48])
+def test_denoised_lights_stay_in_their_places(size: int, thing_glb: Path, tmp_path: Path) -> None:
+    """Only the part of a picture that is rendered is denoised. Moved by a pixel, it would differ much more from one with many samples."""
+    folders = []
+    for denoise, samples in ((True, 16), (False, 256)):
+        few = {"count": 4, "size": size, "suns": 1, "turned": 0, "denoise": denoise, "samples": samples, "training_samples": samples}
+        folders.append(render_views(thing_glb, tmp_path / f"{samples}", ViewsConfig(**SMALL | few)))
+    for kind in ("", "_ambient", "_sun0", "_sun1"):
+        got, expected = (np.stack([premultiplied(picture(folder, f"{n:04}{kind}")) for n in range(4)]) for folder in folders)
+        error = np.sqrt(np.mean((got - expected) ** 2))
+        moved = [np.sqrt(np.mean((np.roll(got, step, axis) - expected) ** 2)) for step in (-1, 1) for axis in (1, 2)]
+        assert error < 6 and error < min(moved) / 2, (kind, error, moved)
+
+
 def test_unit_lights_show_white_as_white_and_passes_show_what_surfaces_are(tmp_path: Path) -> None:
     """A white box under the sky is white. Its front is as bright under a sun as the cosine says. Normals are those of its sides, Z up."""
     trimesh.Scene([box((-1, 0, -1), (1, 2, 1), (255, 255, 255))]).export(str(tmp_path / "white.glb"))

@@ -75,11 +75,6 @@ def test_training_views_have_half_of_the_samples(given: dict[str, int], training
             assert (view != of_samples[other][int(name)]).any()
 
 
-def test_with_suns_training_views_have_all_samples() -> None:
-    """Each training camera sees a sun of its own once."""
-    assert ViewsConfig(samples=9).samples_of_training == 5 and ViewsConfig(samples=9, suns=1).samples_of_training == 9
-
-
 def test_only_the_part_of_a_picture_with_the_tree_is_rendered(thing_glb: Path, tmp_path: Path) -> None:
     """With three pixels around it at most. The rest is empty in the whole picture too, which is the same bit by bit."""
     corners = trimesh.load(str(thing_glb), force="mesh").vertices

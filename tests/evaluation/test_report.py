@@ -12,7 +12,7 @@ import pytest
 from bbfit.checks import InputError, MissingFileError
 from bbfit.evaluation.distances import Distances
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
-from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeScore, Subject, ViewScore, stage_seconds
+from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeMeasures, SizeScore, Subject, ViewScore, stage_seconds
 from bbfit.evaluation.trunk import TrunkScore, TrunkView
 
 
@@ -23,7 +23,10 @@ def score(name: str, scale: float, sharpness: float | None = 1.0) -> ViewScore:
     return ViewScore(name, 12.0, 0.0, measures, replace(measures, rgba=Rgba(0.05, 28 * scale, 0.8)))
 
 
-SIZES = (SizeScore(64, 48, 20.5, 1.01, 0.1), SizeScore(32, 24, 21.5, None, 0.09))
+SIZES = (
+    SizeScore(64, 48, SizeMeasures(20.5, 1.01, 0.1), SizeMeasures(21.5, 0.99, 0.08)),
+    SizeScore(32, 24, SizeMeasures(21.5, None, 0.09)),
+)
 SHIMMER = (ShimmerScore(64, 48, 0.02, 1.25, 0.9), ShimmerScore(32, 24, 0.0, None, None))
 TRUNK = TrunkScore((TrunkView("a", 0.9, 2.0), TrunkView("b", 0.5, None)))
 REPORT = Report(
@@ -105,7 +108,9 @@ def test_schema() -> None:
     for cost in ("vertices", "bytes"):
         assert set(content[cost]) == {"model", "original", "ratio"}
     assert content["views"][1]["sharpness"] is None
-    assert content["sizes"][0] == {"width": 64, "height": 48, "psnr": 20.5, "coverage": 1.01, "alpha": 0.1}
+    hard, smooth = ({"psnr": 20.5, "coverage": 1.01, "alpha": 0.1}, {"psnr": 21.5, "coverage": 0.99, "alpha": 0.08})
+    assert content["sizes"][0] == {"width": 64, "height": 48} | hard | {"antialiased": smooth}
+    assert content["sizes"][1]["antialiased"] is None
     assert content["shimmer"][0] == {"width": 64, "height": 48, "tree": 0.02, "ratio": 1.25, "antialiased": 0.9}
     assert content["trunk"]["worst_iou"] == 0.5 and content["trunk"]["worst_view"] == "b" and content["trunk"]["iou"] == 0.7
     assert replace(REPORT, trunk=None).to_json()["trunk"] is None

@@ -107,8 +107,8 @@ def test_one_sample_per_pixel_flickers_and_more_the_smaller_it_is_drawn() -> Non
 def test_report_has_the_shimmer_of_both_drawings_of_a_mask(pairs: TurnedViews, tmp_path: Path) -> None:
     mask, seen = replace(crossing_billboards(), alpha=AlphaMode("mask")), list[tuple[int, int]]()
     report = evaluate(mask, pairs.views, turned=pairs, on_progress=lambda done, total: seen.append((done, total)))
-    smooth = replace(mask, alpha=AlphaMode("mask", antialiased=True))
-    expected = score_shimmer(lambda camera: render(mask, camera), pairs, lambda camera: render(smooth, camera))
+    model = shipped_model(mask)
+    expected = score_shimmer(model.draw, pairs, model.antialiased().draw)
     assert report.shimmer == expected and all(score.antialiased for score in expected)
     assert seen[-1] == (9, 9) and [done for done, _ in seen] == sorted(done for done, _ in seen)
     report.save(tmp_path / "metrics.json")

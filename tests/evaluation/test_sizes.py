@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,8 @@ from torch import Tensor
 
 from bbfit.checks import InputError
 from bbfit.evaluation.backgrounds import BACKGROUNDS
-from bbfit.evaluation.sizes import score_sizes
+from bbfit.evaluation.report import SizeScore
+from bbfit.evaluation.sizes import Draw, score_sizes
 from bbfit.geometry.camera import Camera
 from bbfit.images import over_color, shrunk
 from bbfit.rendering.dispatch import render
@@ -45,9 +46,9 @@ def test_a_cloud_scores_full_marks_at_the_size_of_its_own_views(views: ViewSet) 
     cloud = crossing_billboards()
     scores = score_sizes(lambda camera: render(cloud, camera), views)
     assert [(score.width, score.height) for score in scores] == [(98, 70), (49, 35), (24, 17)]
-    assert scores[0].psnr > 60 and scores[0].alpha < 2e-3 and scores[0].coverage == pytest.approx(1, abs=1e-3)
+    assert scores[0].measures.psnr > 60 and scores[0].measures.alpha < 2e-3 and scores[0].measures.coverage == pytest.approx(1, abs=1e-3)
     for score in scores[1:]:
-        assert 20 < score.psnr < 60 and score.coverage == pytest.approx(1, abs=0.02)  # measured 33.0 and 28.0 dB, 0.2 %
+        assert 20 < score.measures.psnr < 60 and score.measures.coverage == pytest.approx(1, abs=0.02)  # measured 33.0 and 28.0 dB, 0.2 %
 
 
 def test_targets_are_means_by_area_of_premultiplied_display_values(views: ViewSet) -> None:
@@ -61,7 +62,7 @@ def test_targets_are_means_by_area_of_premultiplied_display_values(views: ViewSe
         return averaged(views, index, camera.width, camera.height).expand(len(camera), -1, -1, -1)
 
     for score in score_sizes(draw, views):
-        assert score.psnr == 120 and score.alpha < 1e-9 and score.coverage == pytest.approx(1, abs=1e-12)
+        assert score.measures.psnr == 120 and score.measures.alpha < 1e-9 and score.measures.coverage == pytest.approx(1, abs=1e-12)
     for size, moved in (((98, 70), [0]), ((49, 35), [0, 4]), ((24, 17), [0, 16])):
         shifts = torch.stack([camera.intrinsics for camera in asked if (camera.width, camera.height) == size])
         assert shifts.shape == (4, sum(moved) + 1, 3, 3)
@@ -85,7 +86,7 @@ def test_small_pictures_are_drawn_at_several_places_for_their_coverage(views: Vi
         middle = float(views.cameras.resized(score.width, score.height).intrinsics[0, 0, 2])
         columns = sum(math.ceil(middle + (part + 0.5) / parts - 0.5) for part in range(parts)) / parts
         wanted = sum(float(shrunk(views.targets([index], torch.float64)[0], score.width, score.height)[..., 3].sum()) for index in range(4))
-        assert score.coverage == pytest.approx(4 * columns * score.height / wanted)
+        assert score.measures.coverage == pytest.approx(4 * columns * score.height / wanted)
 
 
 def test_measures_are_those_of_known_differences(views: ViewSet) -> None:
@@ -94,14 +95,14 @@ def test_measures_are_those_of_known_differences(views: ViewSet) -> None:
     nothing = score_sizes(lambda camera: plain(camera, 0.0), views, 1)[1]
     colors = [torch.tensor(color).double() for color in BACKGROUNDS.values()]
     errors = torch.stack([(over_color(targets, color) - color).square().mean((1, 2, 3)) for color in colors])
-    assert nothing.coverage == 0 and nothing.alpha == pytest.approx(float(targets[..., 3].square().mean().sqrt()))
-    assert nothing.psnr == pytest.approx(float((-10 * errors.log10()).mean()))
+    assert nothing.measures.coverage == 0 and nothing.measures.alpha == pytest.approx(float(targets[..., 3].square().mean().sqrt()))
+    assert nothing.measures.psnr == pytest.approx(float((-10 * errors.log10()).mean()))
     haze = score_sizes(lambda camera: plain(camera, 0.25), views, 1)[1]
     hazes = torch.stack([(over_color(targets, color) - 0.25 - 0.75 * color).square().mean((1, 2, 3)) for color in colors])
-    assert haze.psnr == pytest.approx(float((-10 * hazes.log10()).mean()))
-    assert haze.coverage == pytest.approx(float(0.25 / targets[..., 3].mean()))
-    assert haze.alpha == pytest.approx(float((targets[..., 3] - 0.25).square().mean().sqrt()))
-    assert score_sizes(lambda camera: plain(camera, 7.0), views, 0)[0].coverage == pytest.approx(4 * haze.coverage)
+    assert haze.measures.psnr == pytest.approx(float((-10 * hazes.log10()).mean()))
+    assert haze.measures.coverage == pytest.approx(float(0.25 / targets[..., 3].mean()))
+    assert haze.measures.alpha == pytest.approx(float((targets[..., 3] - 0.25).square().mean().sqrt()))
+    assert score_sizes(lambda camera: plain(camera, 7.0), views, 0)[0].measures.coverage == pytest.approx(4 * haze.measures.coverage)
 
 
 def test_coverage_is_of_all_views_together(views: ViewSet) -> None:
@@ -113,12 +114,32 @@ def test_coverage_is_of_all_views_together(views: ViewSet) -> None:
         shown = torch.equal(camera.world_to_camera[0], pose) and camera.width == 49
         return target.expand(len(camera), -1, -1, -1) if shown else plain(camera, 0.0)
 
-    assert score_sizes(draw, views, 1)[1].coverage == pytest.approx(float(sums[2] / sums.sum()))
+    assert score_sizes(draw, views, 1)[1].measures.coverage == pytest.approx(float(sums[2] / sums.sum()))
 
 
 def test_scores_can_be_written_as_json(views: ViewSet) -> None:
-    score = score_sizes(lambda camera: plain(camera, 0.0), views, 0)[0]
-    assert json.loads(json.dumps(asdict(score), allow_nan=False)) == asdict(score) and (score.width, score.height) == (98, 70)
+    """With and without alpha to coverage."""
+    smooths: tuple[Draw | None, ...] = (None, lambda camera: plain(camera, 0.25))
+    for smooth in smooths:
+        score = score_sizes(lambda camera: plain(camera, 0.0), views, 0, antialiased=smooth)[0]
+        assert SizeScore.from_json(json.loads(json.dumps(score.to_json(), allow_nan=False))) == score
+        assert (score.width, score.height) == (98, 70) and (score.antialiased is None) == (smooth is None)
+
+
+def test_masks_have_measures_for_both_ways_of_drawing(views: ViewSet) -> None:
+    """Each is what the other way of drawing has on its own."""
+
+    def hard(camera: Camera) -> Tensor:
+        return plain(camera, 0.0)
+
+    def smooth(camera: Camera) -> Tensor:
+        return plain(camera, 0.25)
+
+    both = score_sizes(hard, views, 1, antialiased=smooth)
+    alone = [score_sizes(draw, views, 1) for draw in (hard, smooth)]
+    assert [score.measures for score in both] == [score.measures for score in alone[0]]
+    assert [score.antialiased for score in both] == [score.measures for score in alone[1]]
+    assert all(score.antialiased is None for score in alone[0])
 
 
 @pytest.mark.parametrize("size", [(98, 70), (97, 1), (24, 17), (1, 1)])

@@ -12,7 +12,7 @@ import torch
 
 from bbfit.checks import InputError
 from bbfit.evaluation.measures import Over, OverBackground
-from bbfit.evaluation.report import SizeScore, ViewScore
+from bbfit.evaluation.report import SizeMeasures, SizeScore, ViewScore
 from bbfit.evaluation.scoring import measure
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.reporting.charts import FEW, Chart, azimuth_chart, billboard_color, loss_chart, plan_chart, sizes_chart, times_chart, worst_views
@@ -91,7 +91,7 @@ def test_the_plan_numbers_a_few_billboards_and_shows_many(known_cloud: Billboard
 
 
 def test_colors_are_the_pages(known_cloud: BillboardCloud) -> None:
-    sizes = [SizeScore(64 >> n, 64 >> n, 20.0 + n, None if n else 1.1, 0.1) for n in range(3)]
+    sizes = [SizeScore(64 >> n, 64 >> n, SizeMeasures(20.0 + n, None if n else 1.1, 0.1)) for n in range(3)]
     charts = [azimuth_chart(scores((20, 0.9, 0.1))), plan_chart(known_cloud), sizes_chart(sizes), loss_chart([3.0, 2.0, float("nan"), 1.0])]
     charts.append(times_chart({"views": 3.0, "fit": 1.0}))
     for chart in charts:

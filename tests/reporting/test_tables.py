@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
-from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeScore, ViewScore
+from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeMeasures, SizeScore, ViewScore
 from bbfit.evaluation.trunk import TrunkScore, TrunkView
 from bbfit.reporting.tables import report_table
 
@@ -25,7 +25,7 @@ REPORT = Report(
     Cost(32, 10_525_153),
     Cost(123_456, None),
     {"views": 1234.56, "fit": 60, "export": 0.4, "evaluate": 15.04},
-    sizes=(SizeScore(1024, 1024, 19.87, 1.012, 0.1),),
+    sizes=(SizeScore(1024, 1024, SizeMeasures(19.87, 1.012, 0.1), SizeMeasures(20.76, 0.976, 0.1)),),
     shimmer=(ShimmerScore(512, 384, 0.02, 1.2345, 0.987), ShimmerScore(256, 192, 0.0, None, None)),
     trunk=TrunkScore((TrunkView("0000", 0.9312, 2.5), TrunkView("0001", 0.8512, 1.5))),
 )
@@ -38,7 +38,7 @@ def test_every_figure_is_there_and_nothing_is_cut(width: int) -> None:
         console.print(report_table(REPORT, "willow"))
     text = capture.get()
     for figure in (
-        "willow: mean of 2", "18.23", "0.7375", "0.1811", "0.00", "1.000", "0.800", "19.87", "1.012", "0.8912, 0.8512",
+        "willow: mean of 2", "18.23", "0.7375", "0.1811", "0.00", "1.000", "0.800", "19.87", "1.012", "20.76", "0.976", "0.8912, 0.8512",
         "21.23", "23.46", "92.605", "0.0712", "2.24e-05", "0.8125", "0.9999966", "17.280", "0.1061", "0.7345",
         "1.234", "0.987", "0.900", "10,525,153", "0.000304 %", "123,456", "views 1,234.6", "evaluate 15.0",
     ):  # fmt: skip
