@@ -39,7 +39,7 @@ def test_a_cloud_scores_full_marks_on_its_own_views(tmp_path: Path) -> None:
     Rims are transparent and of one color, because fits and files differ in the colors that they mix in beyond a rim.
     """
     cloud = crossing_billboards()
-    texels = torch.full((2, 12, 8, 4), 128 / 255)
+    texels = torch.tensor([128 / 255, 0.2, 0.6, 1.0]).repeat(2, 12, 8, 1)
     texels[:, [0, -1], :, 3], texels[:, :, [0, -1], 3] = 0, 0
     texels[:, 2:-2, 2:-2] = cloud.texels.unflatten(0, (2, 12, 8))[:, 2:-2, 2:-2]
     cloud = cloud.with_texels(texels.flatten(0, 2))
