@@ -23,7 +23,7 @@ VERSIONS: Mapping[str, int] = {
     "views": 8,
     "budget": 12,
     "fit": 27,
-    "export": 16,
+    "export": 17,
     "evaluate": 19,
     "report": 12,
     "lod": 10,

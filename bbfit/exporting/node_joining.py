@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +16,6 @@ from bbfit.exporting.visibility import Overlaps, Rig
 _AT_ONCE, _TRIED = 0.2, 3
 # Rounds of changes of cards, orders and origins at the end.
 _ROUNDS = 3
-# Numbers that are computed at once.
-_CHUNK = 1 << 22
 
 
 def joined(overlaps: Overlaps, layers: Layers, cameras: Rig, nodes: int) -> Layers:
@@ -58,7 +57,7 @@ def _with_pairs_joined(overlaps: Overlaps, layers: Layers, cameras: Rig, most: i
         return order_cost(own, drawing_order(own))
 
     alone = [inside(members) for members in faces]
-    change = _moved(overlaps.grouped(np.repeat(node, 2)), node_keys(cameras, layers))
+    change = moving_costs(overlaps.grouped(np.repeat(node, 2)), node_keys(cameras, layers))
     costs = []
     for at in np.argsort(change, axis=None, kind="stable")[: _TRIED * count].tolist():
         moved, kept = divmod(at, count)
@@ -74,22 +73,27 @@ def _with_pairs_joined(overlaps: Overlaps, layers: Layers, cameras: Rig, most: i
     return Layers(target[node], layers.order, layers.origins[left])
 
 
-def _moved(between: Overlaps, keys: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How the wrong share changes if a node is sorted by the origin of another, without their own overlaps, [K, K]; inf on the diagonal."""
+def moving_costs(between: Overlaps, keys: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How the wrong share changes if a node is sorted by the origin of another, and both no longer overlap, [K, K]; inf on the diagonal.
+
+    ``between`` are overlaps of nodes, one for each camera and pair, ordered by camera; ``keys`` are those of the nodes, [2, V, K], from
+    which the farther is drawn first.
+    """
     count = keys.shape[-1]
     change = np.zeros((count, count))
-    rows = max(1, _CHUNK // count)
-    for start in range(0, len(between.weight), rows):
-        part = between.take(np.arange(start, min(start + rows, len(between.weight))))
-        line, half = np.arange(len(part.weight)), part.weight[:, None] / 2
-        for key in keys[:, part.camera]:
-            front, back = key[line, part.front], key[line, part.back]
-            as_front, as_back = half * (key >= back[:, None]), half * (front[:, None] >= key)
-            as_front[line, part.back] = as_back[line, part.front] = 0.0
-            now = half * (front >= back)[:, None]
-            for group, wrong in ((part.front, as_front - now), (part.back, as_back - now)):
-                order = np.argsort(group, kind="stable")
-                first = np.flatnonzero(np.diff(group[order], prepend=-1))
-                change[group[order][first]] += np.add.reduceat(wrong[order], first)
+    starts = np.searchsorted(between.camera, np.arange(keys.shape[1] + 1))
+    for camera, (start, end) in enumerate(itertools.pairwise(starts.tolist())):
+        front, back, half = between.front[start:end], between.back[start:end], between.weight[start:end] / 2
+        for key in keys[:, camera]:
+            places, rank = np.unique(key, return_inverse=True)
+            # Sums of the overlaps with nodes that are drawn after each place, and at it: of a node in front they come to be wrong, and with
+            # those that are drawn before it, of a node behind.
+            size = (count, len(places))
+            as_front = np.bincount(front * size[1] + rank[back], half, count * size[1]).reshape(size).cumsum(1)
+            as_back = np.bincount(back * size[1] + rank[front], half, count * size[1]).reshape(size)[:, ::-1].cumsum(1)[:, ::-1]
+            now = half * (key[front] >= key[back])
+            change += (as_front + as_back)[:, rank] - (np.bincount(front, now, count) + np.bincount(back, now, count))[:, None]
+            change[front, back] -= half
+            change[back, front] -= half
     np.fill_diagonal(change, np.inf)
     return change

@@ -138,17 +138,21 @@ def sample_visibility(cards: Cards, cameras: Rig, across: int = 32) -> Visibilit
     for number, card in enumerate(largest.values()):
         middle, at = card.corners.mean(0), texel_corners(cards, card)
         to_texel = np.linalg.pinv(card.corners - middle) @ (at - at.mean(0))
-        normal, facing = card.normal, (eyes - middle) @ card.normal
+        facing, start = (eyes - middle) @ card.normal, (eyes - middle) @ to_texel + at.mean(0)
+        along, right, down = np.moveaxis(rays @ np.column_stack([card.normal, to_texel]), -1, 0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = -facing[:, None] / (rays @ normal)
-            places = (((eyes - middle) @ to_texel)[:, None] + t[..., None] * (rays @ to_texel)) + at.mean(0)
+            t = -facing[:, None] / along
+            x, y = start[:, :1] + t * right, start[:, 1:] + t * down
         others = [other for other in cards.cards if other.rectangle == card.rectangle]
-        from_behind = any(not other.culled or other.normal @ normal < 0 for other in others)
-        shown = (t > 0) & np.isfinite(t) & (facing != 0 if from_behind else facing > 0)[:, None]
-        opacity = np.where(shown, bilinear(rimmed_alpha(cards, card.rectangle), places), 0.0)
-        ray = np.flatnonzero(opacity > 0)
-        values = (part[ray].astype(np.float32) for part in (t.ravel(), opacity.ravel(), places.reshape(-1, 2)))
-        hits.append((np.full(len(ray), number), ray, *values))
+        from_behind = any(not other.culled or other.normal @ card.normal < 0 for other in others)
+        alpha = rimmed_alpha(cards, card.rectangle)
+        height, width = alpha.shape
+        met = (t > 0) & (x > -1) & (x < width - 2) & (y > -1) & (y < height - 2) & (facing != 0 if from_behind else facing > 0)[:, None]
+        ray = np.flatnonzero(met)
+        points = np.stack([x.ravel()[ray], y.ravel()[ray]], -1)
+        opacity = bilinear(alpha, points)
+        values = (part[opacity > 0].astype(np.float32) for part in (t.ravel()[ray], opacity, points))
+        hits.append((np.full(int((opacity > 0).sum()), number), ray[opacity > 0], *values))
     sheet, ray, depth, alpha, points = (np.concatenate(parts) for parts in zip(*hits, strict=True))
     return _paired(cameras, cell, across, np.array(list(largest))[sheet], points, ray, depth, alpha)
 

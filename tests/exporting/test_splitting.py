@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from bbfit.checks import InputError
 from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.layers import Misordered, card_layers, drawing_order, misordered, order_cost
+from bbfit.exporting.node_joining import moving_costs
 from bbfit.exporting.splitting import centered, split
+from bbfit.exporting.visibility import Overlaps
 from bbfit.geometry.camera import Camera, look_at
 from bbfit.geometry.cards import Card, Cards
 from bbfit.geometry.cloud import BillboardCloud, even_upright
@@ -215,6 +217,26 @@ def test_few_nodes_draw_many_pieces_in_the_right_order(nodes: int) -> None:
     assert misordered(few, cameras()).mean <= WRONG
     assert max(difference(cards, few, key) for key in ("depth", "distance")) < 5e-4
     assert misordered(split(cards, WRONG, most=12, nodes=1), cameras()).mean > 0.02
+
+
+def test_costs_of_moving_nodes_are_those_of_each_move() -> None:
+    """Each node gets the keys of each other in turn. Nodes of equal keys are drawn in the wrong order."""
+    rng = np.random.default_rng(4)
+    pairs = rng.integers(0, 6, (200, 3))
+    between = Overlaps(pairs[:, 0] % 5, pairs[:, 1], pairs[:, 2], rng.random(200)).grouped(np.arange(6))
+    keys = rng.integers(0, 4, (2, 5, 6)).astype(np.float64)
+
+    def wrong(keys: NDArray[np.float64], rows: NDArray[np.bool_]) -> float:
+        part = between.take(rows)
+        return float(sum((part.weight * (key[part.camera, part.front] >= key[part.camera, part.back])).sum() for key in keys)) / 2
+
+    costs = moving_costs(between, keys)
+    assert np.isinf(np.diag(costs)).all()
+    for moved, kept in itertools.permutations(range(6), 2):
+        changed = keys.copy()
+        changed[:, :, moved] = keys[:, :, kept]
+        others = ~(np.isin(between.front, (moved, kept)) & np.isin(between.back, (moved, kept)))
+        assert costs[moved, kept] == pytest.approx(wrong(changed, others) - wrong(keys, np.full(len(others), True)))
 
 
 def test_an_order_without_circles_is_found() -> None:
