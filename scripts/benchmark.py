@@ -24,7 +24,8 @@ levels    for each folder of views: milliseconds of a step at each resolution of
 start     starting up: ``bbfit --help`` and ``import bbfit`` (medians of five), and a fit of two steps and the first step of a fit, with an
           empty and with a filled cache of compiled kernels; only with ``--only start``
 cards     drawing the model of a short default fit as programs show it, by torch and by the kernel: four cameras, medians of five; with
-          alpha to coverage also by the kernel with one sample a pixel; and filling the gaps of its texture; only with ``--only cards``
+          alpha to coverage also by the kernel with one sample a pixel; filling the gaps of its texture; and splitting it for programs that
+          sort nodes; only with ``--only cards``
 render    the default views of a grown aspen, with all samples for training views, with the default number, and under a sun for each; only
           with ``--only render``
 run       the stages of ``bbfit run`` without a tree and without options; only with ``--only run``
@@ -61,9 +62,11 @@ import torch
 from torch.nn.functional import interpolate
 
 import bbfit
+from bbfit.exporting.cards import cloud_cards
 from bbfit.exporting.gaps import with_filled_gaps
 from bbfit.exporting.mips import plain_chain
 from bbfit.exporting.model import shipped_model
+from bbfit.exporting.splitting import split
 from bbfit.fitting import fused_pass
 from bbfit.fitting.config import ResolvedFit
 from bbfit.fitting.initialize import random_textures, start_cloud
@@ -441,8 +444,10 @@ def cards() -> list[Row]:
     model = shipped_model(bbfit.fit(views, bbfit.FitConfig(steps=100)).cloud)
     empty = shipped_model(model.cloud, bbfit.ExportConfig(mipmaps=False)).cards
     empty = replace(empty, chain=tuple(plain_chain(empty.atlas.image)))
-    seconds = seconds_of(lambda: with_filled_gaps(empty), torch.device("cpu"))
-    rows.append({"name": "cards", "what": "gaps", "cards": len(empty.cards), "seconds": round(seconds, 2)})
+    whole = cloud_cards(replace(model.cloud, alpha=BLEND), model.config.padding)
+    for what, work in (("gaps", partial(with_filled_gaps, empty)), ("split", partial(split, whole))):
+        seconds = seconds_of(work, torch.device("cpu"))
+        rows.append({"name": "cards", "what": what, "cards": len(empty.cards), "seconds": round(seconds, 2)})
     for antialiased in (False, True):
         shown = replace(model.cards, alpha=replace(model.cards.alpha, antialiased=antialiased))
         renderers = {name: CardRenderer(shown, backend=name) for name in ("reference", "fused")}

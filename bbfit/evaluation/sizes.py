@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -49,36 +50,39 @@ def score_sizes(
     if len(views) == 0:
         fail("views", "there is no held-out view to measure on", "give views with a test split")
     metrics.check_size(views.cameras.width, views.cameras.height)
-    scores = []
+    scores, draws = [], [draw] if antialiased is None else [draw, antialiased]
     for halving in range(halvings + 1):
         width, height = views.cameras.width >> halving, views.cameras.height >> halving
         if min(width, height) >= metrics.SSIM_WINDOW:
-            smooth = None if antialiased is None else _measures(antialiased, views, halving, width, height)
-            scores.append(SizeScore(width, height, _measures(draw, views, halving, width, height), smooth))
+            scores.append(SizeScore(width, height, *_measures(draws, views, halving, width, height)))
         if on_size is not None:
             on_size(halving + 1, halvings + 1)
     return tuple(scores)
 
 
-def _measures(draw: Draw, views: ViewSet, halving: int, width: int, height: int) -> SizeMeasures:
-    cameras = views.cameras.resized(width, height)
-    psnrs, squares, render_cover, target_cover = [], [], 0.0, 0.0
+def _measures(draws: Sequence[Draw], views: ViewSet, halving: int, width: int, height: int) -> list[SizeMeasures]:
+    cameras, target_cover = views.cameras.resized(width, height), 0.0
+    errors: list[list[tuple[float, float, float]]] = [[] for _ in draws]
     for index, name in enumerate(views.names):
         target = shrunk(views.targets([index], torch.float64)[0], width, height)
-        batch = _shifted(cameras[index], min(halving, 2))
-        with torch.no_grad():
-            images = draw(batch).detach().cpu().double()
-        check_shape(f"the render of view {name}", tuple(images.shape), (len(batch), height, width, 4))
-        if not images.isfinite().all():
-            fail("draw", f"returned values that are not finite for view {name} at {width} x {height} pixels", "check the model")
-        centered, *shifted = images.clamp(0, 1)
-        psnrs.append(mean_psnr(target, centered))
-        squares.append(metrics.mean_squared_error(target[..., 3].numpy(), centered[..., 3].numpy()))
-        covers = [float(image[..., 3].sum()) for image in shifted or [centered]]
-        render_cover += sum(covers) / len(covers)
         target_cover += float(target[..., 3].sum())
-    mean_square = sum(squares) / len(views)
-    return SizeMeasures(sum(psnrs) / len(views), render_cover / target_cover if target_cover else None, mean_square**0.5)
+        batch = _shifted(cameras[index], min(halving, 2))
+        for own, draw in zip(errors, draws, strict=True):
+            with torch.no_grad():
+                images = draw(batch).detach().cpu()
+            check_shape(f"the render of view {name}", tuple(images.shape), (len(batch), height, width, 4))
+            if not images.isfinite().all():
+                fail("draw", f"returned values that are not finite for view {name} at {width} x {height} pixels", "check the model")
+            centered, *shifted = images.clamp(0, 1)
+            square = metrics.mean_squared_error(target[..., 3].numpy(), centered[..., 3].numpy())
+            covers = [float(image[..., 3].double().sum()) for image in shifted or [centered]]
+            own.append((mean_psnr(target, centered), square, sum(covers) / len(covers)))
+    measures = []
+    for own in errors:
+        psnr, square, cover = np.mean(own, 0).tolist()
+        coverage = cover * len(views) / target_cover if target_cover else None
+        measures.append(SizeMeasures(psnr, coverage, square**0.5))
+    return measures
 
 
 def _shifted(camera: Camera, halvings: int) -> Camera:
