@@ -31,7 +31,9 @@ from bbfit.trees.config import GrowConfig
 from bbfit.views.dataset import ViewDataset
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
-STAGES = RunConfig(views=ViewsConfig(count=8, size=64, samples=2, denoise=False), fit=FitConfig(steps=40, placement="even"))
+STAGES = RunConfig(
+    views=ViewsConfig(count=8, size=64, samples=2, training_samples=2, denoise=False), fit=FitConfig(steps=40, placement="even")
+)
 SMALL = CompareConfig(
     billboards=3,
     few=2,
