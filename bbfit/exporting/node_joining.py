@@ -86,8 +86,7 @@ def moving_costs(between: Overlaps, keys: NDArray[np.float64]) -> NDArray[np.flo
         front, back, half = between.front[start:end], between.back[start:end], between.weight[start:end] / 2
         for key in keys[:, camera]:
             places, rank = np.unique(key, return_inverse=True)
-            # Sums of the overlaps with nodes that are drawn after each place, and at it: of a node in front they come to be wrong, and with
-            # those that are drawn before it, of a node behind.
+            # What each place makes wrong: overlaps with nodes behind that have no larger key, and with nodes in front that have no smaller.
             size = (count, len(places))
             as_front = np.bincount(front * size[1] + rank[back], half, count * size[1]).reshape(size).cumsum(1)
             as_back = np.bincount(back * size[1] + rank[front], half, count * size[1]).reshape(size)[:, ::-1].cumsum(1)[:, ::-1]
