@@ -35,6 +35,7 @@ sys.path[:0] = [str(TESTS), str(TESTS / "viewers")]
 from blender_viewer import render_blender  # noqa: E402
 from browser import open_browser  # noqa: E402
 from browser_viewer import open_program, version_of  # noqa: E402
+from eevee import draw_as_eevee  # noqa: E402
 
 import bbfit  # noqa: E402
 from bbfit.evaluation.metrics import psnr  # noqa: E402
@@ -151,9 +152,12 @@ def measure(views: Path, run: Path, every: int, reduction: int, programs: list[s
         if same not in models:
             models[same] = shipped_model(cloud, config)
         model = models[same]
-        if (drawn := (same, program.smooth)) not in drawings:
+        if (drawn := (same, program.smooth, name == EEVEE)) not in drawings:
             alpha = replace(model.cloud.alpha, antialiased=program.smooth and cloud.alpha.kind == "mask")
-            drawing = draw_cards(replace(model.cards, alpha=alpha), camera, light, multisampled=program.smooth)
+            cards = replace(model.cards, alpha=alpha)
+            drawing = (
+                draw_as_eevee(cards, camera, light) if name == EEVEE else draw_cards(cards, camera, light, multisampled=program.smooth)
+            )
             drawings[drawn] = over_color(drawing.double().clamp(0, 1)).numpy()
         own = drawings[drawn]
         with tempfile.TemporaryDirectory() as folder:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,11 +14,13 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.light import Light
-from bbfit.operators.cards.sampling import filtered
+from bbfit.operators.cards.sampling import MipChain, filtered
 from bbfit.operators.cards.sheets import CENTER, SAMPLES, SLACK, PreparedCards, Sheets, seen_axes, seen_sheets
 from bbfit.operators.drawing.compositing import composite_fragments, coverage, covered_samples, opacity, thresholds
 from bbfit.operators.shading.reference import decode, encode
 
+Sampler = Callable[[MipChain, Tensor, Tensor], Tensor]
+"""As :func:`~bbfit.operators.cards.sampling.filtered`."""
 # Most pixels that are compared with polygons at once, and of cameras that are drawn together.
 _AT_ONCE, _TOGETHER = 1 << 21, 1 << 18
 
@@ -47,16 +49,16 @@ class Hits:
     """From a pixel (x, y, 1) to homogeneous texture coordinates of each sheet in each camera, [V, S, 3, 3]."""
 
 
-def draw_cards_reference(prepared: PreparedCards, camera: Camera, light: Light | None = None) -> Tensor:
+def draw_cards_reference(prepared: PreparedCards, camera: Camera, light: Light | None = None, sample: Sampler = filtered) -> Tensor:
     """Draw cards for V cameras: premultiplied RGBA in [0, 1], float32 [V, H, W, 4], as :func:`~bbfit.rendering.cards.draw_cards`.
 
-    ``light``, for cards with maps, is that of each view, or one for all. Without it they show their base color.
+    ``light``, for cards with maps, is that of each view, or one for all. Without it they show their base color. ``sample`` reads textures.
     """
     together = 1 if light is not None else max(1, _TOGETHER // (camera.width * camera.height))
     pictures = list[Tensor]()
     for index in range(0, len(camera), together):
         some = camera[index : index + together]
-        met, straight = shown(prepared, some)
+        met, straight = shown(prepared, some, sample)
         colors = straight[:, :3]
         if light is not None:
             axes, own = seen_axes(prepared.sheets, some)[0, met.sheet], light[[index if len(light) > 1 else 0]]
@@ -65,10 +67,10 @@ def draw_cards_reference(prepared: PreparedCards, camera: Camera, light: Light |
     return torch.cat(pictures)
 
 
-def shown(prepared: PreparedCards, camera: Camera) -> tuple[Hits, Tensor]:
+def shown(prepared: PreparedCards, camera: Camera, sample: Sampler = filtered) -> tuple[Hits, Tensor]:
     """The places that cameras see, and the filtered values of the atlas there, [M, C]."""
     met = hits(prepared.cards, prepared.sheets, camera, multisampled=prepared.multisampled)
-    return met, filtered(prepared.levels, met.uv, met.detail) / 255
+    return met, sample(prepared.levels, met.uv, met.detail) / 255
 
 
 def composited(values: Tensor, alphas: Tensor, met: Hits, prepared: PreparedCards, camera: Camera) -> Tensor:
