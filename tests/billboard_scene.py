@@ -27,6 +27,16 @@ def crossing_billboards(count: int = 2) -> BillboardCloud:
     return cloud.with_texels(torch.rand(cloud.texels.shape, generator=torch.Generator().manual_seed(1)))
 
 
+def framed_billboards() -> BillboardCloud:
+    """The crossing billboards with transparent rims of one color, so that files show what fits draw: they mix in other colors beyond rims,
+    and samples of a pixel smooth an outline that is not transparent."""
+    cloud = crossing_billboards()
+    texels = torch.tensor([128 / 255, 0.2, 0.6, 1.0]).repeat(2, 12, 8, 1)
+    texels[:, [0, -1], :, 3], texels[:, :, [0, -1], 3] = 0, 0
+    texels[:, 2:-2, 2:-2] = cloud.texels.unflatten(0, (2, 12, 8))[:, 2:-2, 2:-2]
+    return cloud.with_texels(texels.flatten(0, 2))
+
+
 def column(light: Light, color: tuple[float, float, float] = (0.6, 0.5, 0.3)) -> BillboardCloud:
     """A billboard that looks to +Z, 2 x 3 meters, of one color, with the normals of an upright cylinder: at its left they point left."""
     plane = even_upright(1, axis=torch.tensor([0.0, 1.5, 0.0]), half_extents=torch.tensor([1.0, 1.5]), texture_sizes=torch.tensor([48, 36]))

@@ -27,7 +27,7 @@ from bbfit.blender.request import RenderedTree, ViewsRequest
 from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
-from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeScore, ViewScore
+from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeMeasures, SizeScore, ViewScore
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import LodLevel
 from bbfit.exporting.model import shipped_model
@@ -483,7 +483,9 @@ def _report() -> dict[str, Any]:
     colour = Colour((1.0, 2.0, 0.5, 4.0), (1.0, 1.5, 0.5, 4.0), (0.5, 1.0, 0.2, 2.0), (0.4, 0.9, 0.2, 2.0))
     measures = Measures(Over(over, over, over, over), Rgba(0.1, 20.0, 0.9), ThesisScale(0.1, 0.9, 90.0, 10.0), colour, 0.9, None)
     scores = tuple(ViewScore(name, 90.0, 0.0, measures) for name in ("0001", "0002"))
-    report = Report(scores, Cost(8, 1000), Cost(1000, 10_000), {"fit": 1.0}, small_cloud().alpha, 1.5, (SizeScore(8, 8, 30.0, None, 0.1),))
+    report = Report(
+        scores, Cost(8, 1000), Cost(1000, 10_000), {"fit": 1.0}, small_cloud().alpha, 1.5, (SizeScore(8, 8, SizeMeasures(30.0, None, 0.1)),)
+    )
     report = replace(report, shimmer=(ShimmerScore(8, 8, 0.1, 1.2, None),))
     return report.to_json()
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from billboard_scene import crossing_billboards, write_views
+from billboard_scene import crossing_billboards, framed_billboards, write_views
 
 from bbfit.budget.choice import Choice
 from bbfit.budget.trials import Trial
@@ -55,7 +55,7 @@ def test_comparison_holds_the_pictures_unchanged(tmp_path: Path, width: int) -> 
 
 def test_comparison_of_equal_pictures_has_a_black_difference(tmp_path: Path) -> None:
     """Rounding to bytes stays within a FLIP of 0.03 (measured 0.024): magma's first shades, (0, 0, 4) to (3, 3, 16)."""
-    cloud = crossing_billboards()
+    cloud = framed_billboards()
     views = write_views(tmp_path, cloud, width=240, height=200).test
     comparison_picture(shipped_model(cloud, ExportConfig(mipmaps=False)), views, tmp_path / "out.png", count=1)
     sheet = read(tmp_path / "out.png").astype(int)
