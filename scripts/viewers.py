@@ -74,7 +74,9 @@ class Program:
         return version_of(self.page) if self.page else metadata.version("bpy")
 
 
-AS_IT_COMES, EEVEE = "Cycles as it comes", "EEVEE"
+AS_IT_COMES = "Cycles as it comes"
+# Compared with bbfit's drawing for Blender, which is that of Cycles, and with a drawing that reads and lights textures as EEVEE does.
+EEVEE, OWN_EEVEE = "EEVEE", "EEVEE, from its own drawing"
 # By the name in the table.
 PROGRAMS = {
     "three.js": Program("three", lights=True),
@@ -90,7 +92,8 @@ PROGRAMS = {
     "Filament, smooth edges": Program("filament", smooth=True),
     "Cycles": Program(None, lights=True),
     AS_IT_COMES: Program(None, lights=True),
-    EEVEE: Program(None, lights=True, mipmaps=True),
+    EEVEE: Program(None, lights=True),
+    OWN_EEVEE: Program(None, lights=True, mipmaps=True),
 }
 NOT_TRIED = ("Godot 4", "Unity", "Unreal")
 # Cycles chooses at random whether a path passes a layer that is half transparent.
@@ -106,7 +109,9 @@ def shown(name: str, glb: Path, camera: Camera, light: Light | None, alpha: str,
     if program.page:
         with open_program(*browser, program.page, program.query) as viewer:
             return viewer.render(glb, camera, light=light)
-    return render_blender(glb, camera, samples=SAMPLES[alpha], light=light, as_it_comes=name == AS_IT_COMES, eevee=name == EEVEE)
+    return render_blender(
+        glb, camera, samples=SAMPLES[alpha], light=light, as_it_comes=name == AS_IT_COMES, eevee=name in (EEVEE, OWN_EEVEE)
+    )
 
 
 def held_out(views: Path, cloud: bbfit.BillboardCloud, every: int, reduction: int) -> tuple[Camera, Light | None, Pictures]:
@@ -152,12 +157,13 @@ def measure(views: Path, run: Path, every: int, reduction: int, programs: list[s
         if same not in models:
             models[same] = shipped_model(cloud, config)
         model = models[same]
-        if (drawn := (same, program.smooth, name == EEVEE)) not in drawings:
+        if (drawn := (same, program.smooth)) not in drawings:
             alpha = replace(model.cloud.alpha, antialiased=program.smooth and cloud.alpha.kind == "mask")
             cards = replace(model.cards, alpha=alpha)
-            drawing = (
-                draw_as_eevee(cards, camera, light) if name == EEVEE else draw_cards(cards, camera, light, multisampled=program.smooth)
-            )
+            if name == OWN_EEVEE:
+                drawing = draw_as_eevee(cards, camera, light)
+            else:
+                drawing = draw_cards(cards, camera, light, multisampled=program.smooth)
             drawings[drawn] = over_color(drawing.double().clamp(0, 1)).numpy()
         own = drawings[drawn]
         with tempfile.TemporaryDirectory() as folder:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -11,14 +9,13 @@ from torch import Tensor
 from bbfit.checks import check_shape, fail
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
 from bbfit.evaluation.report import ShimmerScore
+from bbfit.evaluation.sizes import Draw
 from bbfit.geometry.camera import Camera
 from bbfit.images import shrunk
 from bbfit.views.dataset import TurnedViews
 
 SIDES = (512, 256, 128, 64, 32)
 """Longer sides of the pictures in pixels; those longer than the views' are left out."""
-
-Draw = Callable[[Camera], Tensor]
 
 
 def score_shimmer(draw: Draw, pairs: TurnedViews, antialiased: Draw | None = None) -> tuple[ShimmerScore, ...]:

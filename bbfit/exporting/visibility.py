@@ -148,11 +148,11 @@ def sample_visibility(cards: Cards, cameras: Rig, across: int = 32) -> Visibilit
         alpha = rimmed_alpha(cards, card.rectangle)
         height, width = alpha.shape
         met = (t > 0) & (x > -1) & (x < width - 2) & (y > -1) & (y < height - 2) & (facing != 0 if from_behind else facing > 0)[:, None]
-        ray = np.flatnonzero(met)
-        points = np.stack([x.ravel()[ray], y.ravel()[ray]], -1)
+        points = np.stack([x[met], y[met]], -1)
         opacity = bilinear(alpha, points)
-        values = (part[opacity > 0].astype(np.float32) for part in (t.ravel()[ray], opacity, points))
-        hits.append((np.full(int((opacity > 0).sum()), number), ray[opacity > 0], *values))
+        seen = opacity > 0
+        values = (part[seen].astype(np.float32) for part in (t[met], opacity, points))
+        hits.append((np.full(int(seen.sum()), number), np.flatnonzero(met)[seen], *values))
     sheet, ray, depth, alpha, points = (np.concatenate(parts) for parts in zip(*hits, strict=True))
     return _paired(cameras, cell, across, np.array(list(largest))[sheet], points, ray, depth, alpha)
 
