@@ -10,7 +10,7 @@ from torch import Tensor
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.light import Light
-from bbfit.operators.cards.reference import draw_cards_reference
+from bbfit.operators.cards.reference import draw_cards_by
 from bbfit.operators.cards.sampling import MipChain, footprint, sampled
 from bbfit.operators.cards.sheets import prepared_cards
 from bbfit.operators.shading.reference import decode, encode
@@ -27,7 +27,7 @@ def draw_as_eevee(cards: Cards, camera: Camera, light: Light | None = None) -> T
     and by the whole sky, where Cycles lights the visible side. Like Cycles it ignores occlusion.
     """
     prepared = prepared_cards(replace(cards, traced=False), multisampled=False)
-    return draw_cards_reference(prepared, camera.batch(), light, _sampled)
+    return draw_cards_by(_sampled, prepared, camera.batch(), light)
 
 
 def _sampled(levels: MipChain, uv: Tensor, detail: Tensor) -> Tensor:

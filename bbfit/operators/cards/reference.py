@@ -49,11 +49,16 @@ class Hits:
     """From a pixel (x, y, 1) to homogeneous texture coordinates of each sheet in each camera, [V, S, 3, 3]."""
 
 
-def draw_cards_reference(prepared: PreparedCards, camera: Camera, light: Light | None = None, sample: Sampler = filtered) -> Tensor:
+def draw_cards_reference(prepared: PreparedCards, camera: Camera, light: Light | None = None) -> Tensor:
     """Draw cards for V cameras: premultiplied RGBA in [0, 1], float32 [V, H, W, 4], as :func:`~bbfit.rendering.cards.draw_cards`.
 
-    ``light``, for cards with maps, is that of each view, or one for all. Without it they show their base color. ``sample`` reads textures.
+    ``light``, for cards with maps, is that of each view, or one for all. Without it they show their base color.
     """
+    return draw_cards_by(filtered, prepared, camera, light)
+
+
+def draw_cards_by(sample: Sampler, prepared: PreparedCards, camera: Camera, light: Light | None = None) -> Tensor:
+    """:func:`draw_cards_reference` as a program draws that reads textures by ``sample``."""
     together = 1 if light is not None else max(1, _TOGETHER // (camera.width * camera.height))
     pictures = list[Tensor]()
     for index in range(0, len(camera), together):
