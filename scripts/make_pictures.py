@@ -1,9 +1,10 @@
-"""Write the pictures in docs/: python scripts/make_pictures.py [species] [acer] [pages] [steps]
+"""Write the pictures in docs/: python scripts/make_pictures.py [species] [acer] [light] [pages] [steps]
 
 All but ``steps`` need Blender. ``pages`` also needs Chromium and playwright.
 
 species    species.png: one view of every species that bbfit grows
 acer       acer.png: held-out views of an acer over sky and grass, and the results of the thesis preset and of the default
+light      light.png: a held-out camera's views of an aspen under three suns, and baked colors, baked maps and fitted maps
 pages      report.png and view.png: the report of a run, and its page in ``bbfit view``
 steps      steps.png: the parts of a training step, from the table in performance.md
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 import shutil
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -23,6 +25,7 @@ import bbfit
 from bbfit.evaluation.backgrounds import BACKGROUNDS
 from bbfit.exporting.model import shipped_model
 from bbfit.images import over_color
+from bbfit.reporting.suns import under_suns
 from bbfit.trees.species import known_species
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -73,6 +76,36 @@ def draw_acer(views: bbfit.ViewDataset, thesis: bbfit.BillboardCloud, default: b
             axis.axis("off")
     figure.tight_layout()
     figure.savefig(DOCS / "acer.png", dpi=100)
+
+
+def light() -> None:
+    """Draw light.png: an aspen under three held-out suns, with baked colors, baked maps and fitted maps."""
+    baked = bbfit.FitConfig(alpha="blend")
+    maps = replace(baked, light="maps")
+    options = {"baked": baked, "baked maps": replace(maps, map_steps=0), "fitted maps": maps}
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder) / "aspen.glb"
+        bbfit.write_tree(bbfit.grow("quaking_aspen"), tree)
+        views = bbfit.ViewDataset.load(bbfit.render_views(tree, Path(folder) / "views", bbfit.ViewsConfig(size=512, suns=1)))
+        draw_light(views, {title: bbfit.fit(views, config, tree=tree).cloud for title, config in options.items()})
+
+
+def draw_light(views: bbfit.ViewDataset, clouds: dict[str, bbfit.BillboardCloud]) -> None:
+    """Draw light.png from fitted clouds: a row for each sun."""
+    lit = views.lit_test
+    assert lit is not None
+    figure, axes = plt.subplots(3, 1 + len(clouds), figsize=(12, 9.3))
+    for column, (title, cloud) in zip(axes.T[1:], clouds.items(), strict=True):
+        score = bbfit.evaluate(cloud, views.test, lit=lit).light
+        assert score is not None
+        column[0].set_title(f"{title}: {score.psnr:.2f} dB, R² {score.r2:.2f}", fontsize=10)
+        for row, shown in enumerate(under_suns(shipped_model(cloud), lit, score.views)):
+            for axis, image in ((axes[row, 0], shown.target), (column[row], shown.image)):
+                axis.imshow(over_color(image).numpy()[40:472, 40:472])
+                axis.axis("off")
+    axes[0, 0].set_title("held-out view", fontsize=10)
+    figure.tight_layout()
+    figure.savefig(DOCS / "light.png", dpi=100)
 
 
 def species() -> None:
@@ -139,6 +172,6 @@ def steps() -> None:
 
 
 if __name__ == "__main__":
-    pictures = {"species": species, "acer": acer, "pages": pages, "steps": steps}
+    pictures = {"species": species, "acer": acer, "light": light, "pages": pages, "steps": steps}
     for name in sys.argv[1:] or pictures:
         pictures[name]()
