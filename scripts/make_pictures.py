@@ -94,18 +94,19 @@ def draw_light(views: bbfit.ViewDataset, clouds: dict[str, bbfit.BillboardCloud]
     """Draw light.png from fitted clouds: a row for each sun."""
     lit = views.lit_test
     assert lit is not None
-    figure, axes = plt.subplots(3, 1 + len(clouds), figsize=(12, 9.3))
+    figure, axes = plt.subplots(3, 1 + len(clouds), figsize=(9, 11.8))
     for column, (title, cloud) in zip(axes.T[1:], clouds.items(), strict=True):
         score = bbfit.evaluate(cloud, views.test, lit=lit).light
         assert score is not None
-        column[0].set_title(f"{title}: {score.psnr:.2f} dB, R² {score.r2:.2f}", fontsize=10)
+        column[0].set_title(f"{title}\n{score.psnr:.2f} dB, R² {score.r2:.2f}", fontsize=10)
         for row, shown in enumerate(under_suns(shipped_model(cloud), lit, score.views)):
             for axis, image in ((axes[row, 0], shown.target), (column[row], shown.image)):
-                axis.imshow(over_color(image).numpy()[40:472, 40:472])
+                margin = image.shape[1] // 5
+                axis.imshow(over_color(image).numpy()[:, margin:-margin])
                 axis.axis("off")
     axes[0, 0].set_title("held-out view", fontsize=10)
     figure.tight_layout()
-    figure.savefig(DOCS / "light.png", dpi=100)
+    figure.savefig(DOCS / "light.png", dpi=80)
 
 
 def species() -> None:
