@@ -61,6 +61,12 @@ class Program:
     """Whether a pixel has four samples, and masks have smooth edges."""
     mipmaps: bool | None = None
     """As :class:`bbfit.ExportConfig` has it."""
+    as_it_comes: bool = False
+    """Whether Blender keeps shadows of billboards on each other."""
+    eevee: bool = False
+    """Whether Blender renders with EEVEE instead of Cycles."""
+    imitated: bool = False
+    """Whether it is compared with a drawing that reads and lights textures of masks as EEVEE does, and not as Cycles."""
 
     @property
     def profile(self) -> Profile:
@@ -74,9 +80,6 @@ class Program:
         return version_of(self.page) if self.page else metadata.version("bpy")
 
 
-AS_IT_COMES = "Cycles as it comes"
-# Compared with bbfit's drawing for Blender, which is that of Cycles, and with a drawing that reads and lights textures as EEVEE does.
-EEVEE, OWN_EEVEE = "EEVEE", "EEVEE, from its own drawing"
 # By the name in the table.
 PROGRAMS = {
     "three.js": Program("three", lights=True),
@@ -91,9 +94,9 @@ PROGRAMS = {
     "CesiumJS, order-independent": Program("cesium", "order=independent", mipmaps=False),
     "Filament, smooth edges": Program("filament", smooth=True),
     "Cycles": Program(None, lights=True),
-    AS_IT_COMES: Program(None, lights=True),
-    EEVEE: Program(None, lights=True),
-    OWN_EEVEE: Program(None, lights=True, mipmaps=True),
+    "Cycles as it comes": Program(None, lights=True, as_it_comes=True),
+    "EEVEE": Program(None, lights=True, eevee=True),
+    "EEVEE, from its own drawing": Program(None, lights=True, mipmaps=True, eevee=True, imitated=True),
 }
 NOT_TRIED = ("Godot 4", "Unity", "Unreal")
 # Cycles chooses at random whether a path passes a layer that is half transparent.
@@ -103,15 +106,12 @@ Pictures = NDArray[np.float64]
 Chromium = tuple[Browser, ThreadPoolExecutor]
 
 
-def shown(name: str, glb: Path, camera: Camera, light: Light | None, alpha: str, browser: Chromium) -> Pictures:
+def shown(program: Program, glb: Path, camera: Camera, light: Light | None, alpha: str, browser: Chromium) -> Pictures:
     """A program's pictures of a model over white, [V, H, W, 3]."""
-    program = PROGRAMS[name]
     if program.page:
         with open_program(*browser, program.page, program.query) as viewer:
             return viewer.render(glb, camera, light=light)
-    return render_blender(
-        glb, camera, samples=SAMPLES[alpha], light=light, as_it_comes=name == AS_IT_COMES, eevee=name in (EEVEE, OWN_EEVEE)
-    )
+    return render_blender(glb, camera, samples=SAMPLES[alpha], light=light, as_it_comes=program.as_it_comes, eevee=program.eevee)
 
 
 def held_out(views: Path, cloud: bbfit.BillboardCloud, every: int, reduction: int) -> tuple[Camera, Light | None, Pictures]:
@@ -146,9 +146,9 @@ def measure(views: Path, run: Path, every: int, reduction: int, programs: list[s
     drawings: dict[Hashable, Pictures] = {}
     for name in programs:
         program = PROGRAMS[name]
-        if light is None if name == AS_IT_COMES else not (program.lights or light is None):
+        if light is None if program.as_it_comes else not (program.lights or light is None):
             continue
-        if name == OWN_EEVEE and cloud.alpha.kind != "mask":
+        if program.imitated and cloud.alpha.kind != "mask":
             continue  # that drawing is of hard edges
         config = bbfit.ExportConfig(profile=program.profile, mipmaps=program.mipmaps)
         # What the files depend on.
@@ -162,7 +162,7 @@ def measure(views: Path, run: Path, every: int, reduction: int, programs: list[s
         if (drawn := (same, program.smooth)) not in drawings:
             alpha = replace(model.cloud.alpha, antialiased=program.smooth and cloud.alpha.kind == "mask")
             cards = replace(model.cards, alpha=alpha)
-            if name == OWN_EEVEE:
+            if program.imitated:
                 drawing = draw_as_eevee(cards, camera, light)
             else:
                 drawing = draw_cards(cards, camera, light, multisampled=program.smooth)
@@ -170,7 +170,7 @@ def measure(views: Path, run: Path, every: int, reduction: int, programs: list[s
         own = drawings[drawn]
         with tempfile.TemporaryDirectory() as folder:
             (glb,) = model.save(Path(folder) / "model.glb")
-            pictures = shown(name, glb, camera, light, cloud.alpha.kind, browser)
+            pictures = shown(program, glb, camera, light, cloud.alpha.kind, browser)
         figures = f"{psnr(own, pictures):.1f} | {score(own):.2f} | {score(pictures) - score(own):+.2f}"
         print(f"| {run.name} | {name} | {program.version} | {len(camera)} | {model.cards.vertex_count} | {figures} |", flush=True)
 
