@@ -100,7 +100,7 @@ PROGRAMS = {
 }
 NOT_TRIED = ("Godot 4", "Unity", "Unreal")
 # Cycles chooses at random whether a path passes a layer that is half transparent.
-SAMPLES = {"mask": 16, "blend": 64, "hash": 64}
+SAMPLES = {"mask": 16, "coverage": 16, "blend": 64, "hash": 64}
 
 Pictures = NDArray[np.float64]
 Chromium = tuple[Browser, ThreadPoolExecutor]
