@@ -21,9 +21,9 @@ def packed(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
     Raises CalledProcessError if the process fails; its messages go to this process's standard error.
     """
-    # It finds its modules wherever this process does.
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-c", f"from {__name__} import _main; _main()"]
+    # It finds its modules where this process does, and nowhere else (-P), or a file named re.py in the working folder would run.
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
+    command = [sys.executable, "-P", "-c", f"from {__name__} import _main; _main()"]
     # A session of its own: this process handles keyboard interrupts, and ends the other one.
     done = subprocess.run(
         command, input=json.dumps(cells.tolist()).encode(), stdout=subprocess.PIPE, env=environment, check=True, start_new_session=True

@@ -27,6 +27,13 @@ def test_modules_are_found_wherever_this_process_finds_them(tmp_path: Path, monk
     assert packed(np.array([[5, 7]])).tolist() == [[0, 0]]
 
 
+def test_files_in_the_working_folder_do_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("re", "numpy", "xatlas"):
+        (tmp_path / f"{name}.py").write_text("raise ImportError('of the working folder')")
+    monkeypatch.chdir(tmp_path)
+    assert len(packed(CELLS)) == len(CELLS)
+
+
 @pytest.mark.parametrize("answer", ["[]", "[[0, 0, 5, 6]]", "[[0, 0, 5, 7], [5, 0, 10, 7]]"])
 def test_a_wrong_answer_is_refused(answer: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "xatlas.py").write_text(f"import os; os.write(1, b'{answer}'); os._exit(0)")
