@@ -92,7 +92,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
 # stochastic alpha is the noisier the more of them there are.
 _BY_ALPHA: dict[str, dict[str, Any]] = {
     "mask": {
-        "most_layers": 1.85,
+        "most_layers": 2.6,
         "margin": 0.02,
         "alpha_cutoff": 0.2,
         "least_alpha": 0.0,
@@ -132,8 +132,6 @@ _BY_ALPHA: dict[str, dict[str, Any]] = {
         "binarization_weight": 0.0,
     },
 }
-# The same for maps. A texel of a mask has one normal for all cameras, so the fewer cameras share a texel, the nearer it can come.
-_BY_ALPHA_OF_MAPS: dict[str, dict[str, Any]] = {"mask": {"most_layers": 2.6}}
 
 
 @dataclass(frozen=True)
@@ -159,7 +157,7 @@ class FitConfig:
     """Largest number of billboards that the preset chooses by itself."""
     most_layers: _Layers | None = None
     """How many billboards may lie before each other, on average over the rectangle around the tree, when the fit chooses their number.
-    More layers look better, and a graphics card shades all of them. Preset: 1.85 (mask), 2.6 (coverage, and mask with maps) or 3.2."""
+    More layers look better, and a graphics card shades all of them. Preset: 2.6 (mask, coverage) or 3.2 (blend, hash)."""
     light: Lighting = "baked"
     """baked: colors contain the light of the views. maps: base color, normals and occlusion, which take the light of a program.
     Maps need views under many lights (suns)."""
@@ -287,8 +285,7 @@ class FitConfig:
             )
         preset, given = _PRESETS[self.preset], {name: value for name, value in vars(self).items() if value is not None}
         alpha = given.get("alpha", preset["alpha"])
-        of_maps = _BY_ALPHA_OF_MAPS.get(alpha, {}) if self.light == "maps" else {}
-        values = _BY_ALPHA[alpha] | of_maps | preset | given
+        values = _BY_ALPHA[alpha] | preset | given
         if values["placement"] == "even":
             values = {"billboards": EVEN} | values
         return ResolvedFit(**_effort(values.get("billboards"), self.trunk) | values)

@@ -97,13 +97,6 @@ def views(known: BillboardCloud) -> ViewDataset:
 CONFIG = FitConfig(alpha="blend", light="maps", map_steps=300).resolve()
 
 
-def test_masks_with_maps_have_more_layers() -> None:
-    """By default, and only masks; what is given counts."""
-    assert FitConfig().resolve().most_layers < FitConfig(light="maps").resolve().most_layers
-    assert FitConfig(alpha="blend").resolve().most_layers == FitConfig(alpha="blend", light="maps").resolve().most_layers
-    assert FitConfig(light="maps", most_layers=1.5).resolve().most_layers == 1.5
-
-
 def test_known_maps_are_found(known: BillboardCloud, views: ViewDataset) -> None:
     """From plain normals, with the right alpha. Measured under held-out suns: 48.0 dB and R2 .991; at the start 29.5 dB and .82.
 
