@@ -1,9 +1,10 @@
-"""Write the pictures in docs/: python scripts/make_pictures.py [species] [acer] [light] [pages] [steps]
+"""Write the pictures in docs/: python scripts/make_pictures.py [species] [acer] [modes] [light] [pages] [steps]
 
 All but ``steps`` need Blender. ``pages`` also needs Chromium and playwright.
 
 species    species.png: one view of every species that bbfit grows
 acer       acer.png: held-out views of an acer over sky and grass, and the results of the thesis preset and of the default
+modes      modes.png: held-out views of an oak and a fir, and the results of the thesis preset and of three alpha modes
 light      light.png: a held-out camera's views of an aspen under three suns, and baked colors, baked maps and fitted maps
 pages      report.png and view.png: the report of a run, and its page in ``bbfit view``
 steps      steps.png: the parts of a training step, from the table in performance.md
@@ -14,8 +15,10 @@ from __future__ import annotations
 import shutil
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -32,6 +35,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 PERFORMANCE = DOCS / "performance.md"
 SEED = 1
 SIZE = 480
+THESIS_EXPORT = bbfit.ExportConfig(outline="rectangle", mipmaps=False)
 # A thumbnail does not need millions of leaves.
 LEAVES = {"weeping_willow": 0.3, "douglas_fir": 0.5, "silver_birch": 0.7}
 
@@ -59,7 +63,7 @@ def acer() -> None:
 def draw_acer(views: bbfit.ViewDataset, thesis: bbfit.BillboardCloud, default: bbfit.BillboardCloud) -> None:
     """Draw acer.png from two fitted clouds."""
     models = {
-        "thesis preset": shipped_model(thesis, bbfit.ExportConfig(outline="rectangle", mipmaps=False)),
+        "thesis preset": shipped_model(thesis, THESIS_EXPORT),
         "default": shipped_model(default).antialiased(),
     }
     figure, axes = plt.subplots(2, 3, figsize=(12, 8.4))
@@ -76,6 +80,44 @@ def draw_acer(views: bbfit.ViewDataset, thesis: bbfit.BillboardCloud, default: b
             axis.axis("off")
     figure.tight_layout()
     figure.savefig(DOCS / "acer.png", dpi=100)
+
+
+def modes() -> None:
+    """Draw modes.png: an oak and a fir, the thesis preset and three alpha modes."""
+    options: dict[str, dict[str, Any]] = {
+        "thesis preset": {"preset": "thesis"},
+        "mask": {},
+        "coverage": {"alpha": "coverage"},
+        "blend": {"alpha": "blend"},
+    }
+    trees = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, seed in {"black_oak": 3, "douglas_fir": 6}.items():
+            tree = Path(folder) / f"{name}.glb"
+            bbfit.write_tree(bbfit.grow(name, seed=seed), tree)
+            config = bbfit.ViewsConfig(size=256, elevations=(0.0,))
+            views = bbfit.ViewDataset.load(bbfit.render_views(tree, Path(folder) / name, config))
+            trees.append((views, {title: bbfit.fit(views, bbfit.FitConfig(**one), tree=tree).cloud for title, one in options.items()}))
+    draw_modes(trees)
+
+
+def draw_modes(trees: Sequence[tuple[bbfit.ViewDataset, dict[str, bbfit.BillboardCloud]]]) -> None:
+    """Draw modes.png from fitted clouds: a row for each tree, the first over grass and the second over sky."""
+    figure, axes = plt.subplots(len(trees), 1 + len(trees[0][1]), figsize=(13, 6.2))
+    for row, background, (views, clouds) in zip(axes, ("grass", "sky"), trees, strict=True):
+        row[0].set_title("held-out view", fontsize=10)
+        shown = [views.test.targets([0], torch.float64)[0]]
+        for axis, (title, cloud) in zip(row[1:], clouds.items(), strict=True):
+            model = shipped_model(cloud, THESIS_EXPORT if title == "thesis preset" else None)
+            report = bbfit.evaluate(cloud, views.test, export=model.config)
+            shown.append((model.antialiased() if title == "mask" else model).draw(views.test.cameras[0]).clamp(0, 1))
+            mean = (report.antialiased or report.mean).over.mean
+            axis.set_title(f"{title}: {mean.psnr:.1f} dB, FLIP {mean.flip:.3f}", fontsize=10)
+        for axis, image in zip(row, shown, strict=True):
+            axis.imshow(over_color(image, torch.tensor(BACKGROUNDS[background])).numpy())
+            axis.axis("off")
+    figure.tight_layout()
+    figure.savefig(DOCS / "modes.png", dpi=90)
 
 
 def light() -> None:
@@ -173,6 +215,6 @@ def steps() -> None:
 
 
 if __name__ == "__main__":
-    pictures = {"species": species, "acer": acer, "light": light, "pages": pages, "steps": steps}
+    pictures = {"species": species, "acer": acer, "modes": modes, "light": light, "pages": pages, "steps": steps}
     for name in sys.argv[1:] or pictures:
         pictures[name]()
