@@ -15,18 +15,18 @@ from __future__ import annotations
 import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 
 import bbfit
 from bbfit.evaluation.backgrounds import BACKGROUNDS
-from bbfit.exporting.model import shipped_model
+from bbfit.evaluation.measures import Over
+from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.images import over_color
 from bbfit.reporting.suns import under_suns
 from bbfit.trees.species import known_species
@@ -35,7 +35,6 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 PERFORMANCE = DOCS / "performance.md"
 SEED = 1
 SIZE = 480
-THESIS_EXPORT = bbfit.ExportConfig(outline="rectangle", mipmaps=False)
 # A thumbnail does not need millions of leaves.
 LEAVES = {"weeping_willow": 0.3, "douglas_fir": 0.5, "silver_birch": 0.7}
 
@@ -49,6 +48,24 @@ def picture(name: str, folder: Path) -> np.ndarray:
     return over_color(views.train.targets([0])[0], 1.0).numpy()
 
 
+def fitted(views: bbfit.ViewDataset, tree: Path, config: bbfit.FitConfig) -> ShippedModel:
+    """A fitted model as ``bbfit fit`` exports it; a mask is drawn with smooth edges."""
+    model = shipped_model(bbfit.fit(views, config, tree=tree).cloud, bbfit.RunConfig(fit=config).exported)
+    return model.antialiased() if model.cloud.alpha.kind == "mask" else model
+
+
+def score(model: ShippedModel, views: bbfit.ViewDataset) -> Over:
+    """Its score on the held-out views."""
+    report = bbfit.evaluate(model.cloud, views.test, export=model.config)
+    return (report.antialiased or report.mean).over
+
+
+def show(axis: Axes, image: torch.Tensor, background: str, margin: int) -> None:
+    """Show a picture over a background, without a margin of some pixels."""
+    axis.imshow(over_color(image.clamp(0, 1), torch.tensor(BACKGROUNDS[background])).numpy()[margin:-margin, margin:-margin])
+    axis.axis("off")
+
+
 def acer() -> None:
     """Draw acer.png: held-out views over sky and grass, the thesis preset's billboards, and those of the default."""
     with tempfile.TemporaryDirectory() as folder:
@@ -56,66 +73,44 @@ def acer() -> None:
         bbfit.write_tree(bbfit.grow("acer", seed=2), tree)
         bbfit.render_views(tree, Path(folder) / "views", bbfit.ViewsConfig(size=512, elevations=(0.0,)))
         views = bbfit.ViewDataset.load(Path(folder) / "views")
-        thesis = bbfit.fit(views, bbfit.FitConfig(preset="thesis", sides="two")).cloud
-        draw_acer(views, thesis, bbfit.fit(views, tree=tree).cloud)
-
-
-def draw_acer(views: bbfit.ViewDataset, thesis: bbfit.BillboardCloud, default: bbfit.BillboardCloud) -> None:
-    """Draw acer.png from two fitted clouds."""
-    models = {
-        "thesis preset": shipped_model(thesis, THESIS_EXPORT),
-        "default": shipped_model(default).antialiased(),
-    }
-    figure, axes = plt.subplots(2, 3, figsize=(12, 8.4))
-    for column, title in zip(axes.T, ("held-out view", *models), strict=True):
-        model = models.get(title)
-        if model is not None:
-            report = bbfit.evaluate(model.cloud, views.test, export=model.config)
-            mean = (report.antialiased or report.mean).over.mean
-            title += f": {len(model.glb) / 1000:.0f} kB, {mean.psnr:.2f} dB, FLIP {mean.flip:.3f}"
-        column[0].set_title(title, fontsize=10)
-        for axis, index, background in zip(column, (0, len(views.test) // 3), ("sky", "grass"), strict=True):
-            image = views.test.targets([index])[0] if model is None else model.draw(views.test.cameras[index])
-            axis.imshow(over_color(image.clamp(0, 1), torch.tensor(BACKGROUNDS[background])).numpy()[40:472, 40:472])
-            axis.axis("off")
-    figure.tight_layout()
-    figure.savefig(DOCS / "acer.png", dpi=100)
+        options = {"thesis preset": bbfit.FitConfig(preset="thesis", sides="two"), "default": bbfit.FitConfig()}
+        models = {title: fitted(views, tree, config) for title, config in options.items()}
+        figure, axes = plt.subplots(2, 3, figsize=(12, 8.4))
+        for column, title in zip(axes.T, ("held-out view", *models), strict=True):
+            model = models.get(title)
+            if model is not None:
+                mean = score(model, views).mean
+                title += f": {len(model.glb) / 1000:.0f} kB, {mean.psnr:.2f} dB, FLIP {mean.flip:.3f}"
+            column[0].set_title(title, fontsize=10)
+            for axis, index, background in zip(column, (0, len(views.test) // 3), ("sky", "grass"), strict=True):
+                image = views.test.targets([index])[0] if model is None else model.draw(views.test.cameras[index])
+                show(axis, image, background, 40)
+        figure.tight_layout()
+        figure.savefig(DOCS / "acer.png", dpi=100)
 
 
 def modes() -> None:
-    """Draw modes.png: an oak and a fir, the thesis preset and three alpha modes."""
-    options: dict[str, dict[str, Any]] = {
-        "thesis preset": {"preset": "thesis"},
-        "mask": {},
-        "coverage": {"alpha": "coverage"},
-        "blend": {"alpha": "blend"},
+    """Draw modes.png: an oak over grass and a fir over sky, the thesis preset and three alpha modes."""
+    options = {
+        "thesis preset": bbfit.FitConfig(preset="thesis"),
+        "mask": bbfit.FitConfig(),
+        "coverage": bbfit.FitConfig(alpha="coverage"),
+        "blend": bbfit.FitConfig(alpha="blend"),
     }
-    trees = []
-    with tempfile.TemporaryDirectory() as folder:
-        for name, seed in {"black_oak": 3, "douglas_fir": 6}.items():
+    figure, axes = plt.subplots(2, 1 + len(options), figsize=(13, 6.2))
+    for row, (name, seed, background) in zip(axes, (("black_oak", 3, "grass"), ("douglas_fir", 6, "sky")), strict=True):
+        with tempfile.TemporaryDirectory() as folder:
             tree = Path(folder) / f"{name}.glb"
             bbfit.write_tree(bbfit.grow(name, seed=seed), tree)
-            config = bbfit.ViewsConfig(size=256, elevations=(0.0,))
-            views = bbfit.ViewDataset.load(bbfit.render_views(tree, Path(folder) / name, config))
-            trees.append((views, {title: bbfit.fit(views, bbfit.FitConfig(**one), tree=tree).cloud for title, one in options.items()}))
-    draw_modes(trees)
-
-
-def draw_modes(trees: Sequence[tuple[bbfit.ViewDataset, dict[str, bbfit.BillboardCloud]]]) -> None:
-    """Draw modes.png from fitted clouds: a row for each tree, the first over grass and the second over sky."""
-    figure, axes = plt.subplots(len(trees), 1 + len(trees[0][1]), figsize=(13, 6.2))
-    for row, background, (views, clouds) in zip(axes, ("grass", "sky"), trees, strict=True):
-        row[0].set_title("held-out view", fontsize=10)
-        shown = [views.test.targets([0], torch.float64)[0]]
-        for axis, (title, cloud) in zip(row[1:], clouds.items(), strict=True):
-            model = shipped_model(cloud, THESIS_EXPORT if title == "thesis preset" else None)
-            report = bbfit.evaluate(cloud, views.test, export=model.config)
-            shown.append((model.antialiased() if title == "mask" else model).draw(views.test.cameras[0]).clamp(0, 1))
-            mean = (report.antialiased or report.mean).over.mean
-            axis.set_title(f"{title}: {mean.psnr:.1f} dB, FLIP {mean.flip:.3f}", fontsize=10)
-        for axis, image in zip(row, shown, strict=True):
-            axis.imshow(over_color(image, torch.tensor(BACKGROUNDS[background])).numpy())
-            axis.axis("off")
+            bbfit.render_views(tree, Path(folder) / "views", bbfit.ViewsConfig(size=256, elevations=(0.0,)))
+            views = bbfit.ViewDataset.load(Path(folder) / "views")
+            row[0].set_title("held-out view", fontsize=10)
+            show(row[0], views.test.targets([0])[0], background, 10)
+            for axis, (title, config) in zip(row[1:], options.items(), strict=True):
+                model = fitted(views, tree, config)
+                mean = score(model, views).mean
+                axis.set_title(f"{title}: {mean.psnr:.1f} dB, FLIP {mean.flip:.3f}", fontsize=10)
+                show(axis, model.draw(views.test.cameras[0]), background, 10)
     figure.tight_layout()
     figure.savefig(DOCS / "modes.png", dpi=90)
 

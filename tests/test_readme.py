@@ -224,19 +224,12 @@ def run_python(words: list[str], place: Place) -> None:
     assert specification and specification.loader
     script = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(script)
-    pictures = path.name == "make_pictures.py"
     if path.name == "benchmark.py" and "placement" not in arguments:
         arguments = [*arguments, "--quick", "--only", "grow"]
     with pytest.MonkeyPatch.context() as patch:
-        work_small(patch, 64 if pictures else 32)  # margins of 40 pixels are cut off from the pictures
+        work_small(patch)
         patch.setattr(sys, "argv", [str(path), *arguments])
-        if not pictures:
-            script.main()
-            return
-        patch.setattr(script, "DOCS", place.folder)
-        for name in arguments:
-            getattr(script, name)()
-            assert (place.folder / f"{name}.png").stat().st_size > 0
+        script.main()
 
 
 def run_mkdocs(words: list[str], place: Place) -> None:
@@ -256,9 +249,9 @@ RUNNERS: dict[str, Callable[[list[str], Place], None]] = {
 }
 
 
-def work_small(patch: pytest.MonkeyPatch, size: int = SMALL_VIEWS["size"]) -> None:
+def work_small(patch: pytest.MonkeyPatch) -> None:
     """Make the functions that ``bbfit`` offers grow, render and fit little, whatever they are asked for."""
-    views = lambda config: replace(config or bbfit.ViewsConfig(), **SMALL_VIEWS | {"size": size})  # noqa: E731
+    views = lambda config: replace(config or bbfit.ViewsConfig(), **SMALL_VIEWS)  # noqa: E731
     fit = lambda config: replace(config or bbfit.FitConfig(), **SMALL_FIT)  # noqa: E731
     stages = lambda config: replace(  # noqa: E731
         config or bbfit.RunConfig(), views=views(config and config.views), fit=fit(config and config.fit)
