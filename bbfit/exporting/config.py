@@ -44,17 +44,19 @@ class Program:
     """Whether it culls the back faces of blended meshes that are one-sided; otherwise a node cannot order its fronts and backs."""
     nearest: bool = False
     """Whether it sorts nodes by the nearest points of their bounding spheres, not by the centers of their bounds."""
+    quantized: bool = False
+    """Whether it reads positions, normals and tangents that are integers (KHR_mesh_quantization)."""
 
 
 _PROGRAMS: dict[Profile | None, Program] = {
     None: Program(split=False),
-    "three": Program(),
-    "babylon": Program(transmits=True),
-    "playcanvas": Program(),
-    "model-viewer": Program(),
+    "three": Program(quantized=True),
+    "babylon": Program(transmits=True, quantized=True),
+    "playcanvas": Program(quantized=True),
+    "model-viewer": Program(quantized=True),
     # It computes mip levels from textures that it scales to powers of two, without the colors under transparent texels.
-    "cesium": Program(mipmaps=False, culls=False, nearest=True),
-    "filament": Program(),
+    "cesium": Program(mipmaps=False, culls=False, nearest=True, quantized=True),
+    "filament": Program(quantized=True),
     "godot": Program(),
     "unity": Program(),
     "unreal": Program(),
@@ -101,6 +103,9 @@ class ExportConfig:
     Default: yes, except for masks with a cutoff above 0.25, whose leaves would vanish; for the preset thesis; for Blender and CesiumJS."""
     mip_files: bool = False
     """Also write the mip levels as PNG files beside the model, for programs that import them."""
+    quantized: bool | None = None
+    """Store positions of 16 bits, and normals and tangents of 8 bits, for programs with KHR_mesh_quantization.
+    Default: for the profiles of web viewers and Filament, which have it. Other programs may refuse such a file."""
     material: Material | None = None
     """unlit: colors as they are, with the light that the tree was rendered in. pbr: a rough dielectric that the program lights again.
     emissive: a black metal that emits the colors, for programs that do not show unlit right.
@@ -137,6 +142,7 @@ class ExportConfig:
         if isinstance(self, ResolvedExport):
             return self
         chosen: dict[str, Any] = {"split": self.program.split, "material": self.program.material, "textures": "png", "outline": "pieces"}
+        chosen["quantized"] = self.program.quantized
         chosen |= {name: value for name, value in vars(self).items() if value is not None or name not in chosen}
         if chosen["textures"] == "auto":
             chosen["textures"] = "png" if ktx2_missing() else "ktx2"
@@ -159,6 +165,7 @@ class ResolvedExport(ExportConfig):
     split: bool
     outline: Outline
     textures: Encoding
+    quantized: bool
     material: Material
 
     @property

@@ -82,7 +82,7 @@ def _bounds(tree: dict[str, Any]) -> list[list[float]]:
         moved = np.array(node["matrix"]).reshape(4, 4)[3, :3] if "matrix" in node else np.array(node.get("translation", (0, 0, 0)))
         for primitive in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
             accessor = tree["accessors"][primitive["attributes"]["POSITION"]]
-            corners += [(moved + accessor[end]).tolist() for end in ("min", "max")]
+            corners += [(moved + np.multiply(node.get("scale", 1), accessor[end])).tolist() for end in ("min", "max")]
     return [np.min(corners, 0).tolist(), np.max(corners, 0).tolist()]
 
 

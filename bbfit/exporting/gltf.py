@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.exporting.encoders import encode_ktx2, encode_webp
 from bbfit.exporting.splitting import centered
+from bbfit.exporting.vertex_formats import on_grid, quantized, with_short_indices
 from bbfit.geometry.cards import Card, Cards, texture_axes
 from bbfit.glb import joined_glb, split_glb
 from bbfit.images import encode_png
@@ -19,8 +20,6 @@ from bbfit.model_files import glb_of_scene
 # Numbers that glTF 2.0 borrows from OpenGL (specification, section 5.26).
 _SAMPLER = {"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}  # linear, clamped to the edge
 _WITH_MIPS = _SAMPLER | {"minFilter": 9987}  # trilinear
-# Component types of glTF, and the largest index of 16 bits (65,535 would restart a primitive; glTF 2.0, section 3.7.2.1).
-_UNSIGNED_SHORT, _UNSIGNED_INT, _LARGEST_SHORT = 5123, 5125, 65_534
 # Pictures of cards with maps beside the atlas.
 _MAPS = ("normals", "occlusion")
 # Pictures by name.
@@ -58,6 +57,7 @@ def glb_bytes(
     from PIL import Image
 
     resolved = config.resolve()
+    cards = on_grid(cards) if resolved.quantized else cards
     placeholder = Image.new("RGBA", (1, 1))  # trimesh writes texture coordinates for textured materials only
     scene = trimesh.Scene(base_frame="billboard_cloud")
     radius = None
@@ -93,7 +93,9 @@ def glb_bytes(
     pictures = _pictures(cards)
     glb = glb_of_scene(scene, lambda tree: _complete(tree, cards, list(pictures), resolved), normals=lit)
     tree, views = split_glb(glb)
-    views = _with_short_indices(tree, views)
+    views = with_short_indices(tree, views)
+    if resolved.quantized:
+        views = quantized(tree, views, cards)
     images = _with_images(tree, list(pictures), resolved)
     if files is not None:
         tree["images"] = [{"uri": files[name], "mimeType": kind, "name": picture} for name, picture, kind in images]
@@ -217,19 +219,6 @@ def _complete(tree: dict[str, Any], cards: Cards, pictures: list[str], config: R
         tree["extensionsUsed"] = sorted(used)
 
 
-def _with_short_indices(tree: dict[str, Any], views: list[bytes]) -> list[bytes]:
-    """The contents of the buffer views with indices of 16 bits in place of trimesh's 32 wherever they suffice."""
-    views = list(views)
-    assert len({accessor["bufferView"] for accessor in tree["accessors"]}) == len(tree["accessors"])
-    for accessor in tree["accessors"]:
-        if accessor["componentType"] == _UNSIGNED_INT:
-            indices = np.frombuffer(views[accessor["bufferView"]], "<u4")
-            if indices.max() <= _LARGEST_SHORT:
-                views[accessor["bufferView"]] = indices.astype("<u2").tobytes()
-                accessor["componentType"] = _UNSIGNED_SHORT
-    return views
-
-
 def _pictures(cards: Cards) -> _Pictures:
     """The pictures by name: their mip levels, or level 0 alone, uint8 [h, w, C], and whether they are colors."""
     pictures = {"atlas": (list(cards.chain or [cards.atlas.image]), True)}
@@ -255,7 +244,7 @@ def _with_images(tree: dict[str, Any], pictures: list[str], config: ResolvedExpo
     if extension:
         tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), extension})
         if not config.fallback:
-            tree["extensionsRequired"] = [extension]
+            tree["extensionsRequired"] = sorted({*tree.get("extensionsRequired", ()), extension})
     return images
 
 

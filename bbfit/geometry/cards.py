@@ -126,6 +126,10 @@ def texture_axes(card: Card) -> NDArray[np.float64]:
     """The axes of the normals in a card's texture: its tangent, up along the texture, and its normal, [3, 3]; NaN without a tangent."""
     if card.tangent is None:
         return np.full((3, 3), np.nan)
-    slopes = np.linalg.pinv(card.uvs - card.uvs.mean(0)) @ (card.corners - card.corners.mean(0))
     up = np.cross(card.normal, card.tangent)
-    return np.stack([card.tangent, up * np.sign(-slopes[1] @ up), card.normal])  # v grows downwards
+    return np.stack([card.tangent, up * np.sign(-texture_slopes(card)[1] @ up), card.normal])  # v grows downwards
+
+
+def texture_slopes(card: Card) -> NDArray[np.float64]:
+    """How a point of a card moves with u and with v, in meters for the whole atlas, [2, 3]."""
+    return np.linalg.pinv(card.uvs - card.uvs.mean(0)) @ (card.corners - card.corners.mean(0))

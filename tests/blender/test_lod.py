@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from gltf_arrays import array
 from PIL import Image
 
 import bbfit.lod
@@ -110,19 +111,13 @@ def test_colors_count_too(built: LodResult) -> None:
 def test_textures_are_as_fine_as_the_screen_shows(built: LodResult) -> None:
     """One to two texels a pixel where the level takes over, by the file alone, as textures are halved."""
     tree, views = split_glb(built.path.read_bytes())
-
-    def array(number: int) -> np.ndarray:
-        accessor = tree["accessors"][number]
-        kind = {5123: "<u2", 5125: "<u4", 5126: "<f4"}[accessor["componentType"]]
-        return np.frombuffer(views[accessor["bufferView"]], kind).reshape(accessor["count"], -1)
-
     for level in built.levels[1:]:
         (primitive,) = next(mesh for mesh in tree["meshes"] if mesh["name"] == f"{level.name}_billboards")["primitives"]
         surface = tree["materials"][primitive["material"]]["pbrMetallicRoughness"]
         image = tree["images"][tree["textures"][surface["baseColorTexture"]["index"]]["source"]]
         extent = Image.open(io.BytesIO(views[image["bufferView"]])).size
-        triangles = array(primitive["indices"]).reshape(-1, 3)
-        points, uvs = (array(primitive["attributes"][name])[triangles] for name in ("POSITION", "TEXCOORD_0"))
+        triangles = array(tree, views, primitive["indices"]).astype(int).reshape(-1, 3)
+        points, uvs = (array(tree, views, primitive["attributes"][name])[triangles] for name in ("POSITION", "TEXCOORD_0"))
         sides = [np.linalg.norm(values - np.roll(values, 1, axis=1), axis=-1) for values in (points, uvs * extent)]
         seen = 1080 / 2 / np.tan(np.radians(25)) / level.distance_meters
         texels_a_pixel = sides[1] / sides[0] / seen

@@ -14,13 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gltf_arrays import array, matrix
 from numpy.typing import NDArray
 from PIL import Image
 
 from bbfit.geometry.camera import Camera
-
-COMPONENTS = {5126: ("<f4", 4), 5125: ("<u4", 4), 5123: ("<u2", 2)}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
 
 
 @dataclass
@@ -46,21 +44,15 @@ def read_glb(path: Path) -> tuple[dict[str, Any], list[Primitive], NDArray[np.ui
         start = view.get("byteOffset", 0)
         return binary[start : start + view["byteLength"]]
 
-    def array(index: int) -> NDArray[Any]:
-        accessor = tree["accessors"][index]
-        kind, width = COMPONENTS[accessor["componentType"]][0], WIDTHS[accessor["type"]]
-        data = blob(tree["bufferViews"][accessor["bufferView"]])
-        values = np.frombuffer(data, kind, accessor["count"] * width, accessor.get("byteOffset", 0))
-        return values.reshape(-1, width)
-
-    primitives = []
+    contents, primitives = [blob(view) for view in tree["bufferViews"]], []
     for node in tree["nodes"]:
-        assert not {"matrix", "translation", "rotation", "scale"} & node.keys()
+        placed = matrix(node)
         for primitive in tree["meshes"][node["mesh"]]["primitives"]:
-            attributes = {name: array(index).astype(np.float64) for name, index in primitive["attributes"].items()}
-            triangles = array(primitive["indices"]).astype(np.int64).reshape(-1, 3)
+            attributes = {name: array(tree, contents, index) for name, index in primitive["attributes"].items()}
+            points = attributes["POSITION"] @ placed[:3, :3].T + placed[:3, 3]
+            triangles = array(tree, contents, primitive["indices"]).astype(np.int64).reshape(-1, 3)
             material = tree["materials"][primitive["material"]]
-            primitives.append(Primitive(attributes["POSITION"], attributes.get("NORMAL"), attributes["TEXCOORD_0"], triangles, material))
+            primitives.append(Primitive(points, attributes.get("NORMAL"), attributes["TEXCOORD_0"], triangles, material))
     (image,) = tree["images"]
     return tree, primitives, np.array(Image.open(io.BytesIO(blob(tree["bufferViews"][image["bufferView"]]))).convert("RGBA"))
 

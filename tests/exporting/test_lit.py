@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from gltf_arrays import array, matrix
 from khronos import messages
 from PIL import Image
 
@@ -123,10 +124,13 @@ def test_glb_has_three_textures_and_tangents_and_is_valid(
     )
 
     def rows(name: str, width: int) -> np.ndarray:
-        accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"][name]]
-        return np.frombuffer(views[accessor["bufferView"]], "<f4").reshape(-1, width)
+        rows = array(tree, views, tree["meshes"][0]["primitives"][0]["attributes"][name])
+        assert rows.shape[1] == width
+        return rows
 
-    normals, tangents, points, uvs = rows("NORMAL", 3), rows("TANGENT", 4), rows("POSITION", 3), rows("TEXCOORD_0", 2)
+    placed = matrix(tree["nodes"][tree["scenes"][0]["nodes"][0]])
+    points = rows("POSITION", 3) @ placed[:3, :3] + placed[:3, 3]
+    normals, tangents, uvs = rows("NORMAL", 3), rows("TANGENT", 4), rows("TEXCOORD_0", 2)
     bitangents = np.cross(normals, tangents[:, :3]) * tangents[:, 3:]
     assert set(tangents[:, 3]) == {-1.0, 1.0}
     for sign in (-1.0, 1.0):  # up along the texture, to which v falls, and right, to which u grows, on both sides

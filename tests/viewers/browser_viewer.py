@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gltf_arrays import matrix
 from numpy.typing import NDArray
 from playwright.sync_api import Browser, ConsoleMessage, Page, Route
 
@@ -181,16 +182,14 @@ def version_of(program: str) -> str:
 
 
 def extent(glb: Path) -> NDArray[np.float64]:
-    """Least and greatest coordinates of all meshes in a GLB whose nodes are moved, if at all, by a matrix of their own, [2, 3]."""
+    """Least and greatest coordinates of all meshes in a GLB whose nodes are moved or scaled, if at all, on their own, [2, 3]."""
     tree, _ = gltf_parts(glb.read_bytes())
     corners = []
     for node in tree["nodes"]:
-        assert not {"translation", "rotation", "scale"} & node.keys()
-        matrix = np.reshape(node.get("matrix", np.eye(4)), (4, 4))  # of rows of points
-        np.testing.assert_array_equal(matrix[:3], np.eye(4)[:3], err_msg="the node is turned or scaled")
+        placed = matrix(node)
         for primitive in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
             accessor = tree["accessors"][primitive["attributes"]["POSITION"]]
-            corners += [np.add(accessor[end], matrix[3, :3]) for end in ("min", "max")]
+            corners += [placed[:3, :3] @ accessor[end] + placed[:3, 3] for end in ("min", "max")]
     return np.stack([np.min(corners, 0), np.max(corners, 0)])
 
 
