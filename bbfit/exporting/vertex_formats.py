@@ -108,7 +108,7 @@ class _Geometry:
                 origin = np.zeros(3) if moved else (points.min(0) + points.max(0)) / 2
                 places.append((node, number, origin, np.array(moved[12:15] if moved else origin)))
         farthest = max(float(np.abs(self._floats(number) - origin).max()) for _, number, origin, _ in places)
-        unit = farthest / _INTEGERS[_SHORT][1]
+        unit = float(f"{farthest / _INTEGERS[_SHORT][1]:.6g}")  # split models have a node for each card, which all name it
         for node, number, origin, place in places:
             self.put(number, _SHORT, unit, origin)
             node |= {"translation": place.tolist(), "scale": [unit] * 3}

@@ -110,7 +110,7 @@ def report_stage(
         on_progress("report", 0, 1)
         losses = [float(row["loss"]) for row in csv.DictReader((folder / "loss.csv").read_text().splitlines())]
         picture = pareto.read_bytes() if pareto else None
-        readable = replace(model.config, textures="webp", fallback=False, mip_files=False)  # browsers read WebP
+        readable = replace(model.config, textures="webp", fallback=False, mip_files=False, quantized=True)  # browsers read these
         known = RunFacts(**facts, losses=losses, pareto=picture)
         page = report_page(report, model, views.test, known, glb_bytes(model.cards, readable), views.lit_test)
         write_bytes(folder / "report.html", page.encode(errors="backslashreplace"))

@@ -12,6 +12,7 @@ import { Scene } from "@babylonjs/core/scene.js";
 import "@babylonjs/loaders/glTF/2.0/Extensions/EXT_texture_webp.js";
 import "@babylonjs/loaders/glTF/2.0/Extensions/KHR_materials_specular.js";
 import "@babylonjs/loaders/glTF/2.0/Extensions/KHR_materials_unlit.js";
+import "@babylonjs/loaders/glTF/2.0/Extensions/KHR_mesh_quantization.js";
 import "@babylonjs/loaders/glTF/2.0/glTFLoader.js";
 import "@babylonjs/loaders/glTF/glTFFileLoader.js";
 

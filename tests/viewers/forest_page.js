@@ -44,7 +44,8 @@ const programs = {
     );
     await import("@babylonjs/core/Materials/standardMaterial.js");
     await import("@babylonjs/core/Meshes/thinInstanceMesh.js");
-    for (const name of ["glTFFileLoader", "2.0/glTFLoader", "2.0/Extensions/KHR_materials_unlit", "2.0/Extensions/EXT_mesh_gpu_instancing"]) {
+    const extensions = ["KHR_materials_unlit", "KHR_mesh_quantization", "EXT_mesh_gpu_instancing"].map((name) => `2.0/Extensions/${name}`);
+    for (const name of ["glTFFileLoader", "2.0/glTFLoader", ...extensions]) {
       await import(`@babylonjs/loaders/glTF/${name}.js`);
     }
     const engine = new Engine(canvas, false, { preserveDrawingBuffer: true, useExactSrgbConversions: true });

@@ -47,7 +47,8 @@ const programs = {
       ["Engines/engine", "scene", "Cameras/freeCamera", "Maths/math.vector", "Maths/math.color"].map(at),
     );
     await import("@babylonjs/core/Materials/standardMaterial.js");
-    for (const name of ["glTFFileLoader", "2.0/glTFLoader", "2.0/Extensions/KHR_materials_unlit", "2.0/Extensions/MSFT_lod"]) {
+    const extensions = ["KHR_materials_unlit", "KHR_mesh_quantization", "MSFT_lod"].map((name) => `2.0/Extensions/${name}`);
+    for (const name of ["glTFFileLoader", "2.0/glTFLoader", ...extensions]) {
       await import(`@babylonjs/loaders/glTF/${name}.js`);
     }
     const engine = new Engine(canvas, false, { preserveDrawingBuffer: true });

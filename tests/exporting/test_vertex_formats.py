@@ -1,0 +1,114 @@
+"""Integer positions, texture coordinates, normals and tangents (KHR_mesh_quantization)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from glb_viewer import view_glb
+from gltf_arrays import array, matrix
+from khronos import messages
+from test_lit import with_maps
+
+from bbfit.exporting.config import ExportConfig, Profile
+from bbfit.exporting.model import export, shipped_model
+from bbfit.exporting.vertex_formats import EXTENSION, on_grid
+from bbfit.geometry.camera import Camera
+from bbfit.geometry.cards import texture_slopes
+from bbfit.geometry.cloud import BillboardCloud
+from bbfit.glb import split_glb
+
+# Components of 16 bits and of 8 bits.
+_SHORT, _UNSIGNED_SHORT, _BYTE = 5122, 5123, 5120
+
+
+def _attributes(path: Path) -> tuple[dict[str, Any], list[bytes], list[dict[str, int]]]:
+    tree, contents = split_glb(path.read_bytes())
+    return tree, contents, [primitive["attributes"] for mesh in tree["meshes"] for primitive in mesh["primitives"]]
+
+
+def _both(cloud: BillboardCloud, folder: Path, **options: Any) -> tuple[Path, Path]:
+    """The same model with integers and with floats."""
+    (integers,), (floats,) = (
+        export(cloud, folder / f"{quantized}.glb", ExportConfig(quantized=quantized, **options)) for quantized in (True, False)
+    )
+    return integers, floats
+
+
+@pytest.mark.parametrize("kind", ["one", "two", "mixed"])
+def test_a_viewer_shows_the_same_in_fewer_bytes(kind: str, clouds: dict[str, BillboardCloud], orbit: Camera, tmp_path: Path) -> None:
+    """Eight bytes of 20 are saved for each vertex. A viewer that knows nothing but the specification shows the same picture."""
+    integers, floats = _both(clouds[kind], tmp_path)
+    tree, _, attributes = _attributes(integers)
+    assert messages(integers) == [] and tree["extensionsRequired"] == [EXTENSION]
+    accessors = [{name: tree["accessors"][number]["componentType"] for name, number in each.items()} for each in attributes]
+    assert all(each == {"POSITION": _SHORT, "TEXCOORD_0": _UNSIGNED_SHORT} for each in accessors)
+    vertices = sum(tree["accessors"][each["POSITION"]]["count"] for each in attributes)
+    lengths = [sum(map(len, split_glb(path.read_bytes())[1])) for path in (integers, floats)]
+    assert lengths[1] - lengths[0] == 8 * vertices
+    for index in range(len(orbit)):
+        shown, expected = view_glb(integers, orbit[index]), view_glb(floats, orbit[index])
+        assert expected[..., 3].max() > 0.5
+        assert abs(shown - expected).max() < 1 / 255  # measured 0.07 / 255: positions are rounded to 0.02 mm
+
+
+def test_a_corner_moves_along_its_texture(crossed: BillboardCloud) -> None:
+    """A texture stays at its place: positions and coordinates change together."""
+    cards = shipped_model(crossed, ExportConfig(quantized=True)).cards
+    for before, after in zip(cards.cards, on_grid(cards).cards, strict=True):
+        np.testing.assert_allclose(after.uvs * 65_535, np.rint(before.uvs * 65_535), atol=1e-9)
+        moved = before.corners + (after.uvs - before.uvs) @ texture_slopes(before)
+        np.testing.assert_allclose(after.corners, moved, atol=1e-12)
+        np.testing.assert_allclose(texture_slopes(after), texture_slopes(before), atol=1e-9)
+    assert any((before.uvs != after.uvs).any() for before, after in zip(cards.cards, on_grid(cards).cards, strict=True))
+
+
+def test_a_large_atlas_keeps_its_coordinates(crossed: BillboardCloud, tmp_path: Path) -> None:
+    """Beyond 4096 texels, 16 bits would move a corner by more than 1/32 of a texel."""
+    cards = shipped_model(crossed).cards
+    for side, same in ((4096, False), (4100, True)):
+        wide = replace(cards, atlas=replace(cards.atlas, image=np.zeros((4, side, 4), np.uint8)))
+        assert (on_grid(wide) is wide) == same
+
+
+def test_normals_and_tangents_keep_their_directions(clouds: dict[str, BillboardCloud], tmp_path: Path) -> None:
+    integers, floats = _both(with_maps(clouds["mixed"]), tmp_path, alpha="mask")
+    assert [found["code"] for found in messages(integers) if found["code"] != "UNSUPPORTED_EXTENSION"] == []
+    (tree, contents, found), (other, others, expected) = _attributes(integers), _attributes(floats)
+    assert {tree["accessors"][each[name]]["componentType"] for each in found for name in ("NORMAL", "TANGENT")} == {_BYTE}
+    for name in ("NORMAL", "TANGENT"):
+        rows = np.concatenate([array(tree, contents, each[name]) for each in found])
+        exact = np.concatenate([array(other, others, each[name]) for each in expected])
+        cosines = (rows[:, :3] * exact[:, :3]).sum(-1) / np.linalg.norm(rows[:, :3], axis=-1)
+        assert np.degrees(np.arccos(cosines.clip(-1, 1))).max() < 0.4  # half a step of 1/127 along each axis
+        np.testing.assert_array_equal(rows[:, 3:], exact[:, 3:])  # the sign of the bitangent
+    saved = len(floats.read_bytes()) - len(integers.read_bytes())
+    assert saved > 27 * len(rows)  # 4 bytes each of positions and coordinates, 8 of normals, 12 of tangents, less some JSON
+
+
+def test_split_nodes_stay_at_their_origins(crossed: BillboardCloud, tmp_path: Path) -> None:
+    """Programs sort nodes by their places or by the centers of their bounds."""
+    config = ExportConfig(alpha="blend", profile="three")
+    (path,) = export(crossed, tmp_path / "tree.glb", config)
+    tree, contents, _ = _attributes(path)
+    nodes, placed = on_grid(shipped_model(crossed, config).cards).nodes, [node for node in tree["nodes"] if "mesh" in node]
+    assert len(nodes) == len(placed) > 1 and messages(path) == []
+    for cards, node in zip(nodes, placed, strict=True):
+        assert cards[0].origin is not None
+        np.testing.assert_allclose(node["translation"], cards[0].origin, atol=1e-6)
+        number = tree["meshes"][node["mesh"]]["primitives"][0]["attributes"]["POSITION"]
+        assert np.add(tree["accessors"][number]["min"], tree["accessors"][number]["max"]).tolist() == [0, 0, 0]
+        points, unit = array(tree, contents, number) @ matrix(node)[:3, :3].T + cards[0].origin, node["scale"][0]
+        exact = np.concatenate([card.corners for card in cards])
+        assert abs(points[: len(exact)] - exact).max() < 0.5 * unit + 1e-6
+
+
+def test_programs_that_read_integers_get_them(crossed: BillboardCloud) -> None:
+    readers = {"three", "babylon", "playcanvas", "model-viewer", "cesium", "filament"}
+    for profile in (None, *get_args(Profile)):
+        assert ExportConfig(profile=profile).resolve().quantized == (profile in readers)
+        assert ExportConfig(profile=profile, quantized=False).resolve().quantized is False
+        assert ExportConfig(profile=profile, quantized=True).resolve().quantized is True
