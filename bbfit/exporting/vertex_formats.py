@@ -59,7 +59,7 @@ def quantized(tree: dict[str, Any], views: list[bytes], cards: Cards) -> list[by
     """The contents of the buffer views of a GLB of cards :func:`on_grid` with integers in place of floats; the JSON changes in place.
 
     Positions and texture coordinates have 16 bits, normals and tangents 8. A unit of all positions is 1/32,767 of the largest distance
-    along an axis from the origin of a vertex's node. A node that has no origin gets the center of its bounds.
+    along an axis from the origin of a vertex's node. Nodes that have no origin get the center of their common bounds.
     """
     geometry = _Geometry(tree, list(views))
     for attributes in (primitive["attributes"] for mesh in tree["meshes"] for primitive in mesh["primitives"]):
@@ -99,16 +99,15 @@ class _Geometry:
 
     def quantize_positions(self) -> None:
         """Store positions as integers, and let their nodes scale and move them. Each mesh has one node and one primitive."""
-        places = list[tuple[dict[str, Any], int, NDArray[np.float64], NDArray[np.float64]]]()
-        for node in self._tree["nodes"]:
-            if "mesh" in node:
-                (primitive,) = self._tree["meshes"][node["mesh"]]["primitives"]
-                number = primitive["attributes"]["POSITION"]
-                points, moved = self._floats(number), node.pop("matrix", None)
-                origin = np.zeros(3) if moved else (points.min(0) + points.max(0)) / 2
-                places.append((node, number, origin, np.array(moved[12:15] if moved else origin)))
-        farthest = max(float(np.abs(self._floats(number) - origin).max()) for _, number, origin, _ in places)
+        nodes = [node for node in self._tree["nodes"] if "mesh" in node]
+        numbers = [self._tree["meshes"][node["mesh"]]["primitives"][0]["attributes"]["POSITION"] for node in nodes]
+        points = [self._floats(number) for number in numbers]
+        moved = [node.pop("matrix", None) for node in nodes]
+        free = np.concatenate([own for own, matrix in zip(points, moved, strict=True) if matrix is None] or [np.zeros((1, 3))])
+        center = (free.min(0) + free.max(0)) / 2
+        origins = [center if matrix is None else np.zeros(3) for matrix in moved]
+        farthest = max(float(np.abs(own - origin).max()) for own, origin in zip(points, origins, strict=True))
         unit = float(f"{farthest / _INTEGERS[_SHORT][1]:.6g}")  # split models have a node for each card, which all name it
-        for node, number, origin, place in places:
+        for node, number, origin, matrix in zip(nodes, numbers, origins, moved, strict=True):
             self.put(number, _SHORT, unit, origin)
-            node |= {"translation": place.tolist(), "scale": [unit] * 3}
+            node |= {"translation": origin.tolist() if matrix is None else matrix[12:15], "scale": [unit] * 3}
