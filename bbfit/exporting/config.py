@@ -45,7 +45,7 @@ class Program:
     nearest: bool = False
     """Whether it sorts nodes by the nearest points of their bounding spheres, not by the centers of their bounds."""
     quantized: bool = False
-    """Whether it reads positions, normals and tangents that are integers (KHR_mesh_quantization)."""
+    """Whether it reads vertices of integers (KHR_mesh_quantization)."""
 
 
 _PROGRAMS: dict[Profile | None, Program] = {
@@ -104,8 +104,8 @@ class ExportConfig:
     mip_files: bool = False
     """Also write the mip levels as PNG files beside the model, for programs that import them."""
     quantized: bool | None = None
-    """Store positions of 16 bits, and normals and tangents of 8 bits, for programs with KHR_mesh_quantization.
-    Default: for the profiles of web viewers and Filament, which have it. Other programs may refuse such a file."""
+    """Store positions and texture coordinates of a GLB with 16 bits, normals and tangents with 8 (KHR_mesh_quantization).
+    Default: for the profiles of web viewers and Filament, which read this. Other programs may refuse such a file."""
     material: Material | None = None
     """unlit: colors as they are, with the light that the tree was rendered in. pbr: a rough dielectric that the program lights again.
     emissive: a black metal that emits the colors, for programs that do not show unlit right.
