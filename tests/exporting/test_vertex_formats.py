@@ -52,7 +52,7 @@ def test_a_viewer_shows_the_same_in_fewer_bytes(kind: str, clouds: dict[str, Bil
     for index in range(len(orbit)):
         shown, expected = view_glb(integers, orbit[index]), view_glb(floats, orbit[index])
         assert expected[..., 3].max() > 0.5
-        assert abs(shown - expected).max() < 1 / 255  # measured 0.07 / 255: positions are rounded to 0.02 mm
+        assert abs(shown - expected).max() < 1 / 255  # measured 0.81 / 255: noise for texels, and positions that move by 0.02 mm
 
 
 def test_a_corner_moves_along_its_texture(crossed: BillboardCloud) -> None:

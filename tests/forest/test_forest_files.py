@@ -11,12 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from billboard_scene import crossing_billboards
 from khronos import messages
 from numpy.typing import NDArray
 from small_library import small_library
 
 from bbfit.checks import InputError
 from bbfit.cli import main
+from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.model import export
 from bbfit.forest import tileset, usd_stage
 from bbfit.forest.building import Forest, build_forest, read_forest
 from bbfit.forest.config import ForestConfig, RegisterConfig, ScatterConfig
@@ -268,6 +271,25 @@ def test_usd_textures_wrap_as_those_of_gltf(sampler: bytes, wraps: tuple[str, st
     assert textures
     for prim in textures:
         assert tuple(prim.GetAttribute(f"inputs:{side}").Get() for side in ("wrapS", "wrapT")) == wraps
+
+
+@pytest.mark.node
+def test_trees_of_integers_have_the_vertices_of_those_of_floats(tmp_path: Path) -> None:
+    usd, geom = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
+    vertices = list[NDArray[np.float64]]()
+    for quantized in (True, False):
+        folder = tmp_path / str(quantized)
+        small_library(library := folder / "library")
+        export(crossing_billboards(), library / "trees/oak_LOD0.glb", ExportConfig(quantized=quantized))
+        forest = build_forest(register(folder), library, folder / "out", ForestConfig(formats=("glb", "usd"))).folder
+        required = split_glb((forest / "forest.glb").read_bytes())[0]["extensionsRequired"]
+        assert ("KHR_mesh_quantization" in required) == quantized
+        assert not [message for message in messages(forest / "forest.glb") if message["code"] not in REMARKS]
+        stage = usd.Stage.Open(str(forest / "usd" / "trees" / "tree_0.usdc"))
+        meshes = [geom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(geom.Mesh)]
+        sides = [(mesh.GetPointsAttr().Get(), geom.PrimvarsAPI(mesh).GetPrimvar("st").Get()) for mesh in meshes]
+        vertices.append(np.concatenate([np.concatenate([np.array(points), np.array(uvs)], -1) for points, uvs in sides]))
+    np.testing.assert_allclose(*vertices, atol=1e-4)  # units of 0.05 mm, and corners that move with their textures
 
 
 def test_an_interrupted_build_continues(library: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forest: Forest) -> None:
