@@ -27,7 +27,7 @@ VERSIONS: Mapping[str, int] = {
     "evaluate": 19,
     "report": 13,
     "lod": 10,
-    "compare": 8,
+    "compare": 9,
     "frames": 2,
     "library": 3,
     "forest": 3,

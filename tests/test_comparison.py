@@ -20,12 +20,15 @@ from bbfit.checks import InputError
 from bbfit.comparison.config import LIT, SYSTEMS, CompareConfig
 from bbfit.comparison.many_trees import compare_trees
 from bbfit.comparison.one_tree import CompareResult, compare
-from bbfit.evaluation.scoring import evaluate
+from bbfit.evaluation.afar import score_afar
+from bbfit.evaluation.scoring import evaluate_model
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
+from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.pipeline import RunConfig
+from bbfit.rendering.cards import CardRenderer
 from bbfit.reporting.comparison_summary import COSTS, front, summaries
 from bbfit.trees.config import GrowConfig
 from bbfit.views.dataset import ViewDataset
@@ -49,6 +52,8 @@ SMALL = CompareConfig(
     mesh_vertices_many=120,
     mesh_steps=6,
     field_steps=6,
+    tree_height=30,
+    fragments_per_triangle=2.5,
 )
 CODED = ("height-fields", "draco", "radiance-field")  # they ship no model that programs draw
 OCTAHEDRAL = [system for system in SYSTEMS if system.startswith("octahedral")]
@@ -97,11 +102,30 @@ def test_costs_are_those_of_the_models(done: CompareResult) -> None:
     assert costs["radiance-field"].bytes == (done.folder / "radiance-field" / "field.bin").stat().st_size
 
 
+def test_drawing_from_afar_costs_fragments_and_triangles(done: CompareResult) -> None:
+    """Pictures of half of the views' size, in which the tree is 30 pixels high."""
+    sizes = [row.far.tree_pixels for row in done.rows if row.far]
+    assert len(sizes) == len(SYSTEMS) - 1 and min(sizes) == max(sizes) == pytest.approx(30, abs=0.5)
+    for row in done.rows:
+        if row.system == "draco":
+            assert row.far is row.costs.triangles is row.costs.drawing is None
+            continue
+        assert row.far and 5 < row.far.psnr < 40 and 0 < row.far.flip < 1, row.system
+        if row.system in CODED:
+            assert row.far.fragments is row.costs.triangles is row.costs.drawing is None
+            continue
+        triangles = glb_counts((done.folder / row.system / "model.glb").read_bytes())[1]
+        assert row.costs.triangles == triangles and row.far.fragments is not None  # both slicings are drawn at a time
+        assert row.costs.drawing == row.far.fragments + 2.5 * triangles and 10 < row.far.fragments < 30_000, row.system
+
+
 def test_bbfits_row_is_its_run(done: CompareResult) -> None:
     cloud = BillboardCloud.load(done.folder / "bbfit" / "run" / "cloud.safetensors")
-    report = evaluate(cloud, ViewDataset.load(done.folder / "views").test, export=ExportConfig(outline="rectangle"))
+    views, model = ViewDataset.load(done.folder / "views").test, shipped_model(cloud, ExportConfig(outline="rectangle"))
+    report = evaluate_model(model, views)
     row = next(row for row in done.rows if row.system == "bbfit")
     assert row.measures == report.antialiased and cloud.alpha.kind == "mask" and row.costs.shaded == report.shaded
+    assert row.far == score_afar(model.antialiased().draw, views, 30, CardRenderer(model.cards).fragments)
     assert BillboardCloud.load(done.folder / "bbfit-blend" / "run" / "cloud.safetensors").alpha.kind == "blend"
 
 
@@ -148,6 +172,10 @@ def test_nothing_is_done_twice_and_a_missing_package_leaves_one_out(done: Compar
     told = list[str]()
     again = compare(TREE, done.folder, SMALL, STAGES, on_progress=lambda stage, now, total, note="": told.append(stage))
     assert again.rows == done.rows and set(told) == {"systems"}
+    slower = compare(TREE, done.folder, replace(SMALL, fragments_per_triangle=100), STAGES).rows
+    assert [(row.costs.drawing or 0) - (before.costs.drawing or 0) for row, before in zip(slower, done.rows, strict=True)] == pytest.approx(
+        [0 if before.costs.drawing is None else 97.5 * (before.costs.triangles or 0) for before in done.rows]
+    )
     assert times == {path: path.stat().st_mtime_ns for path in done.folder.glob("*/result.json")}
     (done.folder / "draco" / "result.json").unlink()
     monkeypatch.setitem(sys.modules, "DracoPy", None)
@@ -187,12 +215,17 @@ def test_trees_are_compared_by_means_and_spreads(tmp_path: Path) -> None:
     sizes = [rows["crossed"].costs.bytes or 0 for rows in every]
     size = systems["crossed"].costs["bytes"]
     assert size is not None and size.mean == pytest.approx(np.exp(np.mean(np.log(sizes))))
+    afar = [rows["crossed"].far for rows in every]
+    far = systems["crossed"].far
+    assert far is not None and far.flip.mean == pytest.approx(np.mean([each.flip for each in afar if each]))
+    assert systems["crossed"].quality("psnr", "drawing") == far.psnr != systems["crossed"].quality("psnr", "bytes")
     for cost in COSTS:
         assert {each.system for each in front(list(systems.values()), cost, "psnr")} <= {"bbfit", "crossed"}
     with (done.folder / "summary.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
     assert [(line["tree"], line["system"]) for line in lines] == [(name, row.system) for name, rows in done.rows.items() for row in rows]
     text = (done.folder / "summary.md").read_text()
+    assert "## From afar: 30 pixels high" in text and "- FLIP and drawing: " in text
     assert "Means over 3 trees" in text and "| slicing and blending, 2 x 2 slices* |" in text
     with Image.open(done.folder / "pareto.png") as picture:
         assert min(picture.size) > 400

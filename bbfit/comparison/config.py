@@ -88,6 +88,11 @@ class CompareConfig(WorkersConfig):
     """Optimizer steps of a learned mesh."""
     field_steps: Count = 3000
     """Optimizer steps of a radiance field."""
+    tree_height: Count = 100
+    """Height of the tree in pixels in the smaller pictures of the score from afar."""
+    fragments_per_triangle: Annotated[float, Range(0, 1e6)] = 3.4
+    """How many pixels of triangles (fragments) are shaded in the time that a triangle takes; bbfit frames measures it.
+    The cost of drawing counts fragments and triangles."""
 
     def __post_init__(self) -> None:
         for system in self.systems:

@@ -24,7 +24,7 @@ from bbfit.files import write_bytes
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import premultiply, read_rgba
+from bbfit.images import read_rgba
 from bbfit.outputs import output_folder
 from bbfit.rendering.cards import CardRenderer
 from bbfit.rivals.baking import tree_triangles
@@ -38,6 +38,7 @@ from bbfit.rivals.octahedral import octahedral_impostor
 from bbfit.rivals.octahedral_files import THREE_PROGRAM, impostor_glb, three_program
 from bbfit.rivals.radiance_field import learn_radiance_field
 from bbfit.rivals.slicing import slicing
+from bbfit.views.view_set import ViewSet
 
 _RECTANGLE = ExportConfig(outline="rectangle")
 # The triangles of a quad.
@@ -104,17 +105,18 @@ def _sliced(subject: Subject, folder: Path) -> SystemResult:
     def fragments(camera: Camera) -> float:
         return sum(renderers[index].fragments(camera) for index, weight in slices.weights(camera) if weight > 0)
 
-    cameras, planes = subject.views.test.cameras, sum(map(len, slices.clouds))
+    triangles = round(glb_counts(model.glb)[1] * min(2, len(slices.clouds)) / len(slices.clouds))
     note = "two of the slicings are drawn at a time, and their pictures are mixed, which requires a shader"
     seconds = time.perf_counter() - started
     return SystemResult(
         model.glb,
         model.cards.vertex_count,
         seconds,
-        lambda index: slices.draw(cameras[index]),
-        planes,
+        slices.draw,
+        sum(map(len, slices.clouds)),
         note,
         fragments=fragments,
+        triangles=triangles,
         shader=True,
     )
 
@@ -137,13 +139,13 @@ def _octahedral(options: dict[str, Any], subject: Subject, folder: Path) -> Syst
         on_progress=subject.on(folder, "bake"),
     )
     impostor = replace(impostor, **options)
-    model, cameras = impostor_glb(impostor), subject.views.test.cameras
+    model = impostor_glb(impostor)
     write_bytes(folder / THREE_PROGRAM, three_program())
     return SystemResult(
         model,
         glb_counts(model)[0],
         shared + time.perf_counter() - started,
-        lambda index: impostor.draw(cameras[index]),
+        impostor.draw,
         planes=1,
         note="a shader blends three frames; one quad",
         fragments=lambda camera: triangle_fragments(impostor.quad(camera)[_QUAD], camera),
@@ -215,12 +217,12 @@ def _learned(vertices: int, subject: Subject, folder: Path) -> SystemResult:
         seed=subject.stages.fit.seed,
         on_step=lambda step, loss: on_progress(step, steps),
     )
-    model, cameras = mesh_glb(mesh), subject.views.test.cameras
+    model = mesh_glb(mesh)
     return SystemResult(
         model,
         len(mesh.vertices),
         time.perf_counter() - started,
-        lambda index: mesh.draw(cameras[index]),
+        mesh.draw,
         note="blended, so its triangles must be sorted",
         fragments=partial(triangle_fragments, mesh.vertices[mesh.faces].double()),
     )
@@ -232,12 +234,12 @@ def _radiance_field(subject: Subject, folder: Path) -> SystemResult:
         subject.views.train, steps=steps, seed=subject.stages.fit.seed, on_step=lambda step, loss: on_progress(step, steps)
     )
     write_bytes(folder / "field.bin", field.to_bytes())
-    seconds, cameras = time.perf_counter() - started, subject.views.test.cameras
+    seconds = time.perf_counter() - started
     drawn, camera = time.perf_counter(), subject.views.train.cameras[0]
     field.draw(camera)
     drawn = time.perf_counter() - drawn
     note = f"{drawn:.2f} s a frame of {camera.width} x {camera.height} pixels on this CPU; {field.samples(camera):.0f} samples a ray"
-    return SystemResult(None, None, seconds, lambda index: field.draw(cameras[index]), note=note, size=field.bytes, shader=True)
+    return SystemResult(None, None, seconds, field.draw, note=note, size=field.bytes, shader=True)
 
 
 def _rendered(model: bytes, subject: Subject, folder: Path, seconds: float, note: str) -> SystemResult:
@@ -253,7 +255,7 @@ def _rendered(model: bytes, subject: Subject, folder: Path, seconds: float, note
         model,
         glb_counts(model)[0],
         seconds,
-        lambda index: premultiply(torch.from_numpy(read_rgba(paths[index])).double() / 255),
+        ViewSet(tuple(paths), cameras, lambda picture: torch.from_numpy(read_rgba(picture))).draw,
         note=note,
         fragments=partial(triangle_fragments, torch.tensor(tree_triangles(path))),
     )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bbfit.comparison.config import CompareConfig
 from bbfit.evaluation.light import LightScore
-from bbfit.evaluation.scoring import held_out, score_model_light
+from bbfit.evaluation.scoring import score_model_light
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.fitting.initialize import pixels_per_meter
@@ -74,8 +74,9 @@ class SystemResult:
     """Vertices of the model."""
     seconds: float
     """Time of making it."""
-    draw: Callable[[int], Tensor] | None
-    """Draws a held-out view as premultiplied RGBA. ``None`` if the result looks like the tree itself."""
+    draw: Callable[[Camera], Tensor] | None
+    """Draws what the camera of a held-out view sees, or the same camera with a smaller picture, as premultiplied RGBA. ``None`` if the
+    result looks like the tree itself."""
     planes: int | None = None
     """Number of planes; ``None`` for a mesh."""
     note: str = ""
@@ -84,6 +85,8 @@ class SystemResult:
     """Size in bytes if there is no GLB file."""
     fragments: Callable[[Camera], float] | None = None
     """Fragments that a graphics card shades for one camera. ``None`` if that is not known."""
+    triangles: int | None = None
+    """Triangles that are drawn for a picture, if not all of the model's."""
     shader: bool = False
     """Whether a program needs a shader or a decoder of its own to show it."""
     lit: Callable[[Callable[[int, int], None]], LightScore | None] | None = None
@@ -114,7 +117,7 @@ def billboards(subject: Subject, cloud: BillboardCloud, export: ExportConfig, se
         glb,
         model.cards.vertex_count,
         seconds + time.perf_counter() - started,
-        lambda index: held_out(drawn.draw, subject.views.test, index)[1],
+        drawn.draw,
         len(cloud),
         "drawn with alpha to coverage" if cloud.alpha.tested else "",
         fragments=CardRenderer(model.cards).fragments,

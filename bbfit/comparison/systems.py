@@ -14,10 +14,13 @@ from bbfit.comparison.config import CompareConfig
 from bbfit.comparison.own_systems import own_systems
 from bbfit.comparison.rival_systems import rival_systems
 from bbfit.comparison.subject import Subject
+from bbfit.evaluation.afar import drawing_cost, score_afar
 from bbfit.evaluation.measures import Measures, mean_measures
-from bbfit.evaluation.scoring import score_views
+from bbfit.evaluation.scoring import drawn_view, score_views
 from bbfit.evaluation.shading import score_shading
+from bbfit.exporting.lod import glb_counts
 from bbfit.files import read_json, remove_parts, write_bytes, write_json
+from bbfit.geometry.camera import Camera
 from bbfit.images import to_bytes, unpremultiply, write_png
 from bbfit.inputs import reading
 from bbfit.outputs import output_folder, used_folder
@@ -51,16 +54,20 @@ class Systems:
             result = chosen.simplify(subject, folder)
             if result.model is not None:
                 write_bytes(folder / "model.glb", result.model)
-            measures = None if result.draw is None else self._score(system, result.draw, output_folder("out", folder / "held_out"))
+            measures = far = None
+            if result.draw is not None:
+                measures = self._score(system, result.draw, output_folder("out", folder / "held_out"))
+                far = score_afar(result.draw, subject.views.test, subject.config.tree_height, result.fragments)
             score = None if result.lit is None else result.lit(partial(subject.on_progress, f"{system} light"))
             light = None if score is None else score.figures
             size = result.size if result.model is None else len(result.model)
             shaded = None if result.fragments is None else score_shading(result.fragments, subject.views.test)
-            costs = CompareCosts(result.planes, result.vertices, size, round(result.seconds, 1), shaded, result.shader)
-            write_json(folder / "result.json", CompareRow(system, chosen.title, costs, measures, result.note, light).to_json())
+            triangles = glb_counts(result.model)[1] if result.triangles is None and result.model is not None else result.triangles
+            costs = CompareCosts(result.planes, result.vertices, size, round(result.seconds, 1), shaded, result.shader, triangles)
+            write_json(folder / "result.json", CompareRow(system, chosen.title, costs, measures, result.note, light, far).to_json())
 
         shared = (subject.stages.fit, subject.stages.export, _VERSIONS)
-        inputs = (system, subject.tree.digest, subject.views.fingerprint, chosen.inputs, *shared)
+        inputs = (system, subject.tree.digest, subject.views.fingerprint, chosen.inputs, subject.config.tree_height, *shared)
         outputs = (
             f"{system}/result.json",
             f"{system}/model*.glb",
@@ -75,19 +82,20 @@ class Systems:
         except InputError as error:
             if "is not installed" not in str(error) and "LLVM" not in str(error):
                 raise
-            return CompareRow(system, chosen.title, CompareCosts(), None, str(error), None)
+            return CompareRow(system, chosen.title, CompareCosts(), None, str(error), None, None)
         content = read_json("result", folder / "result.json")
         with reading("result", folder / "result.json", "remove it, then start bbfit compare again"):
-            row = replace(CompareRow.from_json(content), title=chosen.title)
+            row = CompareRow.from_json(content)
             check_record("row", row, CompareRow)
-            return row
+            drawing = drawing_cost(row.far, row.costs.triangles, subject.config.fragments_per_triangle)
+            return replace(row, title=chosen.title, costs=replace(row.costs, drawing=drawing))
 
-    def _score(self, system: str, draw: Callable[[int], Tensor], folder: Path) -> Measures:
+    def _score(self, system: str, draw: Callable[[Camera], Tensor], folder: Path) -> Measures:
         """Compute the mean measures over the held-out views, and save the pictures."""
         views = self._subject.views.test
 
         def draw_and_save(index: int) -> Tensor:
-            image = draw(index).double().cpu().clamp(0, 1)
+            image = drawn_view(draw, views.cameras[index], views.names[index])
             write_png(folder / f"{views.names[index]}.png", to_bytes(unpremultiply(image)))
             return image
 

@@ -196,12 +196,16 @@ def held_out(draw: Callable[[Camera], Tensor], views: ViewSet, index: int) -> tu
     ``draw`` returns what one camera sees, premultiplied RGBA [H, W, 4] (:meth:`~bbfit.exporting.model.ShippedModel.draw`). Raises
     InputError if the picture cannot be read, or if the render has values that are not finite.
     """
-    target = views.targets([index], torch.float64)[0]
+    return views.targets([index], torch.float64)[0], drawn_view(draw, views.cameras[index], views.names[index])
+
+
+def drawn_view(draw: Callable[[Camera], Tensor], camera: Camera, name: str) -> Tensor:
+    """The render of one camera as it is measured, like that of :func:`held_out`. ``name`` is that of the view in an error."""
     with torch.inference_mode():
-        image = draw(views.cameras[index]).double().cpu()
+        image = draw(camera).double().cpu()
     if not image.isfinite().all():
-        fail("cloud", f"its render of view {views.names[index]} has values that are not finite", "fit it again")
-    return target, image.clamp(0, 1)
+        fail("cloud", f"its render of view {name} has values that are not finite", "fit it again")
+    return image.clamp(0, 1)
 
 
 def views_psnr(draw: Callable[[Camera], Tensor], views: ViewSet) -> float:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bbfit.evaluation import metrics
+from bbfit.evaluation.afar import seen_afar
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
 from bbfit.evaluation.scoring import view_angles
 from bbfit.frames.browser import FieldPage
@@ -44,24 +45,22 @@ def size_error(model: DrawnModel, page: FieldPage, views: ViewSet, tree_pixels: 
     """
     flips, psnrs, heights = [], [], []
     for index in spread_views(view_angles(views.cameras).numpy(), count):
-        target = views.targets([index], torch.float64)[0]
-        rows = np.flatnonzero(target[..., 3].amax(1).numpy() > 0)
-        if len(rows) == 0:
+        view = seen_afar(views, index, tree_pixels)
+        if view is None:
             continue
-        share = min(1.0, tree_pixels / (rows[-1] + 1 - rows[0]))
-        size = max(metrics.SSIM_WINDOW, round(share * views.cameras.width)), max(metrics.SSIM_WINDOW, round(share * views.cameras.height))
-        heights.append((rows[-1] + 1 - rows[0]) * size[1] / views.cameras.height)
-        target = shrunk(target, *size)
+        target, camera = view.target, view.camera
+        heights.append(view.tree_pixels)
         rendered = None
         for name, color in BACKGROUNDS.items():
             if rendered is None:
                 background = torch.tensor(color, dtype=torch.float64)
-                pair = over_color(target, background).numpy(), _drawn(page, views.cameras[index].resized(*size), color).numpy()
+                pair = over_color(target, background).numpy(), _drawn(page, camera, color).numpy()
                 level = page.call("level")
                 if model.lit[level]:
                     if not (model.pictures and model.pictures[level]):
                         return None
-                    rendered = shrunk(premultiply(torch.from_numpy(read_rgba(model.pictures[level][index])).double() / 255), *size)
+                    picture = premultiply(torch.from_numpy(read_rgba(model.pictures[level][index])).double() / 255)
+                    rendered = shrunk(picture, camera.width, camera.height)
             if rendered is not None:
                 pair = over_background(target, rendered, name)
             flips.append(metrics.flip(*pair))

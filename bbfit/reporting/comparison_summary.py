@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, geometric_mean, stdev
 
 from bbfit.budget.choice import pareto_front
-from bbfit.reporting.comparison_tables import CompareCosts, CompareRow
+from bbfit.reporting.comparison_tables import FAR, FAR_HEAD, FAR_INTRO, CompareCosts, CompareRow, far_figures, far_heading
 from bbfit.reporting.plots import write_figure
 from bbfit.reporting.sweep_tables import markdown
 
@@ -20,8 +19,9 @@ COSTS = {
     "vertices": "vertices",
     "shaded": "shaded pixels for each covered pixel",
     "seconds": "seconds to make",
+    "drawing": "drawing from afar: shaded pixels and triangles, in pixels",
 }
-"""The costs that fronts are drawn against, with their names in pictures."""
+"""The costs that fronts are drawn against, with their names in pictures. The quality at the cost of drawing is that from afar."""
 _QUALITIES = {"psnr": "PSNR, dB, mean over backgrounds", "flip": "FLIP, mean over backgrounds, lower is better"}
 
 
@@ -33,6 +33,20 @@ class Spread:
     """The mean; for costs the geometric mean."""
     deviation: float
     """The standard deviation over the trees, 0 for one tree."""
+
+
+@dataclass(frozen=True)
+class FarSummary:
+    """The scores of one system from afar, over trees."""
+
+    psnr: Spread
+    """PSNR in dB, a mean over backgrounds and views."""
+    flip: Spread
+    """FLIP in [0, 1], a mean over backgrounds and views."""
+    triangles: Spread | None
+    """Triangles that are drawn; ``None`` if not known."""
+    fragments: Spread | None
+    """Fragments that a graphics card shades for a picture; ``None`` if not known."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +67,14 @@ class SystemSummary:
     """FLIP in [0, 1], a mean over backgrounds and views."""
     costs: Mapping[str, Spread | None]
     """By the names of :data:`COSTS`; ``None`` where one is not known for all trees."""
+    far: FarSummary | None
+    """The same from afar; ``None`` where it was not scored on all trees."""
+
+    def quality(self, name: str, cost: str) -> Spread | None:
+        """``psnr`` or ``flip`` in the pictures that a cost of :data:`COSTS` is about."""
+        scores = self.far if cost == "drawing" else self
+        quality: Spread | None = None if scores is None else getattr(scores, name)
+        return quality
 
 
 def summaries(rows: Mapping[str, Sequence[CompareRow]]) -> list[SystemSummary]:
@@ -64,7 +86,6 @@ def summaries(rows: Mapping[str, Sequence[CompareRow]]) -> list[SystemSummary]:
 
 def _summary(rows: Sequence[CompareRow]) -> SystemSummary:
     over = [row.measures.over.mean for row in rows if row.measures is not None]
-    costs = {name: [getattr(row.costs, name) for row in rows] for name in COSTS}
     return SystemSummary(
         rows[0].system,
         rows[0].title,
@@ -72,8 +93,26 @@ def _summary(rows: Sequence[CompareRow]) -> SystemSummary:
         rows[0].costs.shader,
         _spread([each.psnr for each in over]),
         _spread([each.flip for each in over]),
-        {name: None if any(not value for value in values) else _spread(values, costs=True) for name, values in costs.items()},
+        {name: _costs([getattr(row.costs, name) for row in rows]) for name in COSTS},
+        _far(rows),
     )
+
+
+def _far(rows: Sequence[CompareRow]) -> FarSummary | None:
+    scores = [row.far for row in rows if row.far is not None]
+    if len(scores) < len(rows):
+        return None
+    return FarSummary(
+        _spread([score.psnr for score in scores]),
+        _spread([score.flip for score in scores]),
+        _costs([row.costs.triangles for row in rows]),
+        _costs([score.fragments for score in scores]),
+    )
+
+
+def _costs(values: Sequence[float | None]) -> Spread | None:
+    known = [value for value in values if value]
+    return _spread(known, costs=True) if len(known) == len(values) else None
 
 
 def _spread(values: Sequence[float], *, costs: bool = False) -> Spread:
@@ -85,9 +124,15 @@ def front(systems: Sequence[SystemSummary], cost: str, quality: str) -> list[Sys
 
     Those that need a shader or a decoder of their own and those without this cost are left out.
     """
-    able = [(system, spread) for system in systems if not system.shader and (spread := system.costs[cost]) is not None]
+    able = [(each, *point) for each in systems if not each.shader and (point := _point(each, cost, quality)) is not None]
     sign = 1 if quality == "psnr" else -1
-    return [able[index][0] for index in pareto_front([(spread.mean, sign * getattr(each, quality).mean) for each, spread in able])]
+    return [able[index][0] for index in pareto_front([(paid.mean, sign * value.mean) for _, paid, value in able])]
+
+
+def _point(system: SystemSummary, cost: str, quality: str) -> tuple[Spread, Spread] | None:
+    """A cost and the quality in the pictures that it is about; ``None`` if one is not known."""
+    paid, value = system.costs[cost], system.quality(quality, cost)
+    return None if paid is None or value is None else (paid, value)
 
 
 def summary_csv(rows: Mapping[str, Sequence[CompareRow]]) -> bytes:
@@ -95,11 +140,11 @@ def summary_csv(rows: Mapping[str, Sequence[CompareRow]]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     names = list(CompareCosts.__dataclass_fields__)
-    writer.writerow(["tree", "system", *names, "psnr", "flip", "white_psnr", "white_flip", "note"])
+    writer.writerow(["tree", "system", *names, "psnr", "flip", "white_psnr", "white_flip", *(f"far_{name}" for name in FAR), "note"])
     for tree, row in ((tree, row) for tree, of_tree in rows.items() for row in of_tree):
         over = None if row.measures is None else row.measures.over
         figures = [None] * 4 if over is None else [over.mean.psnr, over.mean.flip, over.white.psnr, over.white.flip]
-        writer.writerow([tree, row.system, *vars(row.costs).values(), *figures, row.note])
+        writer.writerow([tree, row.system, *vars(row.costs).values(), *figures, *far_figures(row.far), row.note])
     return text.getvalue().encode(errors="backslashreplace")
 
 
@@ -117,6 +162,7 @@ def summary_markdown(rows: Mapping[str, Sequence[CompareRow]], failures: Mapping
         f"Means over {len(rows)} trees; costs are geometric means, and ± is the standard deviation over the trees. PSNR and FLIP are means "
         "over four backgrounds. Systems with a star need a shader or a decoder of their own in every program.",
         markdown(head, table),
+        *_far_parts(rows, systems),
         "## Fronts",
         "Which systems does no other match that costs no more? Systems with a star are left out. From cheap to dear:",
         "\n".join(
@@ -130,6 +176,17 @@ def summary_markdown(rows: Mapping[str, Sequence[CompareRow]], failures: Mapping
     if failures:
         parts += ["## Trees that failed", "\n".join(f"- {name}: {reason}" for name, reason in failures.items())]
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
+
+
+def _far_parts(rows: Mapping[str, Sequence[CompareRow]], systems: Sequence[SystemSummary]) -> list[str]:
+    """The parts of the document about pictures from afar; none if no system was scored there."""
+    table = []
+    for each in systems:
+        if each.far is not None:
+            costs = [_number(cost) for cost in (each.far.triangles, each.far.fragments, each.costs["drawing"])]
+            table.append([each.title + ("*" if each.shader else ""), *costs, f"{each.far.psnr.mean:.2f}", f"{each.far.flip.mean:.4f}"])
+    heights = [row.far.tree_pixels for of_tree in rows.values() for row in of_tree if row.far is not None]
+    return [far_heading(fmean(heights)), FAR_INTRO, markdown([*FAR_HEAD], table)] if table else []
 
 
 def _psnrs(rows: Mapping[str, Sequence[CompareRow]], system: str) -> list[str]:
@@ -152,7 +209,7 @@ def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
         return
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(22, 10), dpi=100, layout="constrained")
+    figure = Figure(figsize=(27, 10), dpi=100, layout="constrained")
     axes = figure.subplots(len(_QUALITIES), len(COSTS), sharex="col", sharey="row")
     for line, quality in enumerate(_QUALITIES):
         for column, cost in enumerate(COSTS):
@@ -165,9 +222,10 @@ def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
             if len(best) > 1:
                 axis.step(*_corners(best, cost, quality), where="post", color="#9aa3ad", linewidth=1, zorder=1)
             for number, each in enumerate(systems):
-                spread, value, own = each.costs[cost], getattr(each, quality), each.system.startswith("bbfit")
-                if spread is None:
+                point, own = _point(each, cost, quality), each.system.startswith("bbfit")
+                if point is None:
                     continue
+                spread, value = point
                 color, at = f"C{number % 10}", (spread.mean, value.mean)
                 axis.errorbar(*at, value.deviation, color=color, elinewidth=0.6, alpha=0.5, zorder=2)
                 face = "none" if each.shader else color
@@ -181,6 +239,5 @@ def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
 
 
 def _corners(systems: Sequence[SystemSummary], cost: str, quality: str) -> tuple[list[float], list[float]]:
-    return [spread.mean if (spread := each.costs[cost]) else math.nan for each in systems], [
-        getattr(each, quality).mean for each in systems
-    ]
+    points = [point for each in systems if (point := _point(each, cost, quality)) is not None]
+    return [paid.mean for paid, _ in points], [value.mean for _, value in points]

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bbfit.checks import check_record
+from bbfit.evaluation.afar import FarScore
 from bbfit.evaluation.measures import Measures
 from bbfit.evaluation.scoring import OriginalTree, view_angles
 from bbfit.files import write_bytes
@@ -30,9 +31,17 @@ _MEASURES = (
     *("color_delta_e", "color_chroma", "color_brightness", "thesis_psnr"),
 )
 _LIGHT = ("psnr", "flip", "low", "r2")
+FAR = tuple(entry.name for entry in fields(FarScore))
+"""The names of the figures of a score from afar."""
 _INTRO = """Means over the held-out views, which are the same for all systems. PSNR, SSIM and FLIP are also means over four backgrounds.
 *Shaded* is the number of pixels that a graphics card shades for each pixel that the tree covers. Systems with a star need a
 shader or a decoder of their own in every program."""
+FAR_INTRO = """Means over the held-out views, each averaged to the size at which the tree is that high (`--tree-height`).
+*Shaded* is the number of pixels that a graphics card shades for a picture. *Drawing* adds the number that it could shade in the
+time that the triangles take (`--fragments-per-triangle`)."""
+"""What the figures from afar are."""
+FAR_HEAD = ("system", "triangles", "shaded", "drawing", "PSNR, dB", "FLIP")
+"""Headings of the table about pictures from afar."""
 # Headings of the measures in compare.md.
 _SHOWN = ("PSNR, dB", "SSIM", "FLIP", "PSNR over white", "silhouette IoU", "sharpness", "color ΔE", "chroma", "brightness")
 
@@ -53,6 +62,10 @@ class CompareCosts:
     """Fragments that a graphics card shades over the pixels that the tree covers (:func:`bbfit.evaluation.shading.score_shading`)."""
     shader: bool = False
     """Whether a program needs a shader or a decoder of its own to show it."""
+    triangles: int | None = None
+    """Triangles that are drawn for a picture."""
+    drawing: float | None = None
+    """Cost of drawing it from afar, in fragments (:func:`bbfit.evaluation.afar.drawing_cost`)."""
 
 
 @dataclass(frozen=True)
@@ -71,18 +84,22 @@ class CompareRow:
     """A remark for the reader."""
     light: Mapping[str, float | None] | None
     """PSNR, FLIP, PSNR of blocks and R2 under the suns of held-out views (``LightScore.figures``); ``None`` where that was not scored."""
+    far: FarScore | None
+    """The score from afar; ``None`` where nothing was drawn."""
 
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON holds them."""
         measures = None if self.measures is None else self.measures.to_json()
-        return vars(self) | {"costs": asdict(self.costs), "measures": measures}
+        far = None if self.far is None else asdict(self.far)
+        return vars(self) | {"costs": asdict(self.costs), "measures": measures, "far": far}
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> CompareRow:
         """The row that :meth:`to_json` returned."""
-        measures, costs = content["measures"], CompareCosts(**content["costs"])
+        measures, far, costs = content["measures"], content["far"], CompareCosts(**content["costs"])
         check_record("costs", costs, CompareCosts)
-        return CompareRow(**{**content, "costs": costs, "measures": None if measures is None else Measures.from_json(measures)})
+        known = {"measures": None if measures is None else Measures.from_json(measures), "far": None if far is None else FarScore(**far)}
+        return CompareRow(**{**content, "costs": costs, **known})
 
 
 def compare_csv(rows: Sequence[CompareRow]) -> bytes:
@@ -90,11 +107,18 @@ def compare_csv(rows: Sequence[CompareRow]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     costs = [entry.name for entry in fields(CompareCosts)]
-    writer.writerow(["system", "title", *costs, *_MEASURES, *(f"light_{name}" for name in _LIGHT), "note"])
+    names = [*_MEASURES, *(f"far_{name}" for name in FAR), *(f"light_{name}" for name in _LIGHT)]
+    writer.writerow(["system", "title", *costs, *names, "note"])
     for row in rows:
         light = [None if row.light is None else row.light[name] for name in _LIGHT]
-        writer.writerow([row.system, row.title, *vars(row.costs).values(), *_measures(row.measures), *light, row.note])
+        scores = [*_measures(row.measures), *far_figures(row.far), *light]
+        writer.writerow([row.system, row.title, *vars(row.costs).values(), *scores, row.note])
     return text.getvalue().encode(errors="backslashreplace")
+
+
+def far_figures(score: FarScore | None) -> list[float | None]:
+    """The figures of a score from afar by the names in :data:`FAR`."""
+    return [None if score is None else getattr(score, name) for name in FAR]
 
 
 def _measures(measures: Measures | None) -> list[float | None]:
@@ -116,7 +140,24 @@ def compare_markdown(rows: Sequence[CompareRow], original: OriginalTree) -> str:
         table.append([row.title + ("*" if costs.shader else ""), *counts, shaded, seconds, *_shown(row.measures)])
     head = ["system", "planes", "vertices", "bytes", "shaded", "seconds", *_SHOWN]
     notes = "".join(f"- {row.title}: {row.note}\n" for row in rows if row.note)
-    return f"# Comparison\n\n{_INTRO}\n\n{markdown(head, table)}\n{_light_markdown(rows)}{notes}"
+    return f"# Comparison\n\n{_INTRO}\n\n{markdown(head, table)}\n{_far_markdown(rows)}{_light_markdown(rows)}{notes}"
+
+
+def _far_markdown(rows: Sequence[CompareRow]) -> str:
+    """The part of the document about pictures from afar; nothing if no system was drawn."""
+    scored = [(row, row.far) for row in rows if row.far is not None]
+    if not scored:
+        return ""
+    table = []
+    for row, far in scored:
+        costs = [_count(value if value is None else round(value)) for value in (row.costs.triangles, far.fragments, row.costs.drawing)]
+        table.append([row.title + ("*" if row.costs.shader else ""), *costs, f"{far.psnr:.2f}", f"{far.flip:.4f}"])
+    return f"{far_heading(scored[0][1].tree_pixels)}\n\n{FAR_INTRO}\n\n{markdown([*FAR_HEAD], table)}\n"
+
+
+def far_heading(tree_pixels: float) -> str:
+    """The heading of the part about pictures in which the tree has this height in pixels."""
+    return f"## From afar: {tree_pixels:.0f} pixels high"
 
 
 def _light_markdown(rows: Sequence[CompareRow]) -> str:

@@ -37,9 +37,10 @@ def test_models_come_from_files_and_folders_and_have_different_names(tmp_path: P
 def test_of_a_comparison_programs_draw_models_and_impostors(tmp_path: Path) -> None:
     """Systems with another shader and without a model are left out."""
     rows = [
-        CompareRow(name, f"the {name}", CompareCosts(shader=name != "plain"), None, "", None) for name in ("plain", "octahedral", "slices")
+        CompareRow(name, f"the {name}", CompareCosts(shader=name != "plain"), None, "", None, None)
+        for name in ("plain", "octahedral", "slices")
     ]
-    rows.append(CompareRow("draco", "the draco", CompareCosts(), None, "", None))
+    rows.append(CompareRow("draco", "the draco", CompareCosts(), None, "", None, None))
     for name in ("plain", "octahedral", "slices"):
         model(tmp_path / name / "model.glb")
     (tmp_path / "octahedral" / THREE_PROGRAM).write_text("")

@@ -8,6 +8,7 @@ import json
 
 import pytest
 
+from bbfit.evaluation.afar import FarScore
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.scoring import OriginalTree
 from bbfit.reporting.comparison_tables import CompareCosts, CompareRow, compare_csv, compare_markdown
@@ -19,12 +20,13 @@ ROWS = [
     CompareRow(
         "bbfit",
         "bbfit, 8 billboards",
-        CompareCosts(8, 32, 1000, 2.5, 4.25),
+        CompareCosts(8, 32, 1000, 2.5, 4.25, triangles=16, drawing=1234.4),
         MEASURES,
         "",
         {"psnr": 19.5, "flip": 0.2, "low": 25.25, "r2": None},
+        FarScore(99.75, 24.5, 0.0625, 1180.0),
     ),
-    CompareRow("draco", "the tree, with Draco", CompareCosts(None, 9000, 500, 0.1, shader=True), None, "not drawn", None),
+    CompareRow("draco", "the tree, with Draco", CompareCosts(None, 9000, 500, 0.1, shader=True), None, "not drawn", None, None),
 ]
 
 
@@ -45,12 +47,15 @@ def test_csv_has_means_over_backgrounds_scores_over_white_and_colors() -> None:
     assert {other[name] for name in wanted} == {""} and other["note"] == "not drawn"
     lights = [f"light_{name}" for name in ("psnr", "flip", "low", "r2")]
     assert [drawn[name] for name in lights] == ["19.5", "0.2", "25.25", ""] and {other[name] for name in lights} == {""}
+    afar = ["far_tree_pixels", "far_psnr", "far_flip", "far_fragments", "triangles", "drawing"]
+    assert [drawn[name] for name in afar] == ["99.75", "24.5", "0.0625", "1180.0", "16", "1234.4"]
+    assert {other[name] for name in afar} == {""}
 
 
 def test_markdown_shows_them_too() -> None:
     head, line, tree, drawn, other = (
         [cell.strip() for cell in text.strip("| ").split("|")]
-        for text in compare_markdown(ROWS, OriginalTree(9000, 10_000)).partition("## Under other suns")[0].splitlines()
+        for text in compare_markdown(ROWS, OriginalTree(9000, 10_000)).partition("## From afar")[0].splitlines()
         if text.startswith("|")
     )
     shown = dict(zip(head, drawn, strict=True))
@@ -58,6 +63,13 @@ def test_markdown_shows_them_too() -> None:
     assert (shown["color ΔE"], shown["chroma"], shown["brightness"]) == ("0.00", "1.00", "0.80")
     assert set(line) == {"---"} and tree[:2] == ["the tree", ""] and other[0] == "the tree, with Draco*"  # it needs a decoder
     assert shown["shaded"] == "4.2"
+
+
+def test_markdown_lists_what_was_scored_from_afar() -> None:
+    text = compare_markdown(ROWS, OriginalTree(9000, 10_000)).partition("## From afar: 100 pixels high")[2].partition("## Under")[0]
+    _, _, line = [line for line in text.splitlines() if line.startswith("| ")]
+    assert line == "| bbfit, 8 billboards | 16 | 1,180 | 1,234 | 24.50 | 0.0625 |"
+    assert "## From afar" not in compare_markdown(ROWS[1:], OriginalTree(9000, 10_000))
 
 
 def test_markdown_lists_what_was_scored_under_other_suns() -> None:
