@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from bbfit.checks import InputError
 from bbfit.comparison.config import LIT, SYSTEMS, CompareConfig
 from bbfit.comparison.many_trees import compare_trees
 from bbfit.comparison.one_tree import CompareResult, compare
+from bbfit.comparison.subject import baking
 from bbfit.evaluation.afar import score_afar
 from bbfit.evaluation.scoring import evaluate_model
 from bbfit.exporting.config import ExportConfig
@@ -87,7 +89,8 @@ def test_costs_are_those_of_the_models(done: CompareResult) -> None:
     assert {system for system, cost in costs.items() if cost.shader} == {"slicing", "height-fields", "radiance-field", *OCTAHEDRAL}
     assert {costs[system].planes for system in OCTAHEDRAL} == {1} and {costs[system].vertices for system in OCTAHEDRAL} == {4}
     assert (costs["octahedral-flat"].bytes or 0) < (costs["octahedral"].bytes or 0)
-    assert (costs["octahedral-mask"].seconds or 0) >= (costs["octahedral"].seconds or 0)  # which contains their bake
+    bake = json.loads((done.folder / "octahedral" / "baked" / "seconds.json").read_text())["seconds"]
+    assert bake > 0.1 and all((costs[system].seconds or 0) >= round(bake, 1) for system in OCTAHEDRAL)
     assert all((done.folder / system / "impostor_three.js").is_file() for system in OCTAHEDRAL)
     assert [system for system in OCTAHEDRAL if (done.folder / system / "baked").exists()] == ["octahedral"]
     assert costs["bbfit"].vertices == 12 and costs["thesis"].vertices == 32 and costs["crossed"].vertices == 8
@@ -194,6 +197,23 @@ def test_a_result_with_a_damaged_cost_is_refused(done: CompareResult) -> None:
     for row in (again, earlier):
         row["costs"].pop("seconds")
     assert again == earlier  # it had changed, so the system was run again
+
+
+def test_seconds_of_a_bake_outlive_it(tmp_path: Path) -> None:
+    """An interrupted bake counts. One that finds its pictures adds nothing."""
+
+    def bake(seconds: float, error: bool = False) -> str:
+        (tmp_path / "baked").mkdir(exist_ok=True)
+        time.sleep(seconds)
+        if error:
+            raise KeyboardInterrupt
+        return "cloud"
+
+    with pytest.raises(KeyboardInterrupt):
+        baking(tmp_path / "baked", lambda: bake(0.2, error=True))
+    cloud, first = baking(tmp_path / "baked", lambda: bake(0.1))
+    assert cloud == "cloud" and first >= 0.3
+    assert baking(tmp_path / "baked", lambda: bake(0.05)) == ("cloud", first)
 
 
 def test_trees_are_compared_by_means_and_spreads(tmp_path: Path) -> None:

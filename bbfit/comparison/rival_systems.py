@@ -15,7 +15,7 @@ from bbfit.blender.conversion import tree_as_glb
 from bbfit.blender.pictures import render_pictures
 from bbfit.comparison.config import CompareConfig
 from bbfit.comparison.own_systems import fits
-from bbfit.comparison.subject import Subject, System, SystemResult, billboards
+from bbfit.comparison.subject import Subject, System, SystemResult, baking, billboards
 from bbfit.evaluation.shading import triangle_fragments
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
@@ -24,7 +24,6 @@ from bbfit.files import write_bytes
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.images import read_rgba
 from bbfit.outputs import output_folder
 from bbfit.rendering.cards import CardRenderer
 from bbfit.rivals.baking import tree_triangles
@@ -83,31 +82,27 @@ def _cloud(count: int) -> System:
 
 
 def _baked(bake: Callable[..., BillboardCloud], subject: Subject, folder: Path) -> SystemResult:
-    started = time.perf_counter()
-    cloud = bake(subject.tree, config=subject.bake, folder=folder / "baked", on_progress=subject.on(folder, "bake"))
-    result = billboards(subject, cloud, _RECTANGLE, 0.0)
-    return replace(result, seconds=time.perf_counter() - started)
+    baked = folder / "baked"
+    cloud, seconds = baking(baked, lambda: bake(subject.tree, config=subject.bake, folder=baked, on_progress=subject.on(folder, "bake")))
+    return billboards(subject, cloud, _RECTANGLE, seconds)
 
 
 def _sliced(subject: Subject, folder: Path) -> SystemResult:
-    started = time.perf_counter()
-    slices = slicing(
-        subject.tree,
-        subject.bake,
-        directions=subject.config.directions,
-        slices=subject.config.slices,
-        folder=folder / "baked",
-        on_progress=subject.on(folder, "bake"),
+    baked, config = folder / "baked", subject.config
+    directions = {"directions": config.directions, "slices": config.slices}
+    slices, seconds = baking(
+        baked, lambda: slicing(subject.tree, subject.bake, **directions, folder=baked, on_progress=subject.on(folder, "bake"))
     )
+    started = time.perf_counter()
     model = shipped_model(BillboardCloud.joined(slices.clouds), _RECTANGLE)
     renderers = [CardRenderer(shipped_model(cloud, _RECTANGLE).cards) for cloud in slices.clouds]
 
     def fragments(camera: Camera) -> float:
         return sum(renderers[index].fragments(camera) for index, weight in slices.weights(camera) if weight > 0)
 
+    seconds += time.perf_counter() - started
     triangles = round(glb_counts(model.glb)[1] * min(2, len(slices.clouds)) / len(slices.clouds))
     note = "two of the slicings are drawn at a time, and their pictures are mixed, which requires a shader"
-    seconds = time.perf_counter() - started
     return SystemResult(
         model.glb,
         model.cards.vertex_count,
@@ -128,23 +123,20 @@ def _impostor(config: CompareConfig, kind: str, **options: Any) -> System:
 
 def _octahedral(options: dict[str, Any], subject: Subject, folder: Path) -> SystemResult:
     """An octahedral impostor. Variants with ``options`` share the frames of the system ``octahedral``, and the time of rendering them."""
-    shared = subject.row("octahedral").costs.seconds or 0.0 if options else 0.0
+    if options:
+        subject.row("octahedral")  # which renders the frames
+    hemisphere, on_progress = subject.config.hemisphere, subject.on(folder, "bake")
+    baked = folder.parent / "octahedral" / ("baked" if hemisphere else "baked_all_around")
+    render = partial(octahedral_impostor, subject.tree, subject.config.frames, subject.bake, hemisphere=hemisphere)
+    impostor, seconds = baking(baked, lambda: render(folder=baked, on_progress=on_progress))
     started = time.perf_counter()
-    impostor = octahedral_impostor(
-        subject.tree,
-        subject.config.frames,
-        subject.bake,
-        hemisphere=subject.config.hemisphere,
-        folder=folder.parent / "octahedral" / ("baked" if subject.config.hemisphere else "baked_all_around"),
-        on_progress=subject.on(folder, "bake"),
-    )
     impostor = replace(impostor, **options)
     model = impostor_glb(impostor)
     write_bytes(folder / THREE_PROGRAM, three_program())
     return SystemResult(
         model,
         glb_counts(model)[0],
-        shared + time.perf_counter() - started,
+        seconds + time.perf_counter() - started,
         impostor.draw,
         planes=1,
         note="a shader blends three frames; one quad",
@@ -255,7 +247,7 @@ def _rendered(model: bytes, subject: Subject, folder: Path, seconds: float, note
         model,
         glb_counts(model)[0],
         seconds,
-        ViewSet(tuple(paths), cameras, lambda picture: torch.from_numpy(read_rgba(picture))).draw,
+        ViewSet.of_files(paths, cameras).draw,
         note=note,
         fragments=partial(triangle_fragments, torch.tensor(tree_triangles(path))),
     )

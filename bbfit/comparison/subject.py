@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from torch import Tensor
 
@@ -16,6 +16,7 @@ from bbfit.evaluation.light import LightScore
 from bbfit.evaluation.scoring import score_model_light
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import ShippedModel, shipped_model
+from bbfit.files import read_json, write_json
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
@@ -26,6 +27,8 @@ from bbfit.rivals.baking import BakeConfig
 from bbfit.stages.stage import OnProgress
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views.dataset import ViewDataset
+
+Baked = TypeVar("Baked")
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,22 @@ class System:
     """Simplifies the tree, with a folder for its files."""
     inputs: tuple[Any, ...] = ()
     """What the result depends on besides the tree, its views, and the options that all fits and exports share."""
+
+
+def baking(folder: Path, bake: Callable[[], Baked]) -> tuple[Baked, float]:
+    """What ``bake`` makes from pictures in a folder, and its seconds.
+
+    ``seconds.json`` there keeps them. Those of an interrupted bake count, and a later one that finds all pictures adds none.
+    """
+    path, started, finished = folder / "seconds.json", time.perf_counter(), False
+    earlier = read_json("seconds", path) if path.is_file() else {"seconds": 0.0, "finished": False}
+    try:
+        baked, finished = bake(), True
+    finally:
+        if not earlier["finished"] and folder.is_dir():
+            earlier = {"seconds": earlier["seconds"] + time.perf_counter() - started, "finished": finished}
+            write_json(path, earlier)
+    return baked, earlier["seconds"]
 
 
 def billboards(subject: Subject, cloud: BillboardCloud, export: ExportConfig, seconds: float) -> SystemResult:

@@ -57,12 +57,14 @@ class Systems:
             measures = far = None
             if result.draw is not None:
                 measures = self._score(system, result.draw, output_folder("out", folder / "held_out"))
-                far = score_afar(result.draw, subject.views.test, subject.config.tree_height, result.fragments)
+                far = score_afar(result.draw, subject.views.test, subject.config.tree_height, result.fragments, system)
             score = None if result.lit is None else result.lit(partial(subject.on_progress, f"{system} light"))
             light = None if score is None else score.figures
             size = result.size if result.model is None else len(result.model)
             shaded = None if result.fragments is None else score_shading(result.fragments, subject.views.test)
-            triangles = glb_counts(result.model)[1] if result.triangles is None and result.model is not None else result.triangles
+            triangles = result.triangles
+            if triangles is None and result.model is not None:
+                triangles = glb_counts(result.model)[1]
             costs = CompareCosts(result.planes, result.vertices, size, round(result.seconds, 1), shaded, result.shader, triangles)
             write_json(folder / "result.json", CompareRow(system, chosen.title, costs, measures, result.note, light, far).to_json())
 
@@ -95,7 +97,7 @@ class Systems:
         views = self._subject.views.test
 
         def draw_and_save(index: int) -> Tensor:
-            image = drawn_view(draw, views.cameras[index], views.names[index])
+            image = drawn_view(draw, views.cameras[index], views.names[index], system)
             write_png(folder / f"{views.names[index]}.png", to_bytes(unpremultiply(image)))
             return image
 

@@ -31,10 +31,10 @@ class FarView:
 
 @dataclass(frozen=True)
 class FarScore:
-    """A model in pictures in which the tree has a given height: means over views."""
+    """A model in pictures as from afar: means over views."""
 
     tree_pixels: float
-    """Height of the tree in pixels."""
+    """Height of the tree in pixels where it is highest."""
     psnr: float
     """PSNR in dB, a mean over backgrounds too."""
     flip: float
@@ -50,41 +50,45 @@ def drawing_cost(score: FarScore | None, triangles: int | None, fragments_per_tr
     return score.fragments + fragments_per_triangle * triangles
 
 
-def seen_afar(views: ViewSet, index: int, tree_pixels: int) -> FarView | None:
-    """One of the views at the size at which the tree is ``tree_pixels`` high in it; ``None`` if the view is empty.
+def shown_height(views: ViewSet, index: int) -> int:
+    """The height of what one of the views shows, in pixels; 0 for an empty view. Raises InputError if the picture cannot be read."""
+    rows = np.flatnonzero(views.image(index)[..., 3].amax(1).numpy())
+    return int(rows[-1] + 1 - rows[0]) if len(rows) else 0
 
-    A view in which the tree is not as high keeps its size. No side gets shorter than 11 pixels
-    (:data:`bbfit.evaluation.metrics.SSIM_WINDOW`). Raises InputError if the picture cannot be read.
+
+def seen_afar(views: ViewSet, index: int, scale: float) -> FarView:
+    """One of the views at a smaller scale, at most 1.
+
+    No side gets shorter than 11 pixels (:data:`bbfit.evaluation.metrics.SSIM_WINDOW`). Raises InputError if the picture cannot be read.
     """
-    target = views.targets([index], torch.float64)[0]
-    rows = np.flatnonzero(target[..., 3].amax(1).numpy() > 0)
-    if len(rows) == 0:
-        return None
-    height = int(rows[-1] + 1 - rows[0])
-    share = min(1.0, tree_pixels / height)
-    size = [max(metrics.SSIM_WINDOW, round(share * side)) for side in (views.cameras.width, views.cameras.height)]
-    return FarView(shrunk(target, *size), views.cameras[index].resized(*size), height * size[1] / views.cameras.height)
+    width, height = (max(metrics.SSIM_WINDOW, round(min(1.0, scale) * side)) for side in (views.cameras.width, views.cameras.height))
+    target = shrunk(views.targets([index], torch.float64)[0], width, height)
+    return FarView(target, views.cameras[index].resized(width, height), shown_height(views, index) * height / views.cameras.height)
 
 
 def score_afar(
-    draw: Callable[[Camera], Tensor], views: ViewSet, tree_pixels: int, fragments: Callable[[Camera], float] | None = None
+    draw: Callable[[Camera], Tensor],
+    views: ViewSet,
+    height: int,
+    fragments: Callable[[Camera], float] | None = None,
+    drawn: str = "cloud",
 ) -> FarScore | None:
-    """Compare a model with views that are averaged to the size at which the tree is ``tree_pixels`` high in them.
+    """Compare a model with views that are averaged to one smaller size, at which the tree is ``height`` pixels high where it is highest.
 
-    ``draw`` is as for :func:`~bbfit.evaluation.scoring.held_out`; ``fragments`` returns what a graphics card shades for one camera. Returns
-    ``None`` if all views are empty. Raises InputError if a picture cannot be read, or if a render has values that are not finite.
+    So all views are as from one distance. If the tree is not as high in any of them, they keep their size. ``draw`` is as for
+    :func:`~bbfit.evaluation.scoring.held_out`; ``fragments`` returns what a graphics card shades for one camera. Returns ``None`` if all
+    views are empty. Raises InputError if a picture cannot be read, or if a render of what is ``drawn`` has values that are not finite.
     """
-    scores = list[tuple[float, float, float]]()
-    shaded = list[float]()
+    highest = max(shown_height(views, index) for index in range(len(views)))
+    if highest == 0:
+        return None
+    scores, shaded, heights = list[tuple[float, float]](), list[float](), list[float]()
     for index in range(len(views)):
-        view = seen_afar(views, index, tree_pixels)
-        if view is None:
-            continue
-        image = drawn_view(draw, view.camera, views.names[index])
-        scores.append((view.tree_pixels, mean_psnr(view.target, image), float(mean_flip_map(view.target, image).mean())))
+        view = seen_afar(views, index, height / highest)
+        image = drawn_view(draw, view.camera, views.names[index], drawn)
+        scores.append((mean_psnr(view.target, image), float(mean_flip_map(view.target, image).mean())))
+        heights.append(view.tree_pixels)
         if fragments is not None:
             shaded.append(fragments(view.camera))
-    if not scores:
-        return None
-    pixels, psnr, flip = np.mean(scores, 0).tolist()
-    return FarScore(pixels, psnr, flip, float(np.mean(shaded)) if shaded else None)
+    psnr, flip = np.mean(scores, 0).tolist()
+    return FarScore(max(heights), psnr, flip, float(np.mean(shaded)) if shaded else None)

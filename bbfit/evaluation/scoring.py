@@ -199,12 +199,12 @@ def held_out(draw: Callable[[Camera], Tensor], views: ViewSet, index: int) -> tu
     return views.targets([index], torch.float64)[0], drawn_view(draw, views.cameras[index], views.names[index])
 
 
-def drawn_view(draw: Callable[[Camera], Tensor], camera: Camera, name: str) -> Tensor:
-    """The render of one camera as it is measured, like that of :func:`held_out`. ``name`` is that of the view in an error."""
+def drawn_view(draw: Callable[[Camera], Tensor], camera: Camera, name: str, drawn: str = "cloud") -> Tensor:
+    """The render of one camera as it is measured, like that of :func:`held_out`. An error names the view and what was ``drawn``."""
     with torch.inference_mode():
         image = draw(camera).double().cpu()
     if not image.isfinite().all():
-        fail("cloud", f"its render of view {name} has values that are not finite", "fit it again")
+        fail(drawn, f"its render of view {name} has values that are not finite", "make it again")
     return image.clamp(0, 1)
 
 

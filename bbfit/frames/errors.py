@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from bbfit.evaluation import metrics
-from bbfit.evaluation.afar import seen_afar
+from bbfit.evaluation.afar import seen_afar, shown_height
 from bbfit.evaluation.backgrounds import BACKGROUNDS, over_background
 from bbfit.evaluation.scoring import view_angles
 from bbfit.frames.browser import FieldPage
 from bbfit.frames.models import DrawnModel
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.opengl import camera_to_world_matrix, projection_matrix
-from bbfit.images import over_color, premultiply, read_rgba, shrunk
+from bbfit.images import over_color
 from bbfit.reporting.plots import spread_views
 from bbfit.views.view_set import ViewSet
 
@@ -45,9 +45,10 @@ def size_error(model: DrawnModel, page: FieldPage, views: ViewSet, tree_pixels: 
     """
     flips, psnrs, heights = [], [], []
     for index in spread_views(view_angles(views.cameras).numpy(), count):
-        view = seen_afar(views, index, tree_pixels)
-        if view is None:
+        height = shown_height(views, index)
+        if height == 0:
             continue
+        view = seen_afar(views, index, tree_pixels / height)
         target, camera = view.target, view.camera
         heights.append(view.tree_pixels)
         rendered = None
@@ -59,8 +60,7 @@ def size_error(model: DrawnModel, page: FieldPage, views: ViewSet, tree_pixels: 
                 if model.lit[level]:
                     if not (model.pictures and model.pictures[level]):
                         return None
-                    picture = premultiply(torch.from_numpy(read_rgba(model.pictures[level][index])).double() / 255)
-                    rendered = shrunk(picture, camera.width, camera.height)
+                    rendered = ViewSet.of_files(model.pictures[level], views.cameras).draw(camera)
             if rendered is not None:
                 pair = over_background(target, rendered, name)
             flips.append(metrics.flip(*pair))

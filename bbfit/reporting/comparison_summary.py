@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import fmean, geometric_mean, stdev
 
 from bbfit.budget.choice import pareto_front
-from bbfit.reporting.comparison_tables import FAR, FAR_HEAD, FAR_INTRO, CompareCosts, CompareRow, far_figures, far_heading
+from bbfit.reporting.comparison_tables import FAR, CompareCosts, CompareRow, far_figures, far_markdown
 from bbfit.reporting.plots import write_figure
 from bbfit.reporting.sweep_tables import markdown
 
@@ -70,6 +70,11 @@ class SystemSummary:
     far: FarSummary | None
     """The same from afar; ``None`` where it was not scored on all trees."""
 
+    @property
+    def marked(self) -> str:
+        """The title, with a star if a program needs a shader or a decoder of its own."""
+        return self.title + ("*" if self.shader else "")
+
     def quality(self, name: str, cost: str) -> Spread | None:
         """``psnr`` or ``flip`` in the pictures that a cost of :data:`COSTS` is about."""
         scores = self.far if cost == "drawing" else self
@@ -93,7 +98,7 @@ def _summary(rows: Sequence[CompareRow]) -> SystemSummary:
         rows[0].costs.shader,
         _spread([each.psnr for each in over]),
         _spread([each.flip for each in over]),
-        {name: _costs([getattr(row.costs, name) for row in rows]) for name in COSTS},
+        {name: _cost([getattr(row.costs, name) for row in rows]) for name in COSTS},
         _far(rows),
     )
 
@@ -105,12 +110,12 @@ def _far(rows: Sequence[CompareRow]) -> FarSummary | None:
     return FarSummary(
         _spread([score.psnr for score in scores]),
         _spread([score.flip for score in scores]),
-        _costs([row.costs.triangles for row in rows]),
-        _costs([score.fragments for score in scores]),
+        _cost([row.costs.triangles for row in rows]),
+        _cost([score.fragments for score in scores]),
     )
 
 
-def _costs(values: Sequence[float | None]) -> Spread | None:
+def _cost(values: Sequence[float | None]) -> Spread | None:
     known = [value for value in values if value]
     return _spread(known, costs=True) if len(known) == len(values) else None
 
@@ -124,15 +129,15 @@ def front(systems: Sequence[SystemSummary], cost: str, quality: str) -> list[Sys
 
     Those that need a shader or a decoder of their own and those without this cost are left out.
     """
-    able = [(each, *point) for each in systems if not each.shader and (point := _point(each, cost, quality)) is not None]
+    known = [(each, *point) for each in systems if not each.shader and (point := _point(each, cost, quality)) is not None]
     sign = 1 if quality == "psnr" else -1
-    return [able[index][0] for index in pareto_front([(paid.mean, sign * value.mean) for _, paid, value in able])]
+    return [known[index][0] for index in pareto_front([(spent.mean, sign * value.mean) for _, spent, value in known])]
 
 
 def _point(system: SystemSummary, cost: str, quality: str) -> tuple[Spread, Spread] | None:
     """A cost and the quality in the pictures that it is about; ``None`` if one is not known."""
-    paid, value = system.costs[cost], system.quality(quality, cost)
-    return None if paid is None or value is None else (paid, value)
+    spent, value = system.costs[cost], system.quality(quality, cost)
+    return None if spent is None or value is None else (spent, value)
 
 
 def summary_csv(rows: Mapping[str, Sequence[CompareRow]]) -> bytes:
@@ -156,13 +161,13 @@ def summary_markdown(rows: Mapping[str, Sequence[CompareRow]], failures: Mapping
     for each in systems:
         costs = [_number(each.costs[name]) for name in ("vertices", "bytes", "shaded", "seconds")]
         scores = [f"{each.psnr.mean:.2f}", f"{each.psnr.deviation:.2f}", f"{each.flip.mean:.4f}", f"{each.flip.deviation:.4f}"]
-        table.append([each.title + ("*" if each.shader else ""), *costs, *scores])
+        table.append([each.marked, *costs, *scores])
     parts = [
         "# Comparison over trees",
         f"Means over {len(rows)} trees; costs are geometric means, and ± is the standard deviation over the trees. PSNR and FLIP are means "
         "over four backgrounds. Systems with a star need a shader or a decoder of their own in every program.",
         markdown(head, table),
-        *_far_parts(rows, systems),
+        _far_part(rows, systems),
         "## Fronts",
         "Which systems does no other match that costs no more? Systems with a star are left out. From cheap to dear:",
         "\n".join(
@@ -175,18 +180,22 @@ def summary_markdown(rows: Mapping[str, Sequence[CompareRow]], failures: Mapping
     ]
     if failures:
         parts += ["## Trees that failed", "\n".join(f"- {name}: {reason}" for name, reason in failures.items())]
-    return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
+    return "\n\n".join(part.rstrip("\n") for part in parts if part) + "\n"
 
 
-def _far_parts(rows: Mapping[str, Sequence[CompareRow]], systems: Sequence[SystemSummary]) -> list[str]:
-    """The parts of the document about pictures from afar; none if no system was scored there."""
-    table = []
-    for each in systems:
-        if each.far is not None:
-            costs = [_number(cost) for cost in (each.far.triangles, each.far.fragments, each.costs["drawing"])]
-            table.append([each.title + ("*" if each.shader else ""), *costs, f"{each.far.psnr.mean:.2f}", f"{each.far.flip.mean:.4f}"])
+def _far_part(rows: Mapping[str, Sequence[CompareRow]], systems: Sequence[SystemSummary]) -> str:
+    """The part of the document about pictures from afar."""
     heights = [row.far.tree_pixels for of_tree in rows.values() for row in of_tree if row.far is not None]
-    return [far_heading(fmean(heights)), FAR_INTRO, markdown([*FAR_HEAD], table)] if table else []
+    scored = [(each, each.far) for each in systems if each.far is not None]
+    lines = [
+        (each.marked, _mean(far.triangles), _mean(far.fragments), _mean(each.costs["drawing"]), far.psnr.mean, far.flip.mean)
+        for each, far in scored
+    ]
+    return far_markdown(max(heights, default=0.0), lines)
+
+
+def _mean(spread: Spread | None) -> float | None:
+    return None if spread is None else spread.mean
 
 
 def _psnrs(rows: Mapping[str, Sequence[CompareRow]], system: str) -> list[str]:
@@ -232,6 +241,8 @@ def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
                 axis.scatter(*at, s=90 if own else 45, marker="*" if own else "o", edgecolor=color, facecolor=face, zorder=3)
                 axis.annotate(each.system, at, (4, 4), textcoords="offset points", fontsize=7, color="#70767e")
             axis.grid(alpha=0.3)
+            if cost == "drawing":
+                axis.set_ylabel(f"from afar: {_QUALITIES[quality]}")
             if line == len(_QUALITIES) - 1:
                 axis.set_xlabel(COSTS[cost])
         axes[line][0].set_ylabel(_QUALITIES[quality])
@@ -240,4 +251,4 @@ def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
 
 def _corners(systems: Sequence[SystemSummary], cost: str, quality: str) -> tuple[list[float], list[float]]:
     points = [point for each in systems if (point := _point(each, cost, quality)) is not None]
-    return [paid.mean for paid, _ in points], [value.mean for _, value in points]
+    return [spent.mean for spent, _ in points], [value.mean for _, value in points]

@@ -36,12 +36,10 @@ FAR = tuple(entry.name for entry in fields(FarScore))
 _INTRO = """Means over the held-out views, which are the same for all systems. PSNR, SSIM and FLIP are also means over four backgrounds.
 *Shaded* is the number of pixels that a graphics card shades for each pixel that the tree covers. Systems with a star need a
 shader or a decoder of their own in every program."""
-FAR_INTRO = """Means over the held-out views, each averaged to the size at which the tree is that high (`--tree-height`).
-*Shaded* is the number of pixels that a graphics card shades for a picture. *Drawing* adds the number that it could shade in the
+_FAR_INTRO = """Means over the held-out views, each averaged to the size at which the tree is that high (`--tree-height`).
+*Shaded pixels* are those that a graphics card shades for a picture. *Drawing* adds the number that it could shade in the
 time that the triangles take (`--fragments-per-triangle`)."""
-"""What the figures from afar are."""
-FAR_HEAD = ("system", "triangles", "shaded", "drawing", "PSNR, dB", "FLIP")
-"""Headings of the table about pictures from afar."""
+_FAR_HEAD = ("system", "triangles", "shaded pixels", "drawing", "PSNR, dB", "FLIP")
 # Headings of the measures in compare.md.
 _SHOWN = ("PSNR, dB", "SSIM", "FLIP", "PSNR over white", "silhouette IoU", "sharpness", "color ΔE", "chroma", "brightness")
 
@@ -87,6 +85,11 @@ class CompareRow:
     far: FarScore | None
     """The score from afar; ``None`` where nothing was drawn."""
 
+    @property
+    def marked(self) -> str:
+        """The title, with a star if a program needs a shader or a decoder of its own."""
+        return self.title + ("*" if self.costs.shader else "")
+
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON holds them."""
         measures = None if self.measures is None else self.measures.to_json()
@@ -96,10 +99,11 @@ class CompareRow:
     @staticmethod
     def from_json(content: dict[str, Any]) -> CompareRow:
         """The row that :meth:`to_json` returned."""
-        measures, far, costs = content["measures"], content["far"], CompareCosts(**content["costs"])
+        costs = CompareCosts(**content["costs"])
         check_record("costs", costs, CompareCosts)
-        known = {"measures": None if measures is None else Measures.from_json(measures), "far": None if far is None else FarScore(**far)}
-        return CompareRow(**{**content, "costs": costs, **known})
+        measures = None if content["measures"] is None else Measures.from_json(content["measures"])
+        far = None if content["far"] is None else FarScore(**content["far"])
+        return CompareRow(**{**content, "costs": costs, "measures": measures, "far": far})
 
 
 def compare_csv(rows: Sequence[CompareRow]) -> bytes:
@@ -137,27 +141,28 @@ def compare_markdown(rows: Sequence[CompareRow], original: OriginalTree) -> str:
         costs = row.costs
         seconds, shaded = ("" if value is None else f"{value:,.1f}" for value in (costs.seconds, costs.shaded))
         counts = [_count(costs.planes), _count(costs.vertices), _count(costs.bytes)]
-        table.append([row.title + ("*" if costs.shader else ""), *counts, shaded, seconds, *_shown(row.measures)])
+        table.append([row.marked, *counts, shaded, seconds, *_shown(row.measures)])
     head = ["system", "planes", "vertices", "bytes", "shaded", "seconds", *_SHOWN]
     notes = "".join(f"- {row.title}: {row.note}\n" for row in rows if row.note)
     return f"# Comparison\n\n{_INTRO}\n\n{markdown(head, table)}\n{_far_markdown(rows)}{_light_markdown(rows)}{notes}"
 
 
-def _far_markdown(rows: Sequence[CompareRow]) -> str:
-    """The part of the document about pictures from afar; nothing if no system was drawn."""
-    scored = [(row, row.far) for row in rows if row.far is not None]
-    if not scored:
-        return ""
+def far_markdown(tree_pixels: float, lines: Sequence[tuple[str, float | None, float | None, float | None, float, float]]) -> str:
+    """The part of a document about pictures in which the tree has a height in pixels; nothing without lines.
+
+    A line has the title of a system, its triangles, its shaded pixels and the cost of drawing both, PSNR and FLIP.
+    """
     table = []
-    for row, far in scored:
-        costs = [_count(value if value is None else round(value)) for value in (row.costs.triangles, far.fragments, row.costs.drawing)]
-        table.append([row.title + ("*" if row.costs.shader else ""), *costs, f"{far.psnr:.2f}", f"{far.flip:.4f}"])
-    return f"{far_heading(scored[0][1].tree_pixels)}\n\n{FAR_INTRO}\n\n{markdown([*FAR_HEAD], table)}\n"
+    for title, *costs, psnr, flip in lines:
+        counts = [_count(value if value is None else round(value)) for value in costs]
+        table.append([title, *counts, f"{psnr:.2f}", f"{flip:.4f}"])
+    return f"## From afar: {tree_pixels:.0f} pixels high\n\n{_FAR_INTRO}\n\n{markdown([*_FAR_HEAD], table)}\n" if table else ""
 
 
-def far_heading(tree_pixels: float) -> str:
-    """The heading of the part about pictures in which the tree has this height in pixels."""
-    return f"## From afar: {tree_pixels:.0f} pixels high"
+def _far_markdown(rows: Sequence[CompareRow]) -> str:
+    scored = [(row, row.far) for row in rows if row.far is not None]
+    lines = [(row.marked, row.costs.triangles, far.fragments, row.costs.drawing, far.psnr, far.flip) for row, far in scored]
+    return far_markdown(max((far.tree_pixels for _, far in scored), default=0.0), lines)
 
 
 def _light_markdown(rows: Sequence[CompareRow]) -> str:

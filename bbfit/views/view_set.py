@@ -16,7 +16,7 @@ from torch import Tensor
 from bbfit.checks import InputTypeError, check_shape, fail
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.light import Light
-from bbfit.images import premultiply, shrunk, to_bytes
+from bbfit.images import premultiply, read_rgba, shrunk, to_bytes
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,11 @@ class ViewSet:
             raise InputTypeError(f"images: expected uint8 or floats, got {pictures.dtype}")
         paths = [Path(f"{index:04}.png") for index in range(len(pictures))]
         return ViewSet(tuple(paths), cameras, dict(zip(paths, pictures, strict=True)).__getitem__)
+
+    @staticmethod
+    def of_files(paths: Sequence[Path], cameras: Camera) -> ViewSet:
+        """Views from files of straight-alpha RGBA pictures, which are read when they are needed, with V cameras."""
+        return ViewSet(tuple(paths), cameras, lambda path: torch.from_numpy(read_rgba(path)))
 
     def __len__(self) -> int:
         return len(self.paths)

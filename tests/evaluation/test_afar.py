@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from bbfit.checks import InputError
-from bbfit.evaluation.afar import FarScore, drawing_cost, score_afar, seen_afar
+from bbfit.evaluation.afar import FarScore, drawing_cost, score_afar, seen_afar, shown_height
 from bbfit.evaluation.backgrounds import BACKGROUNDS
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.orbit import Orbit
@@ -33,18 +33,17 @@ def nothing(camera: Camera) -> Tensor:
     return torch.zeros(camera.height, camera.width, 4)
 
 
-def test_pictures_have_the_size_at_which_the_tree_is_that_high() -> None:
-    shown = views(((12, 84), (0, 96), (40, 44), (50, 50)))
-    whole, full, low, empty = (seen_afar(shown, index, 24) for index in range(4))
-    assert whole and full and low and empty is None
-    found = [(view.camera.width, view.camera.height, view.tree_pixels) for view in (whole, full, low)]
-    assert found == [(32, 32, 24), (24, 24, 24), (96, 96, 4)]
+def test_views_shrink_by_the_mean_of_areas_and_keep_their_field_of_view() -> None:
+    shown = views(((12, 84), (50, 50)))
+    assert [shown_height(shown, index) for index in (0, 1)] == [72, 0]
+    view = seen_afar(shown, 0, 1 / 3)
+    assert (view.camera.width, view.camera.height, view.tree_pixels) == (32, 32, 24)
     wanted = torch.zeros(32, 32, 4, dtype=torch.float64)
     wanted[4:28, 11:21] = torch.tensor([*COLOR, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(whole.target, wanted, atol=1e-12, rtol=0)
+    torch.testing.assert_close(view.target, wanted, atol=1e-12, rtol=0)
     corner = torch.tensor([[0.0, 0.0, 0.0]], dtype=torch.float64)
-    torch.testing.assert_close((whole.camera.project(corner) + 0.5) * 3, shown.cameras[0].project(corner) + 0.5)  # the same field of view
-    assert seen_afar(shown, 0, 3).camera.height == 11  # type: ignore[union-attr]
+    torch.testing.assert_close((view.camera.project(corner) + 0.5) * 3, shown.cameras[0].project(corner) + 0.5)
+    assert [seen_afar(shown, 0, scale).camera.height for scale in (0.01, 2.0)] == [11, 96]
 
 
 def test_scores_are_means_over_views_and_backgrounds() -> None:
@@ -65,9 +64,21 @@ def test_scores_are_means_over_views_and_backgrounds() -> None:
     assert drawing_cost(equal, 20, 2.5) is drawing_cost(score, None, 2.5) is drawing_cost(None, 20, 2.5) is None
 
 
-def test_empty_views_are_left_out_and_numbers_must_be_finite() -> None:
+def test_all_views_have_the_size_at_which_the_highest_is_that_high() -> None:
+    """A narrow tree from above is low. It is as far away as from the side."""
+    sizes = list[tuple[int, int]]()
+
+    def draw(camera: Camera) -> Tensor:
+        sizes.append((camera.width, camera.height))
+        return nothing(camera)
+
+    both = score_afar(draw, views(((12, 84), (40, 52))), 24)
+    assert both and sizes == [(32, 32)] * 2 and both.tree_pixels == 24
+    lower = score_afar(draw, views(((40, 52),)), 24)
+    assert lower and sizes[2:] == [(96, 96)] and lower.tree_pixels == 12  # never enlarged
+
+
+def test_empty_views_have_no_score_and_numbers_must_be_finite() -> None:
     assert score_afar(nothing, views(((5, 5), (9, 9))), 24) is None
-    both = views(((5, 5), (12, 84)))
-    assert score_afar(nothing, both, 24) == score_afar(nothing, both.take([1]), 24)
-    with pytest.raises(InputError, match="its render of view 0001 has values that are not finite"):
-        score_afar(lambda camera: torch.full((camera.height, camera.width, 4), math.nan), both, 24)
+    with pytest.raises(InputError, match="mesh: its render of view 0000 has values that are not finite"):
+        score_afar(lambda camera: torch.full((camera.height, camera.width, 4), math.nan), views(), 24, drawn="mesh")
