@@ -17,10 +17,13 @@ from bbfit.fitting.config import FitConfig, Placement, ResolvedFit
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views.dataset import ViewDataset
 
-COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128)
-"""Numbers of billboards to try, in addition to the largest number that the limit of vertices allows, up to the last number."""
+COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128, 256)
+"""Numbers of billboards to try, in addition to the largest that the limit of vertices and ``FitConfig.most_billboards`` allow."""
 START = 32
-"""Number of billboards that a limit of texels or bytes is first spent on."""
+"""Least number of billboards that a limit of texels or bytes is first spent on, if it is among those to try."""
+EACH_TEXELS, EACH_BYTES = 100, 600
+"""What each billboard of a good fit has in views of 256 pixels: texels, and bytes of the model. A limit is first spent on as many as have it.
+Default masks of eight trees have 490 to 970 bytes."""
 MIN_GAIN_DB = 0.75
 """Least gain, in dB, for which ``auto`` doubles the number of billboards."""
 LEAST_VIEWS = 5
@@ -69,8 +72,9 @@ def choose(
 
     Every fifth training view is held out for validation. Short fits to the other views are compared there. A limit of vertices alone is
     spent in full, and by halves and quarters for the curve. For a target or ``auto``, the number of billboards doubles until it reaches the
-    target or gains too little; then the number between the last two that matter is tried. A limit of texels or bytes is first spent on 32
-    billboards, and then on more and on fewer for as long as they are not clearly worse; a last trial has half the texels, for the curve.
+    target or gains too little; then the number between the last two that matter is tried. A limit of texels or bytes is first spent on as many
+    billboards as have enough of them, at least 32, and then on more and on fewer for as long as they are not clearly worse; a last trial has
+    half the texels, for the curve.
     Few billboards are also tried two-sided, half as many, and evenly placed, unless there is a target.
 
     All short fits of a number of billboards start from one placement, which a quick search finds. What a limit in bytes leaves for texels
@@ -154,7 +158,9 @@ class _Chooser:
     def __init__(self, trials: Trials, config: FitConfig, budget: BudgetConfig) -> None:
         self._trials, self._config, self._budget = trials, config, budget
         self._placement: Placement = config.placement or "clusters"
-        most = COUNTS[-1] if budget.vertices is None else min(COUNTS[-1], budget.vertices // _vertices(config))
+        most = config.most_billboards
+        if budget.vertices is not None:
+            most = min(most, budget.vertices // _vertices(config))
         least = min(most, 1 + (config.trunk_billboards or 0))
         self._counts = sorted({count for count in COUNTS if least <= count < most} | {most})
         self._spends = budget.texels is not None or budget.bytes is not None
@@ -223,8 +229,10 @@ class _Chooser:
         return False
 
     def _climbed(self) -> list[Spent]:
-        """Spend the limits on :data:`START` billboards, and then on more and on fewer for as long as it is not clearly worse."""
-        start = max(index for index, count in enumerate(self._counts) if count <= START or index == 0)
+        """Spend the limits on as many billboards as have enough of them, and then on more and on fewer until that is clearly worse."""
+        shares = ((self._budget.most_texels, EACH_TEXELS), (self._budget.most_bytes, EACH_BYTES))
+        able = max(START, min(limit // each for limit, each in shares if limit is not None))
+        start = max(index for index, count in enumerate(self._counts) if count <= able or index == 0)
         series, begin = list[Spent](), self._spent(self._counts[start])
         if begin is not None:
             series = self._followed([begin], self._counts[start + 1 :])

@@ -58,8 +58,6 @@ USUAL = Effort()
 """The effort of every fit."""
 QUICK = Effort(more_steps=30, most_additions=0)
 """The effort of a comparison of numbers of billboards."""
-COUNTS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
-"""Numbers of billboards that are compared."""
 LEAST_GAIN_DB = 0.3
 """Least gain at a low resolution, in dB, for which the number of billboards may double."""
 # Numbers of billboards that are tried first and, if they are not too many, next.

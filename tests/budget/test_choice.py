@@ -15,7 +15,7 @@ import torch
 from billboard_scene import crossing_billboards
 
 from bbfit.budget import trials as trials_module
-from bbfit.budget.choice import COUNTS, MIN_GAIN_DB, START, Choice, choose, pareto_front
+from bbfit.budget.choice import MIN_GAIN_DB, START, Choice, choose, pareto_front
 from bbfit.budget.config import BudgetConfig
 from bbfit.budget.sizes import model_bytes, within_bytes
 from bbfit.budget.trials import Trial, lookup, short_config
@@ -39,7 +39,8 @@ BYTES_A_TEXEL, AIM, NEAR = 2.0, 0.92, 0.6
 """The first guess; the part of a limit in bytes that a trial aims at, and the least that it is to use."""
 LESS = 1
 """Trials of less than a limit in texels or bytes, for the curve."""
-DOUBLED = [1, 2, 4, 8, 16, 32, 64, 128]
+MOST = FitConfig().most_billboards
+DOUBLED = [1, 2, 4, 8, 16, 32, 64, 128, 256, MOST]
 """Numbers of billboards that are tried until they are enough."""
 DATA = Path(__file__).resolve().parents[2] / "data"
 Quality = Callable[[int, Sides, Placement], float]
@@ -240,7 +241,8 @@ def summary(found: Choice) -> tuple[int | None, Sides, Placement | None]:
         (43, [2, 5, 10]),
         (124, [7, 15, 31]),
         (128, [8, 16, 32]),
-        (10**6, [32, 64, 128]),
+        (1024, [64, 128, 256]),
+        (10**6, [MOST // 4, MOST // 2, MOST]),
     ],
 )
 def test_a_limit_of_vertices_is_made_use_of(choosing: Choosing, vertices: int, counts: list[int]) -> None:
@@ -253,6 +255,31 @@ def test_a_limit_of_vertices_is_made_use_of(choosing: Choosing, vertices: int, c
     others = [(counts[-1] // 2, "two", "clusters")] * (counts[-1] > 1) + [(counts[-1], "one", "even")]
     assert world.others == (others if counts[-1] <= 8 else [])
     assert found.trials[found.chosen].billboards == counts[-1] and len(found.trials) == len(world.asked)
+
+
+def test_no_more_are_tried_than_a_fit_may_have(choosing: Choosing) -> None:
+    """``most_billboards`` is the largest number, also if that is more than by default."""
+    for most, fewer in ((48, 32), (600, 256)):
+        world = World(rising)
+        found = choosing(world, BudgetConfig(bytes="100M"), FitConfig(most_billboards=most))
+        assert world.line == [most, fewer] and found.config.billboards == most
+
+
+@pytest.mark.parametrize(
+    ("budget", "start"),
+    [
+        (BudgetConfig(bytes="100k"), 128),
+        (BudgetConfig(bytes="160k"), 256),
+        (BudgetConfig(bytes="240k"), MOST),
+        (BudgetConfig(texels="13k"), 128),
+        (BudgetConfig(texels="13k", bytes="240k"), 128),
+        (BudgetConfig(bytes="5k"), START),
+    ],
+)
+def test_a_limit_is_first_spent_on_as_many_as_have_enough(choosing: Choosing, budget: BudgetConfig, start: int) -> None:
+    world = World(lambda count, *kind: 30.0 - abs(math.log2(count / start)))
+    assert choosing(world, budget).config.billboards == start
+    assert world.line[0] == start and len(world.line) <= 3  # one more and one fewer are worse
 
 
 def test_two_sided_billboards_have_twice_the_vertices(choosing: Choosing) -> None:
@@ -299,7 +326,7 @@ def test_a_placement_that_is_asked_for_is_kept(choosing: Choosing) -> None:
         (curve(n32=25, n64=26, n128=25.8), [32, 64, 128], 64),
         (curve(n32=25, n64=24, n128=30, n24=25.5, n16=25.2, n12=30), [32, 64, 24, 16], 24),
         (curve(n32=25, n64=24, n24=24, n16=30), [32, 64, 24], 32),
-        (rising, [32, 64, 128], 128),
+        (rising, [32, 64, 128, 256, MOST], MOST),
         (lambda count, *kind: 30.0 - count, [32, 64, 24, 16, 12, 8, 6, 4, 3, 2, 1], 1),
     ],
 )
@@ -322,11 +349,11 @@ def test_other_manners_have_the_texels_too(choosing: Choosing) -> None:
 
 def test_a_step_in_vain_may_be_bad_luck(choosing: Choosing) -> None:
     """One that loses little is followed by the next, in both directions."""
-    world = World(curve(n32=25, n64=25 - 0.9 * LUCK, n128=26))
-    assert choosing(world, BudgetConfig(texels=10**6)).config.billboards == 128
-    assert world.line == [32, 64, 128]
+    world = World(curve(n32=25, n64=25 - 0.9 * LUCK, n128=26, n256=25))
+    assert choosing(world, BudgetConfig(texels=3000)).config.billboards == 128
+    assert world.line == [32, 64, 128, 256]
     world = World(curve(n32=25, n64=20, n24=25 - 0.9 * LUCK, n16=26, n12=25))
-    assert choosing(world, BudgetConfig(texels=10**6)).config.billboards == 16
+    assert choosing(world, BudgetConfig(texels=3000)).config.billboards == 16
     assert world.line == [32, 64, 24, 16, 12]
 
 
@@ -456,7 +483,7 @@ def test_a_target_that_is_not_reached_gives_the_best(choosing: Choosing) -> None
     assert world.line == [1, 2, 4, 8, 6] and world.others == []
     assert summary(found) == (6, "one", "clusters") and not found.met
     found = choosing(World(rising), BudgetConfig(target_psnr=90))
-    assert found.config.billboards == COUNTS[-1] and not found.met
+    assert found.config.billboards == MOST and not found.met
 
 
 def test_a_target_that_only_more_than_is_allowed_reaches_is_not_reached(choosing: Choosing) -> None:
@@ -493,7 +520,7 @@ def test_auto_stops_at_the_knee(choosing: Choosing) -> None:
     assert world.others == [(2, "two", "clusters")]
 
 
-@pytest.mark.parametrize(("gain", "last"), [(MIN_GAIN_DB + 0.01, COUNTS[-1]), (MIN_GAIN_DB - 0.01, 1)])
+@pytest.mark.parametrize(("gain", "last"), [(MIN_GAIN_DB + 0.01, MOST), (MIN_GAIN_DB - 0.01, 1)])
 def test_auto_goes_as_far_as_it_pays(choosing: Choosing, gain: float, last: int) -> None:
     """By what a doubling gains, though most steps are smaller than that."""
     world = World(lambda count, sides, placement: 20 + gain * math.log2(count) - (sides != "one") - (placement == "even"))
@@ -538,8 +565,8 @@ def test_a_little_better_may_be_luck(choosing: Choosing, better: float) -> None:
     quality = curve(n6=25, n8=26 + better * LUCK, n12=26, n16=21, n24=21, n32=21, n48=21)
     for budget, expected in (
         (BudgetConfig(texels="1M", vertices=48), 12 if better < 1 else 8),
-        (BudgetConfig(texels="1M"), 12 if better < 0 else 8),
-        (BudgetConfig(bytes="1M"), 12 if better < 0 else 8),
+        (BudgetConfig(texels="3k"), 12 if better < 0 else 8),
+        (BudgetConfig(bytes="19k"), 12 if better < 0 else 8),
     ):
         world = World(quality)
         assert choosing(world, budget).config.billboards == expected
