@@ -130,6 +130,8 @@ class Trials:
 def short_config(config: FitConfig, count: int, sides: Sides, placement: Placement, max_texels: int | None) -> FitConfig:
     """The options of a short fit of ``count`` billboards: those of ``config``, but a short search and few steps."""
     most = _MOST | ({} if placement == "even" else {"levels": _LEVELS})
-    short: dict[str, Any] = {name: min(value, getattr(config, name) or value) for name, value in most.items()}
+    chosen = replace(config, billboards=count, sides=sides, placement=placement)
+    full = chosen.resolve()  # the more billboards, the shorter its search
+    short: dict[str, Any] = {name: min(value, getattr(full, name)) for name, value in most.items()}
     short["views_per_step"] = config.views_per_step or _VIEWS_PER_STEP
-    return replace(config, billboards=count, sides=sides, placement=placement, max_texels=max_texels, **short)
+    return replace(chosen, max_texels=max_texels, **short)
