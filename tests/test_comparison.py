@@ -214,6 +214,9 @@ def test_seconds_of_a_bake_outlive_it(tmp_path: Path) -> None:
     cloud, first = baking(tmp_path / "baked", lambda: bake(0.1))
     assert cloud == "cloud" and first >= 0.3
     assert baking(tmp_path / "baked", lambda: bake(0.05)) == ("cloud", first)
+    (tmp_path / "baked" / "seconds.json").write_text('{"seconds": "long"}')
+    with pytest.raises(InputError, match=r"seconds\.json"):
+        baking(tmp_path / "baked", lambda: bake(0))
 
 
 def test_trees_are_compared_by_means_and_spreads(tmp_path: Path) -> None:

@@ -22,8 +22,8 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128, 256)
 START = 32
 """Least number of billboards that a limit of texels or bytes is first spent on, if it is among those to try."""
 EACH_TEXELS, EACH_BYTES = 100, 600
-"""What each billboard of a good fit has in views of 256 pixels: texels, and bytes of the model. A limit is first spent on as many as have it.
-Default masks of eight trees have 490 to 970 bytes."""
+"""Roughly what a billboard needs in views of 256 pixels: texels, and bytes of the model (490 to 970 in default masks of eight trees).
+A limit is first spent on as many billboards as have that."""
 MIN_GAIN_DB = 0.75
 """Least gain, in dB, for which ``auto`` doubles the number of billboards."""
 LEAST_VIEWS = 5
@@ -72,9 +72,9 @@ def choose(
 
     Every fifth training view is held out for validation. Short fits to the other views are compared there. A limit of vertices alone is
     spent in full, and by halves and quarters for the curve. For a target or ``auto``, the number of billboards doubles until it reaches the
-    target or gains too little; then the number between the last two that matter is tried. A limit of texels or bytes is first spent on as many
-    billboards as have enough of them, at least 32, and then on more and on fewer for as long as they are not clearly worse; a last trial has
-    half the texels, for the curve.
+    target or gains too little; then the number between the last two that matter is tried. A limit of texels or bytes is first spent on as
+    many billboards as have enough of them, at least 32, and then on more and on fewer for as long as they are not clearly worse; a last
+    trial has half the texels, for the curve.
     Few billboards are also tried two-sided, half as many, and evenly placed, unless there is a target.
 
     All short fits of a number of billboards start from one placement, which a quick search finds. What a limit in bytes leaves for texels

@@ -20,6 +20,7 @@ from bbfit.files import read_json, write_json
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.inputs import reading
 from bbfit.pipeline import RunConfig
 from bbfit.rendering.cards import CardRenderer
 from bbfit.reporting.comparison_tables import CompareRow
@@ -113,15 +114,19 @@ def baking(folder: Path, bake: Callable[[], Baked]) -> tuple[Baked, float]:
 
     ``seconds.json`` there keeps them. Those of an interrupted bake count, and a later one that finds all pictures adds none.
     """
-    path, started, finished = folder / "seconds.json", time.perf_counter(), False
-    earlier = read_json("seconds", path) if path.is_file() else {"seconds": 0.0, "finished": False}
+    path, seconds, known = folder / "seconds.json", 0.0, False
+    if path.is_file():
+        content = read_json("seconds", path)
+        with reading("seconds", path, "remove it"):
+            seconds, known = float(content["seconds"]), bool(content["finished"])
+    started, finished = time.perf_counter(), False
     try:
         baked, finished = bake(), True
     finally:
-        if not earlier["finished"] and folder.is_dir():
-            earlier = {"seconds": earlier["seconds"] + time.perf_counter() - started, "finished": finished}
-            write_json(path, earlier)
-    return baked, earlier["seconds"]
+        if not known and folder.is_dir():
+            seconds += time.perf_counter() - started
+            write_json(path, {"seconds": seconds, "finished": finished})
+    return baked, seconds
 
 
 def billboards(subject: Subject, cloud: BillboardCloud, export: ExportConfig, seconds: float) -> SystemResult:
