@@ -85,7 +85,7 @@ def compare_command(
     export: ExportConfig = ExportConfig(),  # noqa: B008
     limits: InputLimits = InputLimits(),  # noqa: B008
 ) -> None:
-    """Compare bbfit with other methods: scores on the same held-out views, bytes, vertices, shaded pixels and seconds.
+    """Compare bbfit with other methods: scores on the same held-out views, near and from afar, and what each costs.
 
     With one TREE it compares their pictures. With --trees or --species it compares means over trees, on this machine or on a Ray cluster.
     Interrupted and started again, it resumes where it stopped.

@@ -51,8 +51,8 @@ def compare_trees(
     """Do what :func:`~bbfit.comparison.one_tree.compare` does for many trees: means, spreads, and who is best at which cost.
 
     Writes ``trees/NAME/`` with the comparison of each tree, ``summary.csv`` (a row for each system of each tree), ``summary.md`` (means,
-    spreads, fronts), and ``pareto.png`` (PSNR and FLIP against each cost). A killed comparison continues
-    where it stopped. A tree that fails is recorded with its reason, and the others continue.
+    spreads, fronts), and ``pareto.png`` (PSNR and FLIP against each cost). A killed comparison continues where it stopped. A tree that
+    fails is recorded with its reason, and the others continue.
 
     Parameters
     ----------

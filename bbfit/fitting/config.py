@@ -154,7 +154,7 @@ class FitConfig:
     least_billboards: Count = 16
     """Least number of billboards that the preset chooses by itself."""
     most_billboards: Count = 384
-    """Largest number of billboards that the preset chooses by itself."""
+    """Largest number of billboards that the preset, or a budget, chooses by itself."""
     most_layers: _Layers | None = None
     """How many billboards may lie before each other, on average over the rectangle around the tree, when the fit chooses their number.
     More layers look better, and a graphics card shades all of them. Preset: 2.6 (mask, coverage) or 3.2 (blend, hash)."""

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.conversion import tree_as_glb
 from bbfit.blender.pictures import PICTURES_FILE, render_pictures
 from bbfit.blender.request import ViewsRequest
 from bbfit.blender.views_folder import render_views
-from bbfit.images import read_rgba
 from bbfit.layout import REQUEST_FILE
 from bbfit.outputs import output_folder
 from bbfit.provenance import digest_file
@@ -84,7 +80,7 @@ def pictures_stage(folder: Path, model: Path, views: ViewDataset, config: ViewsC
 
     outputs = tuple(f"{out}/{files}" for out in folders for files in ("*.png", PICTURES_FILE))
     made = Stage(stage, (digest_file(model), views.fingerprint, config), outputs, work, algorithm="views", claims=False)
-    train, test = (ViewSet(own, split.cameras, _picture) for own, split in zip(paths, splits, strict=True))
+    train, test = (ViewSet.of_files(own, split.cameras) for own, split in zip(paths, splits, strict=True))
     return made, train, test
 
 
@@ -96,7 +92,3 @@ def pictures_folder(model: Path, split: str) -> str:
 def pictures_in(folder: Path, views: ViewSet) -> tuple[Path, ...]:
     """The pictures of all views in a folder of :func:`~bbfit.blender.pictures.render_pictures`."""
     return tuple(folder / f"{index:04}.png" for index in range(len(views)))
-
-
-def _picture(path: Path) -> Tensor:
-    return torch.from_numpy(read_rgba(path))
