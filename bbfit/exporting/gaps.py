@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
+from torch.optim.adam import adam
 
 from bbfit.exporting.mip_matching import densities
 from bbfit.exporting.mips import plain_chain
@@ -107,21 +108,24 @@ def _filled(cards: Cards, on_step: Callable[[int, int], None]) -> Cards:
 
     sizes = _views(cards, mode, chain, cameras, [side >> count for count in halvings])
     values, turn = torch.full(shapes[0], _START, requires_grad=True), _TURN_TESTED if mode.tested else _TURN_BLENDED
-    adam = torch.optim.Adam([values], betas=_DECAY)
+    moments = [torch.zeros(shapes[0]), torch.zeros(shapes[0])]
     for step in range(_STEPS):
-        adam.param_groups[0]["lr"] = _RATE * 0.5 * (1 + math.cos(math.pi * step / _STEPS))
+        rate = _RATE * 0.5 * (1 + math.cos(math.pi * step / _STEPS))
         texels, loss = levels(values), torch.zeros(())
         for views in sizes:
             view = views[step % len(views)]
             error = _drawn(texels, view, mode) - view.target
             here, turned = error.chunk(2)
             loss = loss + _visible(error) + turn * _visible(here - turned) + _DENSITY * error[..., 3].mean((1, 2)).square().mean()
-        adam.zero_grad()
         if loss.requires_grad:  # otherwise nothing shows
-            loss.backward()
-            adam.step()
-        with torch.no_grad():
-            values.clamp_(0, 1)
+            (gradient,) = torch.autograd.grad(loss, values)
+            with torch.no_grad():
+                # torch.optim.Adam does the same, but imports the compiler of torch, for a second and a half.
+                adam(
+                    [values], [gradient], [moments[0]], [moments[1]], [], [torch.tensor(float(step))],
+                    amsgrad=False, beta1=_DECAY[0], beta2=_DECAY[1], lr=rate, weight_decay=0.0, eps=1e-8, maximize=False,
+                )  # fmt: skip
+                values.clamp_(0, 1)
         on_step(step + 1, _STEPS)
 
     with torch.no_grad():

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bbfit.checks import check_count, check_range
 from bbfit.geometry.cards import Card, Cards
-from bbfit.geometry.polygons import area, kept_half, sides
+from bbfit.geometry.polygons import area, following, kept_half, sides
 
 MARGIN = 1 / 64
 """Margin of a polygon around the visible part in texels, far more than the rounding of float32 and the vertex snapping of graphics
@@ -146,10 +146,10 @@ def _shown_points(rimmed: NDArray[np.float64], polygon: NDArray[np.float64], lea
     values = np.stack([rimmed[row + y, column + x] for x, y in steps], -1)  # [C, 4]
     top_left = cells[:, ::-1] - 1.0
     corners = (top_left[:, None] + steps)[values >= least]
-    following = np.roll(values, -1, -1)
-    passes = (values >= least) != (following >= least)
-    share = np.where(passes, (values - least) / np.where(passes, values - following, 1.0), 0.0)
-    local = steps + share[..., None] * (np.roll(steps, -1, 0) - steps)  # [C, 4, 2]
+    others = values[:, [1, 2, 3, 0]]
+    passes = (values >= least) != (others >= least)
+    share = np.where(passes, (values - least) / np.where(passes, values - others, 1.0), 0.0)
+    local = steps + share[..., None] * (following(steps) - steps)  # [C, 4, 2]
     points = [corners, (top_left[:, None] + local)[passes]]
     # The border of the visible part is a hyperbola, which may bulge outwards between two such points. Its tangents there meet outside.
     a, b, c, d = values.T[..., None]  # clockwise from the top left
@@ -186,7 +186,7 @@ def _enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices
     """The smallest polygon around the hull and inside the convex polygon with at most ``vertices`` corners; None if there is none."""
     middle = hull.mean(0)
     hull, (normals, offsets) = hull - middle, sides(polygon - middle)
-    along = np.roll(hull, -1, 0) - hull
+    along = following(hull) - hull
     longest = np.argsort(-(along**2).sum(-1), kind="stable")[:_EDGES]
     outwards = np.stack([along[:, 1], -along[:, 0]], -1)[longest]
     edges, fixed = np.arctan2(*outwards.T[::-1]), np.append(np.arctan2(*normals.T[::-1]), np.arange(_AROUND) * (2 * np.pi / _AROUND))
@@ -211,19 +211,21 @@ def _enclosing(hull: NDArray[np.float64], polygon: NDArray[np.float64], vertices
 
 def _shortest_cycle(cost: NDArray[np.float64], length: int) -> NDArray[np.int64] | None:
     """The cheapest cycle once around a circle of n nodes that visits 3 to ``length`` of them; ``cost`` [n, n] is that of each step."""
-    upwards = np.where(np.arange(len(cost))[:, None] < np.arange(len(cost)), cost, np.inf)
-    paths, through = [upwards], []
+    upwards = np.where(np.triu(np.ones_like(cost, np.bool_), 1), cost, np.inf)
+    starts = np.flatnonzero(np.tril(np.isfinite(cost), -1).any(0))  # the first nodes of cycles: a later one has a step back to them
+    back, onwards = cost.T[starts], np.ascontiguousarray(upwards.T)  # the least of a row is found sooner than that of a column
+    paths, through, joined = upwards[starts], [], np.empty((len(starts), *cost.shape))
     best, chosen = sys.float_info.max, None
     for count in range(3, length + 1):
-        joined = paths[-1][:, :, None] + upwards[None]
-        through.append(joined.argmin(1))
-        paths.append(np.take_along_axis(joined, through[-1][:, None], 1)[:, 0])
-        closed = paths[-1] + cost.T
-        if closed.min() < best * (1 - 1e-9):
+        np.add(paths[:, None], onwards, out=joined)  # from a start, [S], to a node, [n], by another, [n]
+        through.append(joined.argmin(-1))
+        paths = np.take_along_axis(joined, through[-1][..., None], -1)[..., 0]
+        closed = paths + back
+        if closed.min(initial=np.inf) < best * (1 - 1e-9):
             first, last = np.unravel_index(closed.argmin(), closed.shape)
             best, chosen = float(closed.min()), [int(last)]
             for step in through[::-1]:
                 chosen.insert(0, int(step[first, chosen[0]]))
-            chosen.insert(0, int(first))
+            chosen.insert(0, int(starts[first]))
             assert len(chosen) == count
     return None if chosen is None else np.array(chosen)

@@ -171,9 +171,9 @@ def _rows(vectors: list[NDArray[np.float64]], width: int) -> Tensor:
 
 def _padded(arrays: list[NDArray[np.float64]], width: int) -> Tensor:
     """Arrays [k, width] with their last rows repeated, [Q, K, width]."""
-    longest = max(map(len, arrays), default=1)
-    padded = [np.pad(array, ((0, longest - len(array)), (0, 0)), "edge") for array in arrays]
-    return torch.from_numpy(np.array(padded, np.float64).reshape(-1, longest, width))
+    counts = np.array([len(array) for array in arrays], np.int64)[:, None]
+    rows = counts.cumsum()[:, None] - counts + np.minimum(np.arange(counts.max(initial=1)), counts - 1)
+    return torch.from_numpy(np.concatenate([*arrays, np.empty((0, width))])[rows])
 
 
 def seen_axes(sheets: Sheets, camera: Camera) -> Tensor:
