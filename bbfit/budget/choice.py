@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.budget.config import BudgetConfig
-from bbfit.budget.spending import Spent, spent
+from bbfit.budget.spending import Spent, allowed, spent
 from bbfit.budget.trials import Known, OnTrial, Trial, Trials
 from bbfit.checks import fail
 from bbfit.exporting.config import ExportConfig
@@ -32,8 +32,6 @@ LEAST_VIEWS = 5
 _FEW = 8
 # Random difference between two short fits, in dB.
 _NOISE_DB = 0.15
-# Fraction of the texels that is also tried, for the curve.
-_CURVE_FRACTION = 0.5
 
 
 @dataclass(frozen=True)
@@ -73,8 +71,8 @@ def choose(
     Every fifth training view is held out for validation. Short fits to the other views are compared there. A limit of vertices alone is
     spent in full, and by halves and quarters for the curve. For a target or ``auto``, the number of billboards doubles until it reaches the
     target or gains too little; then the number between the last two that matter is tried. A limit of texels or bytes is first spent on as
-    many billboards as have enough of them, at least 32, and then on more and on fewer for as long as they are not clearly worse; a last
-    trial has half the texels, for the curve.
+    many billboards as have enough of them, at least 32, and then on more for as long as they are not clearly worse. If none is better,
+    fewer are tried for as long as each is. A last trial spends half of the limit, for the curve.
     Few billboards are also tried two-sided, half as many, and evenly placed, unless there is a target.
 
     All short fits of a number of billboards start from one placement, which a quick search finds. What a limit in bytes leaves for texels
@@ -167,7 +165,7 @@ class _Chooser:
         self._grows = budget.auto or budget.target_psnr is not None
         if not self._spends and not self._grows:  # the more vertices the better; fewer are for the curve
             self._counts = sorted({max(least, most >> halvings) for halvings in range(3)})
-        trials.expected = len(self._counts) + 2 * (budget.target_psnr is None) + self._spends
+        trials.expected = 4 if self._spends and not self._grows else len(self._counts) + 2 * (budget.target_psnr is None) + self._spends
 
     def choice(self, validation: tuple[str, ...]) -> Choice:
         """See :func:`choose`. ``validation`` are the names of the validation views."""
@@ -175,17 +173,16 @@ class _Chooser:
         best = self._best(self._climbed() if self._spends and not self._grows else self._grown())
         if budget.target_psnr is None:
             best = max([best, *self._others(best.trial.billboards)], key=lambda other: other.psnr)
+        if budget.target_psnr is None and self._spends:
+            self._tried_half(best)
         trial = best.trial
-        few, fewer = min(trial.billboards, START), int(_CURVE_FRACTION * trial.texels)
-        if budget.target_psnr is None and self._spends and fewer >= 2 * few:  # for the curve
-            self._trials.run(few, trial.sides, trial.placement, fewer)
         met = budget.target_psnr is None or best.psnr >= budget.target_psnr
         chosen = replace(config, billboards=trial.billboards, sides=trial.sides, placement=trial.placement, max_texels=best.max_texels)
         return Choice(chosen.resolve(), tuple(done), done.index(trial), met, validation)
 
-    def _spent(self, count: int) -> Spent | None:
+    def _spent(self, count: int, least: float = -math.inf) -> Spent | None:
         anyway = count == self._counts[0]  # what the fewest billboards take is told if it is too much
-        return spent(self._trials, self._budget, count, self._config.sides, self._placement, anyway=anyway)
+        return spent(self._trials, self._budget, count, self._config.sides, self._placement, anyway=anyway, least=least)
 
     def _others(self, count: int) -> list[Spent]:
         """Other ways to spend the vertices of a few billboards."""
@@ -229,24 +226,42 @@ class _Chooser:
         return False
 
     def _climbed(self) -> list[Spent]:
-        """Spend the limits on as many billboards as have enough of them, and then on more and on fewer until that is clearly worse."""
-        shares = ((self._budget.most_texels, EACH_TEXELS), (self._budget.most_bytes, EACH_BYTES))
-        able = max(START, min(limit // each for limit, each in shares if limit is not None))
-        start = max(index for index, count in enumerate(self._counts) if count <= able or index == 0)
+        """Spend the limits on as many billboards as have enough of them, then on more until that is clearly worse, or else on fewer."""
+        able = self._able(self._budget)
+        start = min(range(len(self._counts)), key=lambda index: abs(math.log(self._counts[index] / able)))
         series, begin = list[Spent](), self._spent(self._counts[start])
         if begin is not None:
-            series = self._followed([begin], self._counts[start + 1 :])
-            if max(point.psnr for point in series) > begin.psnr + _NOISE_DB:
+            if begin.unlimited and start == len(self._counts) - 1:
+                return [begin]  # what a fit without limits has, too
+            series = self._followed([begin], self._counts[start + 1 :], _NOISE_DB)
+            if max(series, key=lambda point: point.psnr) is not begin:
                 return series
         return self._followed(series, self._counts[:start][::-1])
 
-    def _followed(self, series: list[Spent], counts: Sequence[int]) -> list[Spent]:
-        """Continue a series with numbers of billboards until one is clearly worse than another, or exceeds limits that others keep."""
+    def _able(self, budget: BudgetConfig) -> float:
+        """Roughly how many billboards have enough texels and bytes within limits."""
+        shares = ((budget.most_texels, EACH_TEXELS), (budget.most_bytes, EACH_BYTES))
+        return max(START, min(limit / each for limit, each in shares if limit is not None))
+
+    def _tried_half(self, best: Spent) -> None:
+        """Run a trial with half of the limits, for the curve, unless they leave as much as the whole."""
+        trial, budget = best.trial, self._budget.half
+        if best.unlimited and trial.bytes <= (budget.most_bytes or math.inf) and trial.texels <= (budget.most_texels or math.inf):
+            return
+        able = min(self._able(budget), trial.billboards)
+        count = max((count for count in self._counts if count <= able), default=trial.billboards)
+        texels = allowed(self._trials.done, budget, count * trial.textures // trial.billboards)
+        if texels >= 2 * count:
+            self._trials.run(count, trial.sides, trial.placement, int(texels))
+
+    def _followed(self, series: list[Spent], counts: Sequence[int], patience: float = 0.0) -> list[Spent]:
+        """Continue a series until a number of billboards exceeds the limits, or is worse than another by more than ``patience``, in dB."""
         for count in counts:
-            point = self._spent(count)
+            least = max((point.psnr for point in series), default=-math.inf) - patience
+            point = self._spent(count, least)
             if point is not None:
                 series = [*series, point]
-            if series and (point is None or point.psnr < max(other.psnr for other in series) - _NOISE_DB):
+            if series and (point is None or point.psnr < least):
                 break
         return series
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from typing import Annotated
 
@@ -52,6 +52,12 @@ class BudgetConfig:
     def most_bytes(self) -> int | None:
         """``bytes`` as a number."""
         return None if self.bytes is None else amount("bytes", self.bytes)
+
+    @property
+    def half(self) -> BudgetConfig:
+        """The same with half of the texels and bytes."""
+        halves = {name: limit // 2 for name, limit in (("texels", self.most_texels), ("bytes", self.most_bytes)) if limit is not None}
+        return replace(self, **halves)  # type: ignore[arg-type]
 
 
 def amount(name: str, value: int | str) -> int:

@@ -15,6 +15,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
 from bbfit.fitting.bark import Bark
 from bbfit.fitting.config import FitConfig, Placement, Sides
+from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.fitting.loop import fit
 from bbfit.fitting.points import placement_points
 from bbfit.fitting.requirements import check_cameras, check_device
@@ -45,6 +46,8 @@ class Trial:
     """Vertices of the billboards: four for each texture."""
     texels: int
     """Texels of all textures."""
+    density: float
+    """Texels per area, as a share of what the configuration asks for, in (0, 1]; less than 1 where a limit of texels lowers it."""
     bytes: int
     """Size of the model as GLB, in bytes."""
     texture_bytes: int
@@ -107,11 +110,14 @@ class Trials:
     def _fitted(self, config: FitConfig, count: int, placement: Placement) -> Trial:
         started = time.perf_counter()
         start = None if placement == "even" else self._placement(config)
-        cloud = fit(self._views, config, tree=self._tree, placement=start).cloud
+        result = fit(self._views, config, tree=self._tree, placement=start)
+        cloud, asked = result.cloud, result.config.texel_density * float(pixels_per_meter(self._views.train.cameras))
+        density = float((cloud.texture_sizes.flip(-1) / (2 * cloud.half_extents)).median() / asked) ** 2
         model = shipped_model(cloud, self._export)
         psnr, seconds = round(views_psnr(model.draw, self._views.test), 3), round(time.perf_counter() - started, 1)
-        sizes = len(cloud.texels), len(model.glb), picture_bytes(model.glb)
-        return Trial(count, config.sides, placement, config.max_texels, cloud.vertex_count, *sizes, psnr, seconds)
+        texels, sizes = len(cloud.texels), (len(model.glb), picture_bytes(model.glb))
+        most = config.max_texels
+        return Trial(count, config.sides, placement, most, cloud.vertex_count, texels, min(1.0, round(density, 4)), *sizes, psnr, seconds)
 
     def _placement(self, config: FitConfig) -> BillboardCloud:
         """The placement of a number of billboards, which one search finds for all limits of texels."""

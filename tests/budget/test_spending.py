@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from bbfit.budget.config import BudgetConfig
-from bbfit.budget.spending import has_all_texels, spent, texel_gain, texels_within
+from bbfit.budget.spending import has_all_texels, spent, texels_within
 from bbfit.budget.trials import Trial, Trials
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.views.dataset import ViewDataset
 
 
-def trial(count: int, texels: int, pictures: int, bare: int = 0, psnr: float = 20.0, most: int | None = None, two: bool = False) -> Trial:
-    vertices = count * (8 if two else 4)
-    return Trial(count, "two" if two else "one", "clusters", most or texels, vertices, texels, bare + pictures, pictures, psnr, 0.0)
+def trial(
+    count: int, texels: int, pictures: int, bare: int = 0, psnr: float = 20.0, most: int | None = None, density: float = 0.5
+) -> Trial:
+    return Trial(count, "one", "clusters", most or texels, 4 * count, texels, density, bare + pictures, pictures, psnr, 0.0)
+
+
+def two_sided(one: Trial) -> Trial:
+    return replace(one, sides="two", vertices=2 * one.vertices)
 
 
 @pytest.fixture(scope="module")
@@ -43,12 +49,12 @@ def trials_of(views: ViewDataset) -> Callable[[Callable[[int, int], tuple[int, f
 def test_bytes_that_are_left_go_to_texels() -> None:
     """What is no picture grows with the textures, of which a two-sided billboard has two, for more of them as their power of 0.6 at least;
     nothing may be left."""
-    assert texels_within([], 4, 1000.0) == 500
+    assert texels_within([], 4, 7200.0) == 4000 and texels_within([], 4000, 9000.0) == pytest.approx(2000)
     one = trial(4, 1000, pictures=3000, bare=800)
     assert texels_within([one], 4, 6800) == pytest.approx(2000)
     bare = 800 * 2**0.6
     assert texels_within([one], 8, 6000 + bare) == pytest.approx(2000)
-    assert texels_within([trial(2, 1000, 3000, 800, two=True)], 8, 6000 + bare) == pytest.approx(2000)
+    assert texels_within([two_sided(trial(2, 1000, 3000, 800))], 8, 6000 + bare) == pytest.approx(2000)
     assert texels_within([one], 2, 6400) == pytest.approx(2000)  # at best in proportion
     assert texels_within([one], 8, bare) == 0 and texels_within([one], 40, 1600) < 0
 
@@ -62,27 +68,43 @@ def test_the_nearest_trial_counts() -> None:
 
 
 def test_what_a_fit_may_have_is_more_than_it_has() -> None:
-    """A fit leaves some of its limit, in any case as large a part of it; one that leaves much of it is as dense as it is to be."""
-    some, much = trial(4, 900, 1800, most=1000), trial(4, 500, 1000, most=1000)
+    """A fit leaves some of its limit, in any case as large a part of it; one that is dense needs no more."""
+    some, all_of_them = trial(4, 900, 1800, most=1000, density=0.97), trial(4, 900, 1800, most=1000, density=0.99)
     assert not has_all_texels(some) and texels_within([some], 4, 3600) == pytest.approx(2000)
-    assert has_all_texels(much) and texels_within([much], 4, 2000) == pytest.approx(1000)
-    assert not has_all_texels(trial(128, 500, 1000, most=1000))  # a few texels each are rounded away
+    assert has_all_texels(all_of_them) and texels_within([all_of_them], 4, 3600) == pytest.approx(1800)
 
 
-def test_trials_of_equal_billboards_show_what_texels_gain() -> None:
-    """Otherwise a usual gain is taken; texels never make it worse."""
-    assert texel_gain([]) == texel_gain([trial(4, 1000, 1), trial(6, 4000, 1), trial(2, 4000, 1, two=True), trial(4, 1100, 1)]) == 0.4
-    assert texel_gain([trial(4, 1000, 1, psnr=20), trial(6, 1000, 1), trial(4, 4000, 1, psnr=21)]) == pytest.approx(0.5)
-    assert texel_gain([trial(4, 4000, 1, psnr=20), trial(4, 1000, 1, psnr=21)]) == 0
+@pytest.mark.parametrize(
+    ("share", "target", "gain"),
+    [(1.5, None, 0.1 * (2 - 4 / 3)), (4, None, 0.1), (0.7, None, 0.1 * (2 - 2 / 0.7)), (1.5, 30, 0.0), (0.7, 30, 0.1 * (2 - 2 / 0.7))],
+)
+def test_what_a_trial_leaves_of_the_limit_counts_as_used_and_what_it_exceeds_as_lost(
+    trials_of: Callable[..., Trials], share: float, target: float | None, gain: float
+) -> None:
+    """Until it is dense. A target counts no gain: a trial has to reach it as it is."""
+    first = int((92_000 - 4 * 300) / 1.5)
+    trials = trials_of(lambda count, texels: (round(texels * 100_000 / share / first), 20.0))
+    found = spent(trials, BudgetConfig(bytes=100_000, target_psnr=target), 4, "one", "clusters")
+    assert found is not None and len(trials.done) == 1 and not found.unlimited
+    assert found.psnr == pytest.approx(20 + gain, abs=1e-4) and found.max_texels == pytest.approx(share * first, abs=3)
 
 
-def test_what_a_trial_leaves_of_the_limit_counts_as_used(trials_of: Callable[..., Trials]) -> None:
-    """Except for a target, which a trial has to reach as it is."""
-    for budget, gain in ((BudgetConfig(bytes=100_000), 0.4 * 0.5), (BudgetConfig(bytes=100_000, target_psnr=30), 0.0)):
-        trials = trials_of(lambda count, texels: (round(texels * 100_000 / 2**0.5 / 46_000), 20.0))
-        found = spent(trials, budget, 4, "one", "clusters")
-        assert found is not None and len(trials.done) == 1
-        assert found.psnr == pytest.approx(20 + gain, abs=1e-4) and found.max_texels == pytest.approx(2**0.5 * 46_000, abs=3)
+def test_no_more_is_tried_of_what_exceeds_the_limit_and_is_bad_enough(trials_of: Callable[..., Trials]) -> None:
+    """Fewer texels would not make it better."""
+    for least, tried in ((20.1, 1), (19.9, 2)):
+        trials = trials_of(lambda count, texels: (4 * texels, 20.0))
+        assert (spent(trials, BudgetConfig(bytes=100_000), 4, "one", "clusters", least=least) is None) is (tried == 1)
+        assert len(trials.done) == tried
+
+
+def test_a_trial_with_the_texels_that_it_asks_for_is_unlimited(views: ViewDataset) -> None:
+    """Unless it exceeds the limit in bytes."""
+    for limit, unlimited in ((100_000, True), (3000, False)):
+        trials = Trials(
+            views, FitConfig(), None, ExportConfig(), lambda config: trial(4, 1000, 2000, 1500, most=config.max_texels, density=1)
+        )
+        found = spent(trials, BudgetConfig(bytes=limit), 4, "one", "clusters")
+        assert found is not None and found.unlimited is unlimited and len(trials.done) == 1
 
 
 def test_what_exceeds_the_limit_is_nothing(trials_of: Callable[..., Trials]) -> None:

@@ -125,7 +125,7 @@ def test_loss_plot_needs_losses(tmp_path: Path) -> None:
 
 def trial(count: int, psnr: float, sides: Sides = "one", placement: Placement = "clusters") -> Trial:
     textures = count * (1 if sides == "one" else 2)
-    return Trial(count, sides, placement, None, 4 * textures, 10_000 * count, 30_000 * count, 20_000 * count, psnr, 1.0)
+    return Trial(count, sides, placement, None, 4 * textures, 10_000 * count, 1.0, 30_000 * count, 20_000 * count, psnr, 1.0)
 
 
 def chosen(trials: list[Trial], number: int) -> Choice:
