@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.budget.config import BudgetConfig
-from bbfit.budget.spending import Spent, allowed, spent
+from bbfit.budget.spending import GROWTH, Spent, allowed, spent
 from bbfit.budget.trials import Known, OnTrial, Trial, Trials
 from bbfit.checks import fail
 from bbfit.exporting.config import ExportConfig
@@ -21,17 +21,18 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128, 256)
 """Numbers of billboards to try, in addition to the largest that the limit of vertices and ``FitConfig.most_billboards`` allow."""
 START = 32
 """Least number of billboards that a limit of texels or bytes is first spent on, if it is among those to try."""
-EACH_TEXELS, EACH_BYTES = 100, 600
-"""Roughly what a billboard needs in views of 256 pixels: texels, and bytes of the model (490 to 970 in default masks of eight trees).
-A limit is first spent on as many billboards as have that."""
+EACH_TEXELS, BYTES = 100, 4_100
+"""Roughly what n billboards need in views of 256 pixels: n times as many texels, and a model of n ** :data:`GROWTH` times as many bytes.
+A limit is first spent on the largest number to try that has them. In trials of an acer and an aspen without limits, 128 billboards had
+115 to 119 kB, 256 had 154 to 164 kB, and 384 had 184 to 205 kB. They may have half of the texels or fewer at little cost."""
 MIN_GAIN_DB = 0.75
 """Least gain, in dB, for which ``auto`` doubles the number of billboards."""
 LEAST_VIEWS = 5
 """Least number of training views. Every fifth of them is for validation."""
 # Most billboards for which evenly placed and two-sided ones are tried too: the more there are, the less it matters.
 _FEW = 8
-# Random difference between two short fits, in dB.
-_NOISE_DB = 0.15
+# Random difference between two short fits, in dB, and what limits may cost as many billboards as are allowed, before fewer are tried.
+_NOISE_DB, _LITTLE_DB = 0.15, 0.2
 
 
 @dataclass(frozen=True)
@@ -227,29 +228,28 @@ class _Chooser:
 
     def _climbed(self) -> list[Spent]:
         """Spend the limits on as many billboards as have enough of them, then on more until that is clearly worse, or else on fewer."""
-        able = self._able(self._budget)
-        start = min(range(len(self._counts)), key=lambda index: abs(math.log(self._counts[index] / able)))
+        start = self._start(self._budget)
         series, begin = list[Spent](), self._spent(self._counts[start])
         if begin is not None:
-            if begin.unlimited and start == len(self._counts) - 1:
-                return [begin]  # what a fit without limits has, too
+            if begin.missing <= _LITTLE_DB and start == len(self._counts) - 1:
+                return [begin]  # fewer would not gain that much
             series = self._followed([begin], self._counts[start + 1 :], _NOISE_DB)
             if max(series, key=lambda point: point.psnr) is not begin:
                 return series
         return self._followed(series, self._counts[:start][::-1])
 
-    def _able(self, budget: BudgetConfig) -> float:
-        """Roughly how many billboards have enough texels and bytes within limits."""
-        shares = ((budget.most_texels, EACH_TEXELS), (budget.most_bytes, EACH_BYTES))
-        return max(START, min(limit / each for limit, each in shares if limit is not None))
+    def _start(self, budget: BudgetConfig) -> int:
+        """Index of the number of billboards to spend limits on first."""
+        texels, size = budget.most_texels or math.inf, budget.most_bytes or math.inf
+        able = max(START, min(texels / EACH_TEXELS, (size / BYTES) ** (1 / GROWTH)))
+        return max((index for index, count in enumerate(self._counts) if count <= able), default=0)
 
     def _tried_half(self, best: Spent) -> None:
         """Run a trial with half of the limits, for the curve, unless they leave as much as the whole."""
         trial, budget = best.trial, self._budget.half
-        if best.unlimited and trial.bytes <= (budget.most_bytes or math.inf) and trial.texels <= (budget.most_texels or math.inf):
+        if not best.missing and trial.bytes <= (budget.most_bytes or math.inf) and trial.texels <= (budget.most_texels or math.inf):
             return
-        able = min(self._able(budget), trial.billboards)
-        count = max((count for count in self._counts if count <= able), default=trial.billboards)
+        count = min(self._counts[self._start(budget)], trial.billboards)
         texels = allowed(self._trials.done, budget, count * trial.textures // trial.billboards)
         if texels >= 2 * count:
             self._trials.run(count, trial.sides, trial.placement, int(texels))

@@ -17,9 +17,9 @@ _BYTES_EACH, _MOST_BESIDES, _BYTES_PER_TEXEL = 300, 2 / 3, 1.5
 _AIM, _MOST_OFF, _MOST_GAIN_DB, _MOST_AIMS = 0.92, 2.0, 0.2, 3
 # The least density at which a trial counts as dense as its configuration asks for.
 _DENSE = 0.98
-# All bytes but those of the pictures grow with at least this power of the number of textures, and at most in proportion. Trials of 32 to
-# 384 billboards of an acer and an aspen had powers of 0.33 to 0.85.
-_GROWTH = 0.6
+GROWTH = 0.6
+"""All bytes but those of the pictures grow with at least this power of the number of textures, and at most in proportion. Trials of 32 to
+384 billboards of an acer and an aspen had powers of 0.33 to 0.85."""
 # A trial with a share d of the density that its configuration asks for has this many dB times 1 / d - 1 less than a dense one. In trials of
 # 8 and 128 billboards of an acer and a poplar with a half to a tenth, in three alpha modes, the median was 0.07, and for the acer 0.1.
 _DENSITY_DB = 0.1
@@ -35,8 +35,8 @@ class Spent:
     """Estimated PSNR of a short fit at the limits, in dB."""
     max_texels: int | None
     """Limit of texels with which a short fit is expected to use all that it may. A full fit uses a little more and compresses better."""
-    unlimited: bool
-    """Whether the limits leave the trial all texels that its configuration asks for."""
+    missing: float
+    """What the same billboards are expected to gain without limits, in dB."""
 
 
 def spent(
@@ -52,7 +52,7 @@ def spent(
     limit, most = budget.most_bytes, budget.most_texels
     if limit is None:
         trial = trials.run(count, sides, placement, most)
-        return Spent(trial, trial.psnr, most, has_all_texels(trial))
+        return Spent(trial, trial.psnr, most, _missing(trial, _granted(trial)))
 
     def left(trial: Trial) -> float:
         return min(texels_within([trial], trial.textures, limit), most or math.inf)
@@ -73,7 +73,7 @@ def spent(
         return None
     trial = min(able, key=lambda trial: abs(_gain(trial, left(trial))))
     gain = min(_gain(trial, left(trial)), _MOST_GAIN_DB if budget.target_psnr is None else 0.0)
-    return Spent(trial, trial.psnr + gain, int(left(trial)), trial.bytes <= limit and has_all_texels(trial))
+    return Spent(trial, trial.psnr + gain, int(left(trial)), _missing(trial, left(trial)))
 
 
 def allowed(trials: Sequence[Trial], budget: BudgetConfig, textures: int) -> float:
@@ -93,7 +93,7 @@ def texels_within(trials: Sequence[Trial], textures: int, most_bytes: float) -> 
         return (most_bytes - min(_BYTES_EACH * textures, _MOST_BESIDES * most_bytes)) / _BYTES_PER_TEXEL
     nearest = min(trials, key=lambda trial: (abs(math.log(trial.textures / textures)), abs(math.log(trial.bytes / most_bytes))))
     ratio = textures / nearest.textures
-    left = most_bytes - (nearest.bytes - nearest.texture_bytes) * min(ratio, ratio**_GROWTH)
+    left = most_bytes - (nearest.bytes - nearest.texture_bytes) * min(ratio, ratio**GROWTH)
     return _granted(nearest) * left / nearest.texture_bytes
 
 
@@ -107,10 +107,15 @@ def _granted(trial: Trial) -> int:
     return trial.texels if trial.max_texels is None or has_all_texels(trial) else trial.max_texels
 
 
+def _missing(trial: Trial, texels: float) -> float:
+    """Estimate what a trial's billboards would gain without limits, in dB, over a limit of texels."""
+    share = texels / _granted(trial) * (1.0 if has_all_texels(trial) else trial.density)
+    return math.inf if share <= 0 else _DENSITY_DB * max(0.0, 1 / share - 1)
+
+
 def _gain(trial: Trial, texels: float) -> float:
     """Estimate what a limit of texels gains over that of a trial, in dB; less than 0 if it is lower."""
-    density = min(1.0, trial.density * texels / _granted(trial))
-    return _DENSITY_DB * (1 / trial.density - 1 / density) if density > 0 else -math.inf
+    return _missing(trial, _granted(trial)) - _missing(trial, texels)
 
 
 def _is_near(trial: Trial, texels: float) -> bool:

@@ -85,7 +85,8 @@ def test_what_a_trial_leaves_of_the_limit_counts_as_used_and_what_it_exceeds_as_
     first = int((92_000 - 4 * 300) / 1.5)
     trials = trials_of(lambda count, texels: (round(texels * 100_000 / share / first), 20.0))
     found = spent(trials, BudgetConfig(bytes=100_000, target_psnr=target), 4, "one", "clusters")
-    assert found is not None and len(trials.done) == 1 and not found.unlimited
+    assert found is not None and len(trials.done) == 1
+    assert found.missing == pytest.approx(0.1 * (2 / min(share, 2) - 1), abs=1e-5)
     assert found.psnr == pytest.approx(20 + gain, abs=1e-4) and found.max_texels == pytest.approx(share * first, abs=3)
 
 
@@ -97,14 +98,16 @@ def test_no_more_is_tried_of_what_exceeds_the_limit_and_is_bad_enough(trials_of:
         assert len(trials.done) == tried
 
 
-def test_a_trial_with_the_texels_that_it_asks_for_is_unlimited(views: ViewDataset) -> None:
-    """Unless it exceeds the limit in bytes."""
-    for limit, unlimited in ((100_000, True), (3000, False)):
+def test_a_trial_with_the_texels_that_it_asks_for_misses_nothing(views: ViewDataset) -> None:
+    """Unless it exceeds the limit in bytes; a limit of texels costs what the density is short of."""
+    for limit, missing in ((100_000, 0.0), (3000, 0.1 * (4 / 3 - 1))):
         trials = Trials(
             views, FitConfig(), None, ExportConfig(), lambda config: trial(4, 1000, 2000, 1500, most=config.max_texels, density=1)
         )
         found = spent(trials, BudgetConfig(bytes=limit), 4, "one", "clusters")
-        assert found is not None and found.unlimited is unlimited and len(trials.done) == 1
+        assert found is not None and len(trials.done) == 1 and found.missing == pytest.approx(missing)
+    trials = Trials(views, FitConfig(), None, ExportConfig(), lambda config: trial(4, 900, 2000, most=config.max_texels, density=0.25))
+    assert spent(trials, BudgetConfig(texels=1000), 4, "one", "clusters").missing == pytest.approx(0.3)  # type: ignore[union-attr]
 
 
 def test_what_exceeds_the_limit_is_nothing(trials_of: Callable[..., Trials]) -> None:
