@@ -31,7 +31,7 @@ LEAST_VIEWS = 5
 """Least number of training views. Every fifth of them is for validation."""
 # Most billboards for which evenly placed and two-sided ones are tried too: the more there are, the less it matters.
 _FEW = 8
-# Random difference between two short fits, in dB, and what limits may cost as many billboards as are allowed, before fewer are tried.
+# Random difference between two short fits, in dB, and what limits may cost a number of billboards before fewer are tried.
 _NOISE_DB, _LITTLE_DB = 0.15, 0.2
 
 
@@ -73,7 +73,7 @@ def choose(
     spent in full, and by halves and quarters for the curve. For a target or ``auto``, the number of billboards doubles until it reaches the
     target or gains too little; then the number between the last two that matter is tried. A limit of texels or bytes is first spent on as
     many billboards as have enough of them, at least 32, and then on more for as long as they are not clearly worse. If none is better,
-    fewer are tried for as long as each is. A last trial spends half of the limit, for the curve.
+    and the limits cost more than 0.2 dB, fewer are tried for as long as both are so. A last trial spends half of the limit, for the curve.
     Few billboards are also tried two-sided, half as many, and evenly placed, unless there is a target.
 
     All short fits of a number of billboards start from one placement, which a quick search finds. What a limit in bytes leaves for texels
@@ -231,12 +231,10 @@ class _Chooser:
         start = self._start(self._budget)
         series, begin = list[Spent](), self._spent(self._counts[start])
         if begin is not None:
-            if begin.missing <= _LITTLE_DB and start == len(self._counts) - 1:
-                return [begin]  # fewer would not gain that much
             series = self._followed([begin], self._counts[start + 1 :], _NOISE_DB)
-            if max(series, key=lambda point: point.psnr) is not begin:
+            if begin.missing <= _LITTLE_DB or max(series, key=lambda point: point.psnr) is not begin:
                 return series
-        return self._followed(series, self._counts[:start][::-1])
+        return self._followed(series, self._counts[:start][::-1], fewer=True)
 
     def _start(self, budget: BudgetConfig) -> int:
         """Index of the number of billboards to spend limits on first."""
@@ -254,14 +252,17 @@ class _Chooser:
         if texels >= 2 * count:
             self._trials.run(count, trial.sides, trial.placement, int(texels))
 
-    def _followed(self, series: list[Spent], counts: Sequence[int], patience: float = 0.0) -> list[Spent]:
-        """Continue a series until a number of billboards exceeds the limits, or is worse than another by more than ``patience``, in dB."""
+    def _followed(self, series: list[Spent], counts: Sequence[int], patience: float = 0.0, *, fewer: bool = False) -> list[Spent]:
+        """Continue a series until a number of billboards exceeds the limits, or is worse than another by more than ``patience``, in dB.
+
+        ``fewer`` billboards gain at most what more of them miss, so they are not tried after some that miss little.
+        """
         for count in counts:
             least = max((point.psnr for point in series), default=-math.inf) - patience
             point = self._spent(count, least)
             if point is not None:
                 series = [*series, point]
-            if series and (point is None or point.psnr < least):
+            if series and (point is None or point.psnr < least or (fewer and point.missing <= _LITTLE_DB)):
                 break
         return series
 

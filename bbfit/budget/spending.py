@@ -14,7 +14,7 @@ from bbfit.fitting.config import Placement, Sides
 _BYTES_EACH, _MOST_BESIDES, _BYTES_PER_TEXEL = 300, 2 / 3, 1.5
 # Fraction of a limit in bytes that trials aim at, how many times too many texels a trial may have, what the texels that the limit leaves
 # may be expected to gain over the trial's, in dB, and the most trials until that is so.
-_AIM, _MOST_OFF, _MOST_GAIN_DB, _MOST_AIMS = 0.92, 2.0, 0.2, 3
+_AIM, _MOST_OFF, _MOST_GAIN_DB, _MOST_AIMS = 0.92, 4.0, 0.4, 3
 # The least density at which a trial counts as dense as its configuration asks for.
 _DENSE = 0.98
 GROWTH = 0.6
@@ -44,8 +44,8 @@ def spent(
 ) -> Spent | None:
     """Try a configuration with the texels that the limits leave it. Return ``None`` if it exceeds them.
 
-    With a limit in bytes, up to three trials are run, until one has at most twice the texels that the limit is estimated to leave, and
-    these are expected to gain or to cost little. None is run if earlier trials show that the limit is too low for so many billboards,
+    With a limit in bytes, up to three trials are run, until one has at most four times the texels that the limit is estimated to leave,
+    and these are expected to gain or to cost little. None is run if earlier trials show that the limit is too low for so many billboards,
     unless ``anyway``, and no more after one that exceeds the limit and has less PSNR than ``least``. The PSNR is that of the trial with
     what the difference in texels is expected to gain or to cost. With a target, no gain is counted.
     """

@@ -93,7 +93,7 @@ def test_what_a_trial_leaves_of_the_limit_counts_as_used_and_what_it_exceeds_as_
 def test_no_more_is_tried_of_what_exceeds_the_limit_and_is_bad_enough(trials_of: Callable[..., Trials]) -> None:
     """Fewer texels would not make it better."""
     for least, tried in ((20.1, 1), (19.9, 2)):
-        trials = trials_of(lambda count, texels: (4 * texels, 20.0))
+        trials = trials_of(lambda count, texels: (10 * texels, 20.0))
         assert (spent(trials, BudgetConfig(bytes=100_000), 4, "one", "clusters", least=least) is None) is (tried == 1)
         assert len(trials.done) == tried
 
@@ -112,7 +112,7 @@ def test_a_trial_with_the_texels_that_it_asks_for_misses_nothing(views: ViewData
 
 def test_what_exceeds_the_limit_is_nothing(trials_of: Callable[..., Trials]) -> None:
     """Three trials are enough to see that."""
-    trials = trials_of(lambda count, texels: (200_000 + texels, 20.0))
+    trials = trials_of(lambda count, texels: (2_000_000 + texels, 20.0))
     assert spent(trials, BudgetConfig(bytes=100_000), 4, "one", "clusters") is None and len(trials.done) == 3
     assert spent(trials, BudgetConfig(texels=7), 4, "one", "clusters").psnr == 20  # type: ignore[union-attr]
     assert trials.done[-1].max_texels == 7
