@@ -114,11 +114,13 @@ class RunConfig:
 
     @property
     def exported(self) -> ExportConfig:
-        """The options of the export, unless they say otherwise: rectangles for a budget of vertices and for the preset ``thesis``, which
-        has no mip levels either."""
+        """The options of the export, unless they say otherwise: compact outlines for a budget of bytes; rectangles for one of vertices and
+        for the preset ``thesis``, which has no mip levels either."""
         thesis = self.fit.preset == "thesis"
         export = replace(self.export, mipmaps=False) if thesis and self.export.mipmaps is None else self.export
-        return export.comparable() if thesis or self.budget.vertices is not None else export
+        if thesis or self.budget.vertices is not None:
+            return export.comparable()
+        return export if self.budget.bytes is None else export.compact()
 
     def seeded(self, seed: int) -> RunConfig:
         """The same options with one seed for growing, rendering and fitting."""

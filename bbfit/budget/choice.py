@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bbfit.budget.config import BudgetConfig
-from bbfit.budget.spending import GROWTH, Spent, allowed, spent
+from bbfit.budget.spending import Spent, allowed, spent
 from bbfit.budget.trials import Known, OnTrial, Trial, Trials
 from bbfit.checks import fail
 from bbfit.exporting.config import ExportConfig
@@ -21,10 +21,10 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128, 256)
 """Numbers of billboards to try, in addition to the largest that the limit of vertices and ``FitConfig.most_billboards`` allow."""
 START = 32
 """Least number of billboards that a limit of texels or bytes is first spent on, if it is among those to try."""
-EACH_TEXELS, BYTES = 100, 4_100
-"""Roughly what n billboards need in views of 256 pixels: n times as many texels, and a model of n ** :data:`GROWTH` times as many bytes.
-A limit is first spent on the largest number to try that has them. In trials of an acer and an aspen without limits, 128 billboards had
-115 to 119 kB, 256 had 154 to 164 kB, and 384 had 184 to 205 kB. They may have half of the texels or fewer at little cost."""
+EACH_TEXELS, BYTES, BYTES_POWER = 100, 6_500, 2.5
+"""Roughly how many billboards limits are first spent on, in views of 256 pixels: the largest number to try of which each may have
+``EACH_TEXELS`` texels, and which is not above (bytes / ``BYTES``) ** ``BYTES_POWER``: 32 for 26 kB, 128 for 45 kB, 384 for 70 kB. More
+billboards need hardly more texels together, and each takes about 120 bytes besides."""
 MIN_GAIN_DB = 0.75
 """Least gain, in dB, for which ``auto`` doubles the number of billboards."""
 LEAST_VIEWS = 5
@@ -239,7 +239,7 @@ class _Chooser:
     def _start(self, budget: BudgetConfig) -> int:
         """Index of the number of billboards to spend limits on first."""
         texels, size = budget.most_texels or math.inf, budget.most_bytes or math.inf
-        able = max(START, min(texels / EACH_TEXELS, (size / BYTES) ** (1 / GROWTH)))
+        able = max(START, min(texels / EACH_TEXELS, (size / BYTES) ** BYTES_POWER))
         return max((index for index, count in enumerate(self._counts) if count <= able), default=0)
 
     def _tried_half(self, best: Spent) -> None:

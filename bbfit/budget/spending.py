@@ -11,15 +11,16 @@ from bbfit.budget.trials import Trial, Trials
 from bbfit.fitting.config import Placement, Sides
 
 # Estimate before the first trial: bytes for each texture besides its texels, at most this share of a limit, and bytes per texel.
-_BYTES_EACH, _MOST_BESIDES, _BYTES_PER_TEXEL = 300, 2 / 3, 1.5
+_BYTES_EACH, _MOST_BESIDES, _BYTES_PER_TEXEL = 125, 2 / 3, 2.5
 # Fraction of a limit in bytes that trials aim at, how many times too many texels a trial may have, what the texels that the limit leaves
 # may be expected to gain over the trial's, in dB, and the most trials until that is so.
 _AIM, _MOST_OFF, _MOST_GAIN_DB, _MOST_AIMS = 0.92, 4.0, 0.4, 3
+# Fewest texels for each texture of a trial within bytes: with fewer, fewer billboards are better.
+_LEAST_EACH = 8
 # The least density at which a trial counts as dense as its configuration asks for.
 _DENSE = 0.98
-GROWTH = 0.6
-"""All bytes but those of the pictures grow with at least this power of the number of textures, and at most in proportion. Trials of 32 to
-384 billboards of an acer and an aspen had powers of 0.33 to 0.85."""
+# All bytes but those of the pictures grow with at least this power of the number of textures, and at most in proportion.
+_GROWTH = 0.9
 # A trial with a share d of the density that its configuration asks for has this many dB times 1 / d - 1 less than a dense one. In trials of
 # 8 and 128 billboards of an acer and a poplar with a half to a tenth, in three alpha modes, the median was 0.07, and for the acer 0.1.
 _DENSITY_DB = 0.1
@@ -45,7 +46,7 @@ def spent(
     """Try a configuration with the texels that the limits leave it. Return ``None`` if it exceeds them.
 
     With a limit in bytes, up to three trials are run, until one has at most four times the texels that the limit is estimated to leave,
-    and these are expected to gain or to cost little. None is run if earlier trials show that the limit is too low for so many billboards,
+    and these are expected to gain or to cost little. None is run if earlier trials leave less than eight texels for each texture,
     unless ``anyway``, and no more after one that exceeds the limit and has less PSNR than ``least``. The PSNR is that of the trial with
     what the difference in texels is expected to gain or to cost. With a target, no gain is counted.
     """
@@ -60,7 +61,7 @@ def spent(
     textures, own = count * (1 if sides == "one" else 2), list[Trial]()
     for _ in range(_MOST_AIMS):
         texels = allowed(own[-1:] or trials.done, budget, textures)
-        if texels <= 0 and not anyway:
+        if texels < _LEAST_EACH * textures and not anyway:
             break
         texels = max(2 * textures, int(texels))
         if own and own[-1].max_texels == texels:
@@ -93,7 +94,7 @@ def texels_within(trials: Sequence[Trial], textures: int, most_bytes: float) -> 
         return (most_bytes - min(_BYTES_EACH * textures, _MOST_BESIDES * most_bytes)) / _BYTES_PER_TEXEL
     nearest = min(trials, key=lambda trial: (abs(math.log(trial.textures / textures)), abs(math.log(trial.bytes / most_bytes))))
     ratio = textures / nearest.textures
-    left = most_bytes - (nearest.bytes - nearest.texture_bytes) * min(ratio, ratio**GROWTH)
+    left = most_bytes - (nearest.bytes - nearest.texture_bytes) * min(ratio, ratio**_GROWTH)
     return _granted(nearest) * left / nearest.texture_bytes
 
 

@@ -35,7 +35,7 @@ from bbfit.views.dataset import ViewDataset
 
 LUCK = 0.15
 """What two short fits may differ by for no reason, in dB."""
-BYTES_A_TEXEL, BYTES_EACH, AIM = 1.5, 300, 0.92
+BYTES_A_TEXEL, BYTES_EACH, AIM = 2.5, 125, 0.92
 """The first guess, for a texel and for a billboard besides; the part of a limit in bytes that a trial aims at."""
 
 
@@ -273,10 +273,10 @@ def test_no_more_are_tried_than_a_fit_may_have(choosing: Choosing) -> None:
 @pytest.mark.parametrize(
     ("budget", "start"),
     [
-        (BudgetConfig(bytes="100k"), 128),
-        (BudgetConfig(bytes="120k"), 256),
-        (BudgetConfig(bytes="140k"), 256),
-        (BudgetConfig(bytes="150k"), MOST),
+        (BudgetConfig(bytes="46k"), 128),
+        (BudgetConfig(bytes="60k"), 256),
+        (BudgetConfig(bytes="69k"), 256),
+        (BudgetConfig(bytes="71k"), MOST),
         (BudgetConfig(texels="13k"), 128),
         (BudgetConfig(texels="13k", bytes="240k"), 128),
         (BudgetConfig(bytes="5k"), START),
