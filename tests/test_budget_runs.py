@@ -200,14 +200,15 @@ def test_the_model_has_no_more_bytes_than_asked_for(tmp_path: Path) -> None:
     assert run(VIEWS, tmp_path, config).skipped == STAGES
 
 
-def test_a_budget_of_bytes_draws_compact_outlines() -> None:
-    """Unless vertices are limited too, or another outline is requested."""
+def test_a_budget_of_vertices_or_bytes_draws_compact_outlines() -> None:
+    """Unless another outline is requested. Four corners are as many as a rectangle has."""
     size = BudgetConfig(bytes="20k")
     assert RunConfig().exported == ExportConfig()
     assert RunConfig(budget=size).exported == ExportConfig(outline="hull", corners=5)
     assert RunConfig(budget=size, export=ExportConfig(corners=4)).exported == ExportConfig(outline="hull", corners=4)
     assert RunConfig(budget=size, export=ExportConfig(outline="pieces")).exported == ExportConfig(outline="pieces")
-    assert RunConfig(budget=dataclasses.replace(size, vertices=8)).exported == ExportConfig(outline="rectangle")
+    assert RunConfig(budget=dataclasses.replace(size, vertices=8)).exported == ExportConfig(outline="hull", corners=4)
+    assert RunConfig(fit=FitConfig(preset="thesis")).exported.outline == "rectangle"
 
 
 def test_a_fit_much_larger_than_its_limit_is_cut_to_it(tmp_path: Path) -> None:

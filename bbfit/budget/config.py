@@ -20,11 +20,11 @@ class BudgetConfig:
     """
 
     vertices: Annotated[int, Range(4)] | None = None
-    """Most vertices of the model: a billboard has 4, a two-sided one 8."""
+    """Most vertices of the model: a billboard has 4, a two-sided one 8. Billboards are then hulls of at most 4 corners."""
     texels: int | str | None = None
     """Most texels, such as 500k or 2M."""
     bytes: int | str | None = None
-    """Most bytes of model.glb, such as 500k or 2M. Billboards then have compact outlines, unless vertices are limited too."""
+    """Most bytes of model.glb, such as 500k or 2M. Billboards are then hulls of at most 5 corners."""
     target_psnr: Annotated[float, Range(0, 100, open_low=True)] | None = None
     """PSNR in dB, the mean over four backgrounds, to reach on validation views with as few billboards as possible."""
     auto: bool = False

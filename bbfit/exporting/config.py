@@ -65,9 +65,6 @@ _PROGRAMS: dict[Profile | None, Program] = {
     "panda3d": Program(),
     "blender": Program(split=False, mipmaps=False, traced=True),
 }
-# Most corners of a compact outline. For an acer and an apple of 384 billboards, a hull of 5 takes 122 bytes a billboard, and the default's
-# pieces 292 and 253; it shades 10 % and 7 % more pixels.
-_FEW_CORNERS = 5
 
 
 @dataclass(frozen=True)
@@ -90,7 +87,7 @@ class ExportConfig:
     """What is drawn of each billboard. pieces: convex pieces around its visible parts, so that few empty pixels are shaded;
     hull: one convex polygon; rectangle: all of it.
     Default: pieces; a run with a budget of bytes draws hulls of at most 5 corners, whose vertices take half of the bytes;
-    a run with a budget of vertices or with the preset thesis, and a comparison of vertices, draw rectangles."""
+    a run with a budget of vertices draws hulls of 4; the preset thesis and a comparison of vertices draw rectangles."""
     pieces: Count = 8
     """With pieces: the most pieces of a billboard on average, at least 1. Cuts that save too little are left out."""
     corners: Annotated[int, Range(4, 8)] = 8
@@ -132,9 +129,9 @@ class ExportConfig:
         """The same options with rectangles unless they ask for outlines: all models have as many vertices for each billboard."""
         return replace(self, outline="rectangle") if self.outline is None else self
 
-    def compact(self) -> ExportConfig:
-        """The same options with outlines that take few bytes unless they ask for others: hulls of at most five corners."""
-        return replace(self, outline="hull", corners=min(self.corners, _FEW_CORNERS)) if self.outline is None else self
+    def compact(self, corners: int) -> ExportConfig:
+        """The same options with hulls of at most so many corners, 4 to 8, unless they ask for other outlines."""
+        return replace(self, outline="hull", corners=min(self.corners, corners)) if self.outline is None else self
 
     def mipmapped(self, alpha: AlphaMode) -> bool:
         """Whether a model with an alpha mode is read with mip levels."""
