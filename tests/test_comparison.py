@@ -85,7 +85,8 @@ def test_costs_are_those_of_the_models(done: CompareResult) -> None:
         if system not in CODED:
             model = (done.folder / system / "model.glb").read_bytes()
             assert cost.bytes == len(model) and cost.vertices == glb_counts(model)[0], system
-            assert cost.shaded is not None and 0.1 < cost.shaded < 60, system  # ten vertices cover a part of the tree
+            # Ten vertices cover a part of the tree, and each of many planes up to three times its pixels.
+            assert cost.shaded is not None and 0.1 < cost.shaded < max(60, 3 * (cost.planes or 0)), system
     assert {system for system, cost in costs.items() if cost.shader} == {"slicing", "height-fields", "radiance-field", *OCTAHEDRAL}
     assert {costs[system].planes for system in OCTAHEDRAL} == {1} and {costs[system].vertices for system in OCTAHEDRAL} == {4}
     assert (costs["octahedral-flat"].bytes or 0) < (costs["octahedral"].bytes or 0)
