@@ -341,11 +341,11 @@ def test_a_placement_that_is_asked_for_is_kept(choosing: Choosing) -> None:
         (curve(n32=25, n64=24, n128=30, n24=25.5, n16=25.2, n12=30), [32, 64, 24, 16], 24),
         (curve(n32=25, n64=24, n24=24, n16=30), [32, 64, 24], 32),
         (rising, [32, 64, 128, 256, MOST], MOST),
-        (lambda count, *kind: 30.0 - count, [32, 64, 24, 16, 12, 8, 6, 4, 3, 2], 2),
+        (lambda count, sides, placement: 30.0 - count - 9 * (sides != "one"), [32, 64, 24, 16, 12, 8, 6], 6),
     ],
 )
 def test_texels_go_to_more_and_to_fewer_until_that_is_in_vain(choosing: Choosing, quality: Quality, line: list[int], best: int) -> None:
-    """To fewer only if more are no better; every trial has the limit, and so has the fit."""
+    """To fewer only if more are no better, and until the limit costs 0.2 dB; every trial has the limit, and so has the fit."""
     world = World(quality)
     found = choosing(world, BudgetConfig(texels="2k"), FitConfig(placement="clusters"))
     assert world.line == line and line[0] == START and summary(found) == (best, "one", "clusters")
@@ -374,7 +374,7 @@ def test_a_step_in_vain_may_be_bad_luck(choosing: Choosing) -> None:
 def test_limits_of_vertices_and_texels_hold_at_once(choosing: Choosing) -> None:
     world = World(rising)
     found = choosing(world, BudgetConfig(vertices=20, texels=3000))
-    assert world.line == [5, 4] and found.config.billboards == 5 and found.config.max_texels == 3000
+    assert world.line == [5] and found.config.billboards == 5 and found.config.max_texels == 3000
     assert all(trial.vertices <= 20 and trial.texels <= 3000 for trial in found.trials)
 
 
@@ -418,7 +418,7 @@ def test_so_many_that_no_texel_is_left_are_not_tried(choosing: Choosing) -> None
     assert world.line == [32, 6, 4]
     world = World(rising, texels=10**6, bare=lambda count: 1000)
     assert choosing(world, BudgetConfig(bytes=1010), FitConfig(placement="clusters")).config.billboards == 1
-    assert world.line[0] == 32 and world.line[-1] == 1
+    assert world.line[0] == 12 and world.line[-1] == 1  # for 16 the first guess leaves less than 8 texels each
 
 
 def test_a_budget_of_bytes_that_can_be_kept_is_kept(choosing: Choosing) -> None:
@@ -523,10 +523,10 @@ def test_a_target_is_not_given_up_for_a_trial_that_is_too_much(choosing: Choosin
 
 
 def test_of_all_trials_that_reach_a_target_the_smallest_counts(choosing: Choosing) -> None:
-    """Also one that left much of the limit, before and after ones that were too large by far."""
+    """Of those within the limit, the last one left less of it. One between them was too large by far."""
     world = World(rising, texels=10**6, size=lambda count, texels: 20_000 if texels <= 50_000 else 400_000)
     found = choosing(world, BudgetConfig(target_psnr=20, bytes=100_000))
-    assert world.line == [1, 1, 1] and found.config.billboards == 1 and found.chosen == 1 and found.met
+    assert world.line == [1, 1, 1] and found.config.billboards == 1 and found.chosen == 2 and found.met
 
 
 def test_auto_stops_at_the_knee(choosing: Choosing) -> None:
@@ -583,7 +583,7 @@ def test_a_little_better_may_be_luck(choosing: Choosing, better: float) -> None:
     for budget, expected in (
         (BudgetConfig(texels="3k", vertices=48), 12 if better < 1 else 8),
         (BudgetConfig(texels="3k"), 12 if better < 0 else 8),
-        (BudgetConfig(bytes="19k"), 12 if better < 0 else 8),
+        (BudgetConfig(bytes="6k"), 12 if better < 0 else 8),
     ):
         world = World(quality)
         assert choosing(world, budget).config.billboards == expected
@@ -788,7 +788,7 @@ def test_a_choice_on_real_views() -> None:
     views, told = sealed(DATA / "views"), []
     found = choose(views, QUICK, BudgetConfig(vertices=11, texels="4k"), on_trial=lambda trials, total: told.append(len(trials)))
     kinds = [(trial.billboards, trial.sides, trial.placement) for trial in found.trials]
-    assert kinds[:2] == [(2, "one", "clusters"), (1, "one", "clusters")] and told == list(range(1, len(kinds) + 1))
+    assert kinds[:2] == [(2, "one", "clusters"), (1, "two", "clusters")] and told == list(range(1, len(kinds) + 1))
     assert all(trial.vertices <= 8 and 0 < trial.texels <= 4000 and 5 < trial.psnr < 40 and trial.seconds > 0 for trial in found.trials)
     best = found.trials[found.chosen]
     whole = [trial for trial in found.trials if trial.max_texels == 4000]
@@ -810,8 +810,9 @@ def test_a_choice_on_real_views() -> None:
 @pytest.mark.slow
 def test_bytes_on_real_views() -> None:
     found = choose(sealed(DATA / "views"), dataclasses.replace(QUICK, placement="even"), BudgetConfig(bytes="20k", vertices=8))
-    assert 10_000 < found.trials[found.chosen].bytes <= 20_000 and found.config.max_texels is not None
-    for count in (1, 2):
-        assert any(trial.bytes <= 20_000 for trial in found.trials if trial.billboards == count)
+    best = found.trials[found.chosen]
+    assert (best.billboards, best.max_texels is not None) == (2, True) and best.texels <= (best.max_texels or 0)
+    left = (20_000 - best.bytes + best.texture_bytes) / best.texture_bytes
+    assert found.config.max_texels == pytest.approx(left * (best.max_texels or 0), abs=1)  # a trial that is not dense has all that it may
     within = [trial for trial in found.trials if trial.bytes <= 20_000]
     assert found.trials[found.chosen] in within and len(found.trials) - len(within) <= 1  # only the first guess was too large
