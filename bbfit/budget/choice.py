@@ -174,8 +174,8 @@ class _Chooser:
         best = self._best(self._climbed() if self._spends and not self._grows else self._grown())
         if budget.target_psnr is None:
             best = max([best, *self._others(best.trial.billboards)], key=lambda other: other.psnr)
-        if budget.target_psnr is None and self._spends:
-            self._tried_half(best)
+            if self._spends:
+                self._try_half(best)
         trial = best.trial
         met = budget.target_psnr is None or best.psnr >= budget.target_psnr
         chosen = replace(config, billboards=trial.billboards, sides=trial.sides, placement=trial.placement, max_texels=best.max_texels)
@@ -242,7 +242,7 @@ class _Chooser:
         able = max(START, min(texels / EACH_TEXELS, (size / BYTES) ** BYTES_POWER))
         return max((index for index, count in enumerate(self._counts) if count <= able), default=0)
 
-    def _tried_half(self, best: Spent) -> None:
+    def _try_half(self, best: Spent) -> None:
         """Run a trial with half of the limits, for the curve, unless they leave as much as the whole."""
         trial, budget = best.trial, self._budget.half
         if not best.missing and trial.bytes <= (budget.most_bytes or math.inf) and trial.texels <= (budget.most_texels or math.inf):

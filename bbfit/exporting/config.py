@@ -86,7 +86,7 @@ class ExportConfig:
     outline: Outline | None = None
     """What is drawn of each billboard. pieces: convex pieces around its visible parts, so that few empty pixels are shaded;
     hull: one convex polygon; rectangle: all of it.
-    Default: pieces; a run with a budget of bytes draws hulls of at most 5 corners, whose vertices take half of the bytes;
+    Default: pieces; a run with a budget of bytes draws hulls of at most 5 corners, whose vertices take about half of the bytes;
     a run with a budget of vertices draws hulls of 4; the preset thesis and a comparison of vertices draw rectangles."""
     pieces: Count = 8
     """With pieces: the most pieces of a billboard on average, at least 1. Cuts that save too little are left out."""
