@@ -13,10 +13,11 @@ from bbfit.blender.config import RING, ViewsConfig
 from bbfit.blender.requirements import check_blender
 from bbfit.budget.choice import check_budget
 from bbfit.budget.config import BudgetConfig
+from bbfit.budget.sizes import finest_within_bytes
 from bbfit.checks import fail
 from bbfit.evaluation.report import Report
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import shipped_model
+from bbfit.exporting.model import ShippedModel, shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step
 from bbfit.fitting.requirements import check_device
@@ -114,15 +115,15 @@ class RunConfig:
 
     @property
     def exported(self) -> ExportConfig:
-        """The options of the export, unless they say otherwise: hulls of few corners for a budget of vertices or bytes; rectangles for the
-        preset ``thesis``, which has no mip levels either."""
+        """The options of the export, unless they say otherwise: hulls of few corners for a budget of vertices or bytes, which are finer in
+        the end if the bytes allow it; rectangles for the preset ``thesis``, which has no mip levels either."""
         thesis = self.fit.preset == "thesis"
         export = replace(self.export, mipmaps=False) if thesis and self.export.mipmaps is None else self.export
         if thesis:
             return export.comparable()
         if self.budget.vertices is not None:
             return export.compact(4)
-        return export if self.budget.bytes is None else export.compact(5)
+        return export if self.budget.bytes is None else export.outlines()[-1]
 
     def seeded(self, seed: int) -> RunConfig:
         """The same options with one seed for growing, rendering and fitting."""
@@ -198,9 +199,8 @@ def run(
 def _finished(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on_step: Callable[[Step], None] | None) -> RunResult:
     """The stages of a run after its views."""
     record, views = prepared.record, prepared.views
-    cloud, export, missed = fitted(prepared, config, on_progress=on_progress, on_step=on_step)
+    cloud, model, missed = fitted(prepared, config, on_progress=on_progress, on_step=on_step)
     max_bytes = config.budget.most_bytes
-    model = shipped_model(cloud, export, on_progress=on_progress)
     seconds = {name: spent for name, spent in record.seconds.items() if name not in ("export", "evaluate", "report")}
     grown = record.head["config"]["species"]
     subject, original = subject_of(views, record.folder / "cloud.safetensors", grown and grown["name"]), original_tree(views, prepared.tree)
@@ -213,10 +213,10 @@ def _finished(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on
 
 def fitted(
     prepared: Prepared, config: RunConfig, *, on_progress: OnProgress | None = None, on_step: Callable[[Step], None] | None = None
-) -> tuple[BillboardCloud, ExportConfig, float | None]:
+) -> tuple[BillboardCloud, ShippedModel, float | None]:
     """Run the stages of :func:`run` that make billboards of prepared views.
 
-    Returns the billboards, the options of their export, and the target PSNR in dB if the trials of the budget did not reach it.
+    Returns the billboards, their model, and the target PSNR in dB if the trials of the budget did not reach it.
     """
     record, tree, views, on_progress = prepared.record, prepared.tree, prepared.views, on_progress or silent
     folder, fit_config, missed, export = record.folder, config.fit, None, export_config(views, config.exported)
@@ -228,7 +228,12 @@ def fitted(
     max_bytes = config.budget.most_bytes
     limit = None if max_bytes is None else (max_bytes, export)
     record.run(fit_stage(folder, views, tree, fit_config, limit, on_step), on_progress)
-    return BillboardCloud.load(folder / "cloud.safetensors"), export, missed
+    cloud = BillboardCloud.load(folder / "cloud.safetensors")
+    if max_bytes is None or config.budget.vertices is not None:
+        return cloud, shipped_model(cloud, export, on_progress=on_progress), missed
+    model = finest_within_bytes(cloud, export_config(views, config.export).outlines(), max_bytes, on_progress)
+    record.head["config"]["export"] = _plain(asdict(model.config))
+    return cloud, model, missed
 
 
 @contextlib.contextmanager

@@ -211,6 +211,15 @@ def test_a_budget_of_vertices_or_bytes_draws_compact_outlines() -> None:
     assert RunConfig(fit=FitConfig(preset="thesis")).exported.outline == "rectangle"
 
 
+@pytest.mark.parametrize(("limit", "outline"), [("10M", "pieces"), ("6k", "hull")])
+def test_bytes_that_are_left_are_spent_on_the_outline(tmp_path: Path, limit: str, outline: str) -> None:
+    """The record names it, and a second run finds it done."""
+    config = RunConfig(fit=dataclasses.replace(FIT, least_billboards=1, most_billboards=1), budget=BudgetConfig(bytes=limit))
+    run(VIEWS, tmp_path, config)
+    assert json.loads((tmp_path / "run.json").read_text())["config"]["export"]["outline"] == outline
+    assert run(VIEWS, tmp_path, config).skipped == STAGES
+
+
 def test_a_fit_much_larger_than_its_limit_is_cut_to_it(tmp_path: Path) -> None:
     """The same fit within fewer bytes is another result, and so is one that is exported otherwise."""
     views, config = ViewDataset.load(VIEWS), dataclasses.replace(FIT, billboards=2)

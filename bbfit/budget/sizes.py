@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 from bbfit.checks import fail
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import shipped_model
+from bbfit.exporting.model import OnExport, ShippedModel, shipped_model, silent_export
 from bbfit.fitting.levels import resize_textures
 from bbfit.fitting.loop import FitResult, fit
 from bbfit.fitting.palette import palettized
@@ -18,6 +19,8 @@ from bbfit.views.dataset import ViewDataset
 # The most steps of a fit that is repeated with fewer texels, the factor on its learning rate, the fraction of the limit that it aims at,
 # and the most repetitions.
 _STEPS, _RATE, _AIM, _MOST_FITS = 100, 1 / 3, 0.98, 5
+# How many times a limit the estimated size of a model with another outline may be, so that the model is made and measured.
+_DOUBT = 1.02
 
 
 def model_bytes(cloud: BillboardCloud, export: ExportConfig) -> int:
@@ -27,8 +30,14 @@ def model_bytes(cloud: BillboardCloud, export: ExportConfig) -> int:
 
 def picture_bytes(glb: bytes) -> int:
     """Return the size of all pictures in a GLB, in bytes."""
+    return _parts(glb)[0]
+
+
+def _parts(glb: bytes) -> tuple[int, int]:
+    """The bytes of all pictures in a GLB, and of its vertices and triangles."""
     tree, contents = split_glb(glb)
-    return sum(len(contents[image["bufferView"]]) for image in tree["images"])
+    pictures = sum(len(contents[image["bufferView"]]) for image in tree["images"])
+    return pictures, sum(map(len, contents)) - pictures
 
 
 def fitted_within_bytes(views: ViewDataset, result: FitResult, max_bytes: int, export: ExportConfig) -> BillboardCloud:
@@ -66,3 +75,25 @@ def within_bytes(cloud: BillboardCloud, max_bytes: int | None, export: ExportCon
         scale *= min(0.98, math.sqrt(max_bytes / size))
         cloud = palettized(resize_textures(whole, (whole.texture_sizes * scale).long().clamp_min(1)), palette)
     return cloud
+
+
+def finest_within_bytes(
+    cloud: BillboardCloud, exports: Sequence[ExportConfig], max_bytes: int, on_progress: OnExport = silent_export
+) -> ShippedModel:
+    """The model of a cloud with the first of ``exports`` with which it has at most ``max_bytes`` bytes, or else with the last.
+
+    ``exports`` differ only in their outlines and have ever fewer vertices (:meth:`~bbfit.exporting.config.ExportConfig.outlines`). Models
+    that are estimated to be too large are not made: the triangles are about proportional to the vertices.
+    """
+    *finer, last = exports
+    model = shipped_model(cloud, last, on_progress=on_progress)
+    if finer:
+        size, vertices, pieces = len(model.glb), model.cards.vertex_count, model.count_pieces()
+        each = _parts(model.glb)[1] / vertices
+        for export in finer:
+            polygons = pieces if export.outline == "pieces" else len(model.cards.cards)
+            if size + each * (polygons * export.corners - vertices) <= _DOUBT * max_bytes:
+                other = shipped_model(cloud, export, on_progress=on_progress)
+                if len(other.glb) <= max_bytes:
+                    return other
+    return model

@@ -11,6 +11,7 @@ from pathlib import Path
 from bbfit.budget.config import BudgetConfig
 from bbfit.comparison.config import CompareConfig
 from bbfit.comparison.subject import Subject, System, SystemResult, billboards
+from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.pipeline import RunConfig, fitted, prepare
@@ -96,9 +97,9 @@ def _run(stages: RunConfig, subject: Subject, folder: Path) -> SystemResult:
 
     config = replace(stages, tree=subject.tree.path)
     with prepare(subject.folder / "views", folder / "run", config, on_progress=report) as prepared:
-        cloud, export, _ = fitted(prepared, config, on_progress=report)
+        _, model, _ = fitted(prepared, config, on_progress=report)
         seconds = sum(prepared.record.seconds.get(stage, 0.0) for stage in ("budget", "fit"))
-    return billboards(subject, cloud, export, seconds)
+    return billboards(subject, model, seconds)
 
 
 def _fluffed(subject: Subject, folder: Path) -> SystemResult:
@@ -106,5 +107,5 @@ def _fluffed(subject: Subject, folder: Path) -> SystemResult:
     baked = subject.row("baked-maps")
     started = time.perf_counter()
     cloud = fluffed(BillboardCloud.load(folder.parent / "baked-maps" / "run" / "cloud.safetensors"))
-    result = billboards(subject, cloud, subject.stages.export.comparable(), 0.0)
+    result = billboards(subject, shipped_model(cloud, subject.stages.export.comparable()), 0.0)
     return replace(result, seconds=(baked.costs.seconds or 0.0) + time.perf_counter() - started)

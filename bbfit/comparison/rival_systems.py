@@ -84,7 +84,7 @@ def _cloud(count: int) -> System:
 def _baked(bake: Callable[..., BillboardCloud], subject: Subject, folder: Path) -> SystemResult:
     baked = folder / "baked"
     cloud, seconds = baking(baked, lambda: bake(subject.tree, config=subject.bake, folder=baked, on_progress=subject.on(folder, "bake")))
-    return billboards(subject, cloud, _RECTANGLE, seconds)
+    return billboards(subject, shipped_model(cloud, _RECTANGLE), seconds)
 
 
 def _sliced(subject: Subject, folder: Path) -> SystemResult:

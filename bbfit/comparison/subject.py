@@ -14,12 +14,10 @@ from torch import Tensor
 from bbfit.comparison.config import CompareConfig
 from bbfit.evaluation.light import LightScore
 from bbfit.evaluation.scoring import score_model_light
-from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import ShippedModel, shipped_model
+from bbfit.exporting.model import ShippedModel
 from bbfit.files import read_json, write_json
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.camera import Camera
-from bbfit.geometry.cloud import BillboardCloud
 from bbfit.inputs import reading
 from bbfit.pipeline import RunConfig
 from bbfit.rendering.cards import CardRenderer
@@ -129,12 +127,11 @@ def baking(folder: Path, bake: Callable[[], Baked]) -> tuple[Baked, float]:
     return baked, seconds
 
 
-def billboards(subject: Subject, cloud: BillboardCloud, export: ExportConfig, seconds: float) -> SystemResult:
+def billboards(subject: Subject, model: ShippedModel, seconds: float) -> SystemResult:
     """The result of a system that takes ``seconds`` to make billboards, and some more for their file. Masks are drawn with alpha to
     coverage.
     """
-    started = time.perf_counter()
-    model = shipped_model(cloud, export)
+    started, cloud = time.perf_counter(), model.cloud
     drawn = model.antialiased() if cloud.alpha.kind == "mask" else model
     glb = model.glb
     return SystemResult(

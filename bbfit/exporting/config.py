@@ -86,7 +86,7 @@ class ExportConfig:
     outline: Outline | None = None
     """What is drawn of each billboard. pieces: convex pieces around its visible parts, so that few empty pixels are shaded;
     hull: one convex polygon; rectangle: all of it.
-    Default: pieces; a run with a budget of bytes draws hulls of at most 5 corners, whose vertices take about half of the bytes;
+    Default: pieces; a run with a budget of bytes draws pieces or hulls of 5 to 8 corners, the finest outline that fits;
     a run with a budget of vertices draws hulls of 4; the preset thesis and a comparison of vertices draw rectangles."""
     pieces: Count = 8
     """With pieces: the most pieces of a billboard on average, at least 1. Cuts that save too little are left out."""
@@ -132,6 +132,15 @@ class ExportConfig:
     def compact(self, corners: int) -> ExportConfig:
         """The same options with hulls of at most so many corners, 4 to 8, unless they ask for other outlines."""
         return replace(self, outline="hull", corners=min(self.corners, corners)) if self.outline is None else self
+
+    def outlines(self) -> tuple[ExportConfig, ...]:
+        """The same options with each outline that a budget of bytes may draw: from the one that shades fewest pixels, the default's, to the
+        one of fewest bytes, hulls of at most 5 corners. Only the same options if they ask for an outline.
+        """
+        if self.outline is not None:
+            return (self,)
+        steps: tuple[tuple[Outline, int], ...] = (("pieces", 8), ("pieces", 6), ("pieces", 5), ("hull", 6), ("hull", 5))
+        return tuple(dict.fromkeys(replace(self, outline=outline, corners=min(self.corners, corners)) for outline, corners in steps))
 
     def mipmapped(self, alpha: AlphaMode) -> bool:
         """Whether a model with an alpha mode is read with mip levels."""

@@ -20,7 +20,7 @@ from bbfit.exporting.hulls import overdraw, with_hulls
 from bbfit.exporting.mip_matching import reduced, with_mips
 from bbfit.exporting.mips import plain_chain, surface_chain
 from bbfit.exporting.obj import mtl_bytes, obj_bytes
-from bbfit.exporting.outlines import with_pieces
+from bbfit.exporting.outlines import count_pieces, with_pieces
 from bbfit.exporting.smoothing import smoothed
 from bbfit.exporting.splitting import split
 from bbfit.files import write_bytes
@@ -37,7 +37,7 @@ OnExport = Callable[[str, int, int], None]
 """Called with a kind of work (``"mip levels"``, ``"textures"``), the number of the finished parts and their total."""
 
 
-def _silent(work: str, done: int, total: int) -> None:
+def silent_export(work: str, done: int, total: int) -> None:
     """An :data:`OnExport` that reports nothing."""
 
 
@@ -57,7 +57,7 @@ class ShippedModel:
     """How many times the sides of the textures are halved, for a model that is only seen from afar."""
     description: Description | None = None
     """The names and facts in the GLB."""
-    on_progress: OnExport = field(default=_silent, compare=False, repr=False)
+    on_progress: OnExport = field(default=silent_export, compare=False, repr=False)
     """Called during long work."""
 
     @cached_property
@@ -66,15 +66,7 @@ class ShippedModel:
 
         They are those of the files, so they do not depend on whether a program smooths the edges of masks.
         """
-        cloud = replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=False))
-        program = self.config.program
-        splits = self.config.split and cloud.alpha.kind == "blend"
-        # Where the nodes of a split model cull back faces, a lit one needs the normals of both sides.
-        paired = splits and program.culls and self.config.material != "unlit"
-        cards = cloud_cards(cloud, self.config.padding << self.halvings, traced=program.traced, paired=paired)
-        if splits:
-            cards = split(cards, apart=not program.culls)
-        cards = reduced(cards, self.halvings)
+        cards = self._whole_cards
         if self.config.outline == "hull":
             cards = with_hulls(cards, self.config.corners, cards.outlined_alpha)
         elif self.config.outline == "pieces":
@@ -86,6 +78,24 @@ class ShippedModel:
         surface = None if cards.atlas.surface is None else tuple(surface_chain(cards.atlas.surface, None))
         cards = replace(cards, chain=tuple(plain_chain(cards.atlas.image)), surface_chain=surface)
         return with_filled_gaps(cards, partial(self.on_progress, "mip levels"))
+
+    @property
+    def _whole_cards(self) -> Cards:
+        """The polygons before they are trimmed."""
+        cloud = replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=False))
+        program = self.config.program
+        splits = self.config.split and cloud.alpha.kind == "blend"
+        # Where the nodes of a split model cull back faces, a lit one needs the normals of both sides.
+        paired = splits and program.culls and self.config.material != "unlit"
+        cards = cloud_cards(cloud, self.config.padding << self.halvings, traced=program.traced, paired=paired)
+        if splits:
+            cards = split(cards, apart=not program.culls)
+        return reduced(cards, self.halvings)
+
+    def count_pieces(self) -> int:
+        """How many polygons the model would have with the outline ``pieces``."""
+        cards = self._whole_cards
+        return count_pieces(cards, self.config.pieces, cards.outlined_alpha)
 
     @cached_property
     def _renderer(self) -> CardRenderer:
@@ -158,7 +168,7 @@ class ShippedModel:
 
 
 def shipped_model(
-    cloud: BillboardCloud, config: ExportConfig | None = None, halvings: int = 0, on_progress: OnExport = _silent
+    cloud: BillboardCloud, config: ExportConfig | None = None, halvings: int = 0, on_progress: OnExport = silent_export
 ) -> ShippedModel:
     """The model in the exported files of a billboard cloud; an alpha mode or cutoff that ``config`` leaves open is the cloud's own.
 

@@ -52,6 +52,20 @@ def with_pieces(cards: Cards, pieces: int, corners: int, least: float) -> Cards:
     check_count("pieces", pieces)
     check_count("corners", corners, 4)
     check_range("least alpha", least, 0, 1)
+    boxes = _boxes_of_parts(cards, pieces, least)
+    margin, made = MARGIN if cards.alpha.kind == "mask" else 0.0, []
+    for card, own in zip(cards.cards, boxes, strict=True):
+        made += [trimmed(cards, card, corners, least, box, margin) for box in (own if own[1:] else [None])]
+    return cards.with_cards(made)
+
+
+def count_pieces(cards: Cards, pieces: int, least: float) -> int:
+    """How many pieces :func:`with_pieces` makes of cards, whatever ``corners`` is; nearly all of them have so many."""
+    return sum(max(1, len(own)) for own in _boxes_of_parts(cards, pieces, least))
+
+
+def _boxes_of_parts(cards: Cards, pieces: int, least: float) -> list[list[NDArray[np.float64]]]:
+    """The boxes of each card's parts in texels, [4, 2] each; one or none where a card stays one piece."""
     areas = np.array([_area(card.corners) for card in cards.cards])
     scales, order = areas / [abs(area(texel_corners(cards, card))) for card in cards.cards], itertools.count()
 
@@ -69,10 +83,7 @@ def with_pieces(cards: Cards, pieces: int, corners: int, least: float) -> Cards:
     boxes: list[list[NDArray[np.float64]]] = [[] for _ in cards.cards]
     for _, _, part, _ in sorted(queue, key=lambda entry: tuple(entry[2].start)):
         boxes[part.card].append(_box(part))
-    margin, made = MARGIN if cards.alpha.kind == "mask" else 0.0, []
-    for card, own in zip(cards.cards, boxes, strict=True):
-        made += [trimmed(cards, card, corners, least, box, margin) for box in (own if own[1:] else [None])]
-    return cards.with_cards(made)
+    return boxes
 
 
 def _area(corners: NDArray[np.float64]) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bbfit.budget.sizes import fitted_within_bytes, model_bytes, within_bytes
+from bbfit.budget.sizes import finest_within_bytes, fitted_within_bytes, model_bytes, within_bytes
 from bbfit.checks import InputError
 from bbfit.evaluation.scoring import views_psnr
 from bbfit.exporting.config import ExportConfig
@@ -39,7 +39,7 @@ def test_too_many_bytes_are_fitted_away(views: ViewDataset, result: FitResult, s
 
     Masks are drawn as they are fitted, with smooth edges. With hard edges, resizing gains because it blurs.
     """
-    limit = int(share * model_bytes(result.cloud, EXPORT))
+    limit = int(share * model_bytes(result.cloud, EXPORT) // 2)
     cloud = fitted_within_bytes(views, result, limit, EXPORT)
     assert 0.8 * limit < model_bytes(cloud, EXPORT) <= limit
     assert torch.equal(cloud.rights, result.cloud.rights) and torch.equal(cloud.ups, result.cloud.ups)
@@ -53,3 +53,22 @@ def test_too_many_bytes_are_fitted_away(views: ViewDataset, result: FitResult, s
 def test_a_limit_below_the_rectangles_is_refused(views: ViewDataset, result: FitResult) -> None:
     with pytest.raises(InputError, match=r"^bytes: 1,000 are too few: \d,\d+ are needed without textures"):
         fitted_within_bytes(views, result, 1000, EXPORT)
+
+
+def test_a_limit_is_spent_on_the_finest_outline(result: FitResult) -> None:
+    """With enough bytes it is the default's. A byte less than an outline takes leaves the next one, and below the last nothing changes."""
+    outlines = ExportConfig().outlines()
+    assert outlines[0].resolve() == ExportConfig().resolve() and outlines[-1] == ExportConfig(outline="hull", corners=5)
+    sizes = [model_bytes(result.cloud, outline) for outline in outlines]
+    assert len(set(sizes)) == len(sizes) == 5
+    for limit in (*sizes, *(size - 1 for size in sizes), 10**9):
+        finest = next((outline for outline, size in zip(outlines, sizes, strict=True) if size <= limit), outlines[-1])
+        model = finest_within_bytes(result.cloud, outlines, limit)
+        assert model.config == finest.resolve() and len(model.glb) == sizes[outlines.index(finest)]
+
+
+def test_outlines_that_are_far_too_large_are_not_made(result: FitResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, limit = [], model_bytes(result.cloud, EXPORT) // 2
+    monkeypatch.setattr("bbfit.budget.sizes.shipped_model", lambda *args, **more: made.append(args[1]) or shipped_model(*args, **more))
+    finest_within_bytes(result.cloud, (ExportConfig(outline="pieces"), EXPORT), limit)
+    assert made == [EXPORT]
