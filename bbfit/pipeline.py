@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -148,6 +149,20 @@ class RunResult:
 
 
 @dataclass(frozen=True)
+class Fitted:
+    """The billboards of a run and their model."""
+
+    cloud: BillboardCloud
+    """The fitted billboards."""
+    model: ShippedModel
+    """What is exported of them."""
+    missed: float | None
+    """As in :class:`RunResult`."""
+    seconds: float = 0.0
+    """Seconds that the choice of the model's outline took."""
+
+
+@dataclass(frozen=True)
 class Prepared:
     """A run's folder with the tree and its views, whose pictures were checked."""
 
@@ -199,25 +214,23 @@ def run(
 def _finished(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on_step: Callable[[Step], None] | None) -> RunResult:
     """The stages of a run after its views."""
     record, views = prepared.record, prepared.views
-    cloud, model, missed = fitted(prepared, config, on_progress=on_progress, on_step=on_step)
-    max_bytes = config.budget.most_bytes
+    made = fitted(prepared, config, on_progress=on_progress, on_step=on_step)
+    model, max_bytes = made.model, config.budget.most_bytes
     seconds = {name: spent for name, spent in record.seconds.items() if name not in ("export", "evaluate", "report")}
+    seconds["export"] = made.seconds
     grown = record.head["config"]["species"]
     subject, original = subject_of(views, record.folder / "cloud.safetensors", grown and grown["name"]), original_tree(views, prepared.tree)
     record.run(evaluate_stage(record.folder, model, views, original, subject, seconds, max_bytes), on_progress)
     report = Report.load(record.folder / "metrics.json")
     record.run(export_stage(record.folder, model, report, max_bytes), on_progress)
     record.run(report_stage(record.folder, report, model, views, _facts(record)), on_progress)
-    return RunResult(record.folder, cloud, report, tuple(record.skipped), missed)
+    return RunResult(record.folder, made.cloud, report, tuple(record.skipped), made.missed)
 
 
 def fitted(
     prepared: Prepared, config: RunConfig, *, on_progress: OnProgress | None = None, on_step: Callable[[Step], None] | None = None
-) -> tuple[BillboardCloud, ShippedModel, float | None]:
-    """Run the stages of :func:`run` that make billboards of prepared views.
-
-    Returns the billboards, their model, and the target PSNR in dB if the trials of the budget did not reach it.
-    """
+) -> Fitted:
+    """Run the stages of :func:`run` that make billboards of prepared views."""
     record, tree, views, on_progress = prepared.record, prepared.tree, prepared.views, on_progress or silent
     folder, fit_config, missed, export = record.folder, config.fit, None, export_config(views, config.exported)
     if config.budget.given:
@@ -230,10 +243,11 @@ def fitted(
     record.run(fit_stage(folder, views, tree, fit_config, limit, on_step), on_progress)
     cloud = BillboardCloud.load(folder / "cloud.safetensors")
     if max_bytes is None or config.budget.vertices is not None:
-        return cloud, shipped_model(cloud, export, on_progress=on_progress), missed
+        return Fitted(cloud, shipped_model(cloud, export, on_progress=on_progress), missed)
+    started = time.perf_counter()
     model = finest_within_bytes(cloud, export_config(views, config.export).outlines(), max_bytes, on_progress)
     record.head["config"]["export"] = _plain(asdict(model.config))
-    return cloud, model, missed
+    return Fitted(cloud, model, missed, time.perf_counter() - started)
 
 
 @contextlib.contextmanager

@@ -97,9 +97,9 @@ def _run(stages: RunConfig, subject: Subject, folder: Path) -> SystemResult:
 
     config = replace(stages, tree=subject.tree.path)
     with prepare(subject.folder / "views", folder / "run", config, on_progress=report) as prepared:
-        _, model, _ = fitted(prepared, config, on_progress=report)
-        seconds = sum(prepared.record.seconds.get(stage, 0.0) for stage in ("budget", "fit"))
-    return billboards(subject, model, seconds)
+        made = fitted(prepared, config, on_progress=report)
+        seconds = made.seconds + sum(prepared.record.seconds.get(stage, 0.0) for stage in ("budget", "fit"))
+    return billboards(subject, made.model, seconds)
 
 
 def _fluffed(subject: Subject, folder: Path) -> SystemResult:

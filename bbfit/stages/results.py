@@ -74,13 +74,14 @@ def evaluate_stage(
     """Make the model, score it on the held-out views, and write ``metrics.json`` and ``comparison.png``.
 
     ``folder`` contains the outputs of the fit. ``original`` is the tree, as far as it is known. ``seconds`` are those of the earlier
-    stages, which the report contains. ``most_bytes`` is as in :func:`export_stage`.
+    stages, which the report contains; under ``export`` those that making the model has taken so far. ``most_bytes`` is as in
+    :func:`export_stage`.
     """
 
     def work(on_progress: OnProgress) -> None:
         started, progress = time.perf_counter(), partial(on_progress, "evaluate")
         assert model.glb  # makes it
-        spent = {**seconds, "export": time.perf_counter() - started}
+        spent = {**seconds, "export": seconds.get("export", 0.0) + time.perf_counter() - started}
         report = evaluate_model(model, views.test, original=original, turned=views.turned, lit=views.lit_test, on_progress=progress)
         report = replace(report, seconds={**spent, **report.seconds})
         completed(report, model, subject, most_bytes).save(folder / "metrics.json")
