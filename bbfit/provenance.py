@@ -21,7 +21,7 @@ VERSIONS: Mapping[str, int] = {
     "grow": 2,
     "convert": 1,
     "views": 8,
-    "budget": 15,
+    "budget": 16,
     "fit": 27,
     "export": 18,
     "evaluate": 19,

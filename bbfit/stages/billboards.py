@@ -18,6 +18,7 @@ from bbfit.files import read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.loop import Step, fit, fit_inputs
 from bbfit.inputs import reading
+from bbfit.provenance import VERSIONS
 from bbfit.reporting.plots import Cost, loss_plot, pareto_plot
 from bbfit.stages.stage import OnProgress, Stage
 from bbfit.tree_files.tree_file import TreeFile
@@ -98,7 +99,8 @@ def fit_stage(
         loss_plot(result.losses, folder / "loss.png")
         return result.seconds
 
-    return Stage("fit", (*fit_inputs(views, config, tree), limit), FIT_OUTPUTS, work, temporary=(checkpoint.name,))
+    within = None if limit is None else (*limit, VERSIONS["budget"])
+    return Stage("fit", (*fit_inputs(views, config, tree), within), FIT_OUTPUTS, work, temporary=(checkpoint.name,))
 
 
 def _known_trials(path: Path, key: str) -> list[Trial]:
