@@ -47,7 +47,7 @@ def fitted_within_bytes(views: ViewDataset, result: FitResult, max_bytes: int, e
     """Return the cloud of a fit, with fewer texels if the exported model has more than ``max_bytes`` bytes.
 
     The textures are then fitted to the training views again, each time from the result on, for at most 100 steps in the same placement. How
-    many texels the limit leaves is estimated from the sizes so far; a model of less than 0.93 of the limit is fitted once more with more
+    many texels the limit leaves is estimated from the sizes so far; a model of less than 0.93 of the limit is fitted again with more
     texels. Resized textures without new steps are worse, by 0.2 to 0.8 dB on the views of the tests, as masks with smooth edges. They are
     the last resort (:func:`within_bytes`, which raises its error).
     """
@@ -80,8 +80,8 @@ def _texels_within(sizes: Mapping[int, int], max_bytes: int, growth: float) -> i
     """Estimate the limit of texels for at most ``max_bytes`` bytes from the ``sizes`` by limits. ``growth`` is that of a single size."""
     target = _AIM * max_bytes
     (texels, size), *others = sorted(sizes.items(), key=lambda known: abs(math.log(known[1] / target)))
-    for other in others[:1]:
-        growth = math.log(size / other[1]) / math.log(texels / other[0])
+    if others:
+        growth = math.log(size / others[0][1]) / math.log(texels / others[0][0])
     estimate = texels * (target / size) ** (1 / min(1.0, max(_LEAST_GROWTH, growth)))
     large = min(limit for limit, known in sizes.items() if known > max_bytes)
     return int(min(estimate, _AIM * large))
