@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from bbfit.checks import fail
@@ -20,8 +20,8 @@ from bbfit.views.dataset import ViewDataset
 # the fraction that is enough, and the most repetitions.
 _STEPS, _RATE, _AIM, _ENOUGH, _MOST_FITS = 100, 1 / 3, 0.98, 0.93, 5
 # With which power of a model's texels its pictures grow, and the triangles of pieces. With a seventh to two thirds of the texels of an
-# acer's 379 masks it was 0.52 to 0.60 and 0.03 to 0.15. The least power that two sizes may show.
-_PICTURES, _PIECES, _LEAST_GROWTH = 0.55, 0.15, 0.1
+# acer's 379 masks it was 0.52 to 0.60 and 0.03 to 0.15.
+_PICTURES, _PIECES = 0.55, 0.15
 # How many times a limit the estimated size of a model with another outline may be, so that the model is made and measured.
 _DOUBT = 1.02
 
@@ -51,40 +51,30 @@ def fitted_within_bytes(views: ViewDataset, result: FitResult, max_bytes: int, e
     texels. Resized textures without new steps are worse, by 0.2 to 0.8 dB on the views of the tests, as masks with smooth edges. They are
     the last resort (:func:`within_bytes`, which raises its error).
     """
-    whole, config, sizes, small = result.cloud, result.config, dict[int, int](), None
+    whole, config = result.cloud, result.config
     short = {"levels": 1, "steps": min(config.steps, _STEPS), "placement_learning_rate": 0.0, "learning_rate": _RATE * config.learning_rate}
-    cloud, texels, growth = whole, len(whole.texels), math.nan
+    cloud, texels, best = whole, len(whole.texels), None
+    large = small = (0, 0)  # limits of texels and bytes of the smallest model that is too large, and of the largest that is not
     for fits in range(_MOST_FITS + 1):
         glb = shipped_model(cloud, export).glb
-        sizes[texels] = len(glb)
-        if len(glb) <= max_bytes:
-            small = cloud if small is None or len(cloud.texels) > len(small.texels) else small
-            if fits == 0 or len(glb) >= _ENOUGH * max_bytes or fits == _MOST_FITS:
+        if len(glb) > max_bytes:
+            large = texels, len(glb)
+        else:
+            small, best = (texels, len(glb)), cloud
+            if fits == 0 or len(glb) >= _ENOUGH * max_bytes:
                 break
-        elif fits == 0:
-            growth = _growth(glb, export)
-        texels = _texels_within(sizes, max_bytes, growth)
-        if texels < whole.vertex_count // 2 or texels in sizes:  # two for each texture
+        growth = _growth(glb, export) if best is None else math.log(large[1] / small[1]) / math.log(large[0] / small[0])
+        texels = int(large[0] * min(_AIM, (_AIM * max_bytes / large[1]) ** (1 / growth)))
+        if fits == _MOST_FITS or texels <= max(small[0], whole.vertex_count // 2):  # two for each texture
             break
         cloud = fit(views, replace(config, billboards=len(whole), max_texels=texels, **short), placement=whole).cloud  # type: ignore[arg-type]
-    return within_bytes(cloud, max_bytes, export, palette=config.palette) if small is None else small
+    return within_bytes(cloud, max_bytes, export, palette=config.palette) if best is None else best
 
 
 def _growth(glb: bytes, export: ExportConfig) -> float:
     """Estimate with which power of its texels the size of a model grows."""
     pictures, triangles = _parts(glb)
     return (_PICTURES * pictures + (_PIECES * triangles if export.resolve().outline == "pieces" else 0.0)) / len(glb)
-
-
-def _texels_within(sizes: Mapping[int, int], max_bytes: int, growth: float) -> int:
-    """Estimate the limit of texels for at most ``max_bytes`` bytes from the ``sizes`` by limits. ``growth`` is that of a single size."""
-    target = _AIM * max_bytes
-    (texels, size), *others = sorted(sizes.items(), key=lambda known: abs(math.log(known[1] / target)))
-    if others:
-        growth = math.log(size / others[0][1]) / math.log(texels / others[0][0])
-    estimate = texels * (target / size) ** (1 / min(1.0, max(_LEAST_GROWTH, growth)))
-    large = min(limit for limit, known in sizes.items() if known > max_bytes)
-    return int(min(estimate, _AIM * large))
 
 
 def within_bytes(cloud: BillboardCloud, max_bytes: int | None, export: ExportConfig, *, palette: int = 0) -> BillboardCloud:
