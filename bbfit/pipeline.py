@@ -115,16 +115,17 @@ class RunConfig:
             check_blender(self.views)
 
     @property
-    def exported(self) -> ExportConfig:
-        """The options of the export, unless they say otherwise: hulls of few corners for a budget of vertices or bytes, which are finer in
-        the end if the bytes allow it; rectangles for the preset ``thesis``, which has no mip levels either."""
-        thesis = self.fit.preset == "thesis"
-        export = replace(self.export, mipmaps=False) if thesis and self.export.mipmaps is None else self.export
-        if thesis:
-            return export.comparable()
+    def exports(self) -> tuple[ExportConfig, ...]:
+        """The options of the export, with the outline that the results call for unless one is given.
+
+        A budget of bytes has several: the first that fits is exported, and the choice and the fit count with the last. A budget of vertices
+        has hulls of 4 corners. The preset ``thesis`` has rectangles and no mip levels.
+        """
+        if self.fit.preset == "thesis":
+            return ((replace(self.export, mipmaps=False) if self.export.mipmaps is None else self.export).comparable(),)
         if self.budget.vertices is not None:
-            return export.compact(4)
-        return export if self.budget.bytes is None else export.outlines()[-1]
+            return (self.export.compact(4),)
+        return (self.export,) if self.budget.bytes is None else self.export.outlines()
 
     def seeded(self, seed: int) -> RunConfig:
         """The same options with one seed for growing, rendering and fitting."""
@@ -158,7 +159,7 @@ class Fitted:
     """What is exported of them."""
     missed: float | None
     """As in :class:`RunResult`."""
-    seconds: float = 0.0
+    seconds: float
     """Seconds that the choice of the model's outline took."""
 
 
@@ -232,21 +233,23 @@ def fitted(
 ) -> Fitted:
     """Run the stages of :func:`run` that make billboards of prepared views."""
     record, tree, views, on_progress = prepared.record, prepared.tree, prepared.views, on_progress or silent
-    folder, fit_config, missed, export = record.folder, config.fit, None, export_config(views, config.exported)
+    folder, fit_config, missed = record.folder, config.fit, None
+    exports = [export_config(views, export) for export in config.exports]
     if config.budget.given:
-        record.run(budget_stage(folder, views, tree, fit_config, config.budget, export), on_progress)
+        record.run(budget_stage(folder, views, tree, fit_config, config.budget, exports[-1]), on_progress)
         fit_config, met = read_choice(folder)
         missed = None if met else config.budget.target_psnr
         record.head["config"]["fit"] = _plain(asdict(fit_config))  # the fit uses the chosen configuration
     max_bytes = config.budget.most_bytes
-    limit = None if max_bytes is None else (max_bytes, export)
+    limit = None if max_bytes is None else (max_bytes, exports[-1])
     record.run(fit_stage(folder, views, tree, fit_config, limit, on_step), on_progress)
     cloud = BillboardCloud.load(folder / "cloud.safetensors")
-    if max_bytes is None or config.budget.vertices is not None:
-        return Fitted(cloud, shipped_model(cloud, export, on_progress=on_progress), missed)
     started = time.perf_counter()
-    model = finest_within_bytes(cloud, export_config(views, config.export).outlines(), max_bytes, on_progress)
-    record.head["config"]["export"] = _plain(asdict(model.config))
+    if max_bytes is None:
+        model = shipped_model(cloud, exports[-1], on_progress=on_progress)
+    else:
+        model = finest_within_bytes(cloud, exports, max_bytes, on_progress)
+        record.head["config"]["export"] |= {"outline": model.config.outline, "corners": model.config.corners}
     return Fitted(cloud, model, missed, time.perf_counter() - started)
 
 
@@ -342,7 +345,7 @@ def _head(source: str, config: RunConfig, *, grown: Species | None = None, rende
         "views": asdict(config.views) if rendered else None,
         "fit": asdict(config.fit.resolve()),
         "budget": asdict(config.budget),
-        "export": asdict(config.exported),
+        "export": asdict(config.exports[-1]),
     }
     seeds = ({} if grown is None else {"grow": config.grow.seed}) | {"views": config.views.seed, "fit": config.fit.seed}
     return record_head(source, _plain(resolved), seeds)

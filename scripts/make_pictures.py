@@ -50,7 +50,7 @@ def picture(name: str, folder: Path) -> np.ndarray:
 
 def fitted(views: bbfit.ViewDataset, tree: Path, config: bbfit.FitConfig) -> ShippedModel:
     """A fitted model as ``bbfit fit`` exports it; a mask is drawn with smooth edges."""
-    model = shipped_model(bbfit.fit(views, config, tree=tree).cloud, bbfit.RunConfig(fit=config).exported)
+    model = shipped_model(bbfit.fit(views, config, tree=tree).cloud, bbfit.RunConfig(fit=config).exports[-1])
     return model.antialiased() if model.cloud.alpha.kind == "mask" else model
 
 

@@ -203,12 +203,13 @@ def test_the_model_has_no_more_bytes_than_asked_for(tmp_path: Path) -> None:
 def test_a_budget_of_vertices_or_bytes_draws_compact_outlines() -> None:
     """Unless another outline is requested. Four corners are as many as a rectangle has."""
     size = BudgetConfig(bytes="20k")
-    assert RunConfig().exported == ExportConfig()
-    assert RunConfig(budget=size).exported == ExportConfig(outline="hull", corners=5)
-    assert RunConfig(budget=size, export=ExportConfig(corners=4)).exported == ExportConfig(outline="hull", corners=4)
-    assert RunConfig(budget=size, export=ExportConfig(outline="pieces")).exported == ExportConfig(outline="pieces")
-    assert RunConfig(budget=dataclasses.replace(size, vertices=8)).exported == ExportConfig(outline="hull", corners=4)
-    assert RunConfig(fit=FitConfig(preset="thesis")).exported.outline == "rectangle"
+    assert RunConfig().exports == (ExportConfig(),)
+    assert RunConfig(budget=size).exports == ExportConfig().outlines()
+    quads = RunConfig(budget=size, export=ExportConfig(corners=4)).exports
+    assert quads == (ExportConfig(outline="pieces", corners=4), ExportConfig(outline="hull", corners=4))
+    assert RunConfig(budget=size, export=ExportConfig(outline="pieces")).exports == (ExportConfig(outline="pieces"),)
+    assert RunConfig(budget=dataclasses.replace(size, vertices=8)).exports == (ExportConfig(outline="hull", corners=4),)
+    assert [export.outline for export in RunConfig(fit=FitConfig(preset="thesis")).exports] == ["rectangle"]
 
 
 @pytest.mark.parametrize(("limit", "outline"), [("10M", "pieces"), ("6k", "hull")])

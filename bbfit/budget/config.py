@@ -24,7 +24,7 @@ class BudgetConfig:
     texels: int | str | None = None
     """Most texels, such as 500k or 2M."""
     bytes: int | str | None = None
-    """Most bytes of model.glb, such as 500k or 2M. Billboards are then hulls of at most 5 corners, or pieces where they fit."""
+    """Most bytes of model.glb, such as 500k or 2M. Billboards then have the finest outline that fits."""
     target_psnr: Annotated[float, Range(0, 100, open_low=True)] | None = None
     """PSNR in dB, the mean over four backgrounds, to reach on validation views with as few billboards as possible."""
     auto: bool = False

@@ -79,7 +79,7 @@ class ShippedModel:
         cards = replace(cards, chain=tuple(plain_chain(cards.atlas.image)), surface_chain=surface)
         return with_filled_gaps(cards, partial(self.on_progress, "mip levels"))
 
-    @property
+    @cached_property
     def _whole_cards(self) -> Cards:
         """The polygons before they are trimmed."""
         cloud = replace(self.cloud, alpha=replace(self.cloud.alpha, antialiased=False))

@@ -60,7 +60,7 @@ def with_pieces(cards: Cards, pieces: int, corners: int, least: float) -> Cards:
 
 
 def count_pieces(cards: Cards, pieces: int, least: float) -> int:
-    """How many pieces :func:`with_pieces` makes of cards, whatever ``corners`` is; nearly all of them have so many."""
+    """How many pieces :func:`with_pieces` makes of cards. Nearly all of them have as many corners as are allowed."""
     return sum(max(1, len(own)) for own in _boxes_of_parts(cards, pieces, least))
 
 
