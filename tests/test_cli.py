@@ -213,6 +213,30 @@ def test_fit_within_a_budget(
     assert "no short fit" not in capsys.readouterr().out
 
 
+def test_an_export_has_the_outline_of_its_run(views_folder: Path, tmp_path: Path) -> None:
+    """So does a score, unless another outline is requested or the cloud is not that of the run."""
+    run, model = tmp_path / "run", tmp_path / "model.glb"
+    cloud = run / "cloud.safetensors"
+
+    def exported(file: Path, *options: str) -> bytes:
+        assert main(["export", str(file), "--out", str(model), *options]) == 0
+        return model.read_bytes()
+
+    assert main(["fit", str(views_folder), "--out", str(run), *TRIALS, "--vertices", "4"]) == 0
+    original = (run / "model.glb").read_bytes()
+    default = exported(cloud, "--outline", "pieces")
+    assert exported(cloud) == original != default
+    assert main(["evaluate", str(cloud), str(views_folder), "--out", str(tmp_path / "again.json")]) == 0
+    assert bbfit.Report.load(tmp_path / "again.json").vertices.model == bbfit.Report.load(run / "metrics.json").vertices.model <= 4
+    record = (run / "run.json").read_text()
+    (run / "run.json").unlink()
+    assert exported(cloud) == default  # no record
+    (run / "run.json").write_text(record.replace(digest_file(cloud), "0" * 64))
+    assert exported(cloud) == default  # the record of another cloud
+    (run / "run.json").write_text(record.replace('"hull"', '"circle"'))
+    assert exported(cloud) == default  # of another version
+
+
 def test_run_within_a_budget_is_fit_within_it(views_folder: Path, tmp_path: Path) -> None:
     for command in ("run", "fit"):
         options = ["--out", str(tmp_path / command), *TRIALS, "--vertices", "4", "--texels", "1k"]

@@ -193,7 +193,7 @@ def evaluate_command(
         views: Folder of views.
         out: File for the measures as JSON. Default: metrics.json beside the cloud, which replaces the one of its run.
         tree: The mesh that the views show, for its vertices and bytes, if the views were not rendered by bbfit.
-        export: How the model is exported, if not by default. The scores are those of the exported model.
+        export: How the model is exported. The scores are those of the exported model. Default: the outline is that of the cloud's run.
         limits: What the tree and the views may refer to, and how large they may be.
     """
     from bbfit.checks import check_output_file
@@ -204,13 +204,14 @@ def evaluate_command(
     from bbfit.outputs import claimed_folder, single_files, used_folder
     from bbfit.reporting.tables import report_table
     from bbfit.stages.describing import subject_of
+    from bbfit.stages.recorded import as_in_run
     from bbfit.stages.results import completed, original_tree
     from bbfit.tree_files.tree_file import TreeFile
     from bbfit.views.dataset import ViewDataset
 
     export.check()
     out = check_output_file("out", out or cloud.with_name("metrics.json"))
-    billboards, dataset = BillboardCloud.load(cloud), ViewDataset.load(views, limits=limits)
+    billboards, dataset, export = BillboardCloud.load(cloud), ViewDataset.load(views, limits=limits), as_in_run(export, cloud)
     mesh = None if tree is None else TreeFile.open(tree, limits)
     original = original_tree(dataset, mesh)
     dataset.test.check(may_be_empty=True)
@@ -248,17 +249,18 @@ def export_command(
     Args:
         cloud: The cloud.safetensors of a run's folder.
         out: The model's file, ending in .glb, or in .obj (its .mtl and .png come beside it).
-        export: How the model is written.
+        export: How the model is written. Default: the outline is that of the cloud's run.
     """
     from bbfit.exporting.model import shipped_model
     from bbfit.geometry.cloud import BillboardCloud
     from bbfit.model_files import check_model_path, names_beside
     from bbfit.outputs import check_room, single_files
     from bbfit.stages.describing import described_by_run
+    from bbfit.stages.recorded import as_in_run
 
     out = check_model_path("model file", out)
     export.check()
-    billboards = BillboardCloud.load(cloud)
+    billboards, export = BillboardCloud.load(cloud), as_in_run(export, cloud)
     names = names_beside(out, texture=True, normals=billboards.surface is not None, mip_files=export.resolve().mip_files)
     check_room("out", out.parent, 16 * len(billboards.texels))  # four bytes a texel for up to three pictures and all levels
     with single_files("bbfit export", out.parent, names, [cloud]), progress() as on_progress:

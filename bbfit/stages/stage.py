@@ -70,8 +70,7 @@ class Record:
             earlier = read_json("run", path) if path.is_file() else {}
         except InputError:
             earlier = {}  # without a record, the stages are repeated
-        stages = earlier.get("stages") if isinstance(earlier, dict) else None
-        self.stages = {name: _entry(stage) for name, stage in stages.items() if _is_entry(stage)} if isinstance(stages, dict) else {}
+        self.stages = recorded_stages(earlier)
         self._written = Written(folder)
         for name, entry in self.stages.items():
             self._written.adopt(name, entry["outputs"])
@@ -135,6 +134,12 @@ def record_head(source: str, config: Mapping[str, Any], seeds: Mapping[str, int]
     """The fields of a record besides its stages: source, resolved configuration as JSON, seeds, versions of packages, and the machine."""
     versions = {"python": platform.python_version()} | {name: installed_version(name) for name in _PACKAGES}
     return {"source": source, "config": dict(config), "seeds": dict(seeds), "versions": versions, "machine": platform.platform()}
+
+
+def recorded_stages(record: Any) -> dict[str, dict[str, Any]]:
+    """The stages in the contents of a ``run.json``, which may be anything, with their ``inputs``, ``outputs`` and ``seconds``."""
+    stages = record.get("stages") if isinstance(record, dict) else None
+    return {name: _entry(stage) for name, stage in stages.items() if _is_entry(stage)} if isinstance(stages, dict) else {}
 
 
 def _is_entry(entry: Any) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from bbfit.geometry.extent import shown_bounds
 from bbfit.geometry.light import Light, angles_degrees, direction
 from bbfit.inputs import reading
 from bbfit.layout import REQUEST_FILE
+from bbfit.stages.recorded import recorded_export
 from bbfit.stages.stage import RECORD_FILE
 from bbfit.viewing.levels import ViewerLevel
 from bbfit.viewing.originals import MAX_BYTES, Original, find_original
@@ -178,13 +179,7 @@ def _record(folder: Path) -> dict[str, Any]:
 
 def _export(record: dict[str, Any]) -> ExportConfig:
     """The run's export, with textures that browsers read."""
-    stored = record.get("config", {}).get("export")
-    known = {f.name: stored[f.name] for f in fields(ExportConfig) if f.name in stored} if isinstance(stored, dict) else {}
-    try:
-        config = ExportConfig(**known)
-    except (InputError, TypeError):  # of another version
-        config = ExportConfig()
-    return replace(config, textures="png", mip_files=False)
+    return replace(recorded_export(record), textures="png", mip_files=False)
 
 
 def _views(folder: Path, record: dict[str, Any]) -> Path | None:
