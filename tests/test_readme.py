@@ -84,6 +84,7 @@ def stand_ins(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for name in VIEWS[1:]:
             shutil.copytree("views/tree", f"views/{name}")
         assert main(["fit", "views/tree", "--tree", "tree.glb", "--out", "runs/tree", *options(SMALL_FIT), "--billboards", "2"]) == 0
+        shutil.copytree("views/tree", "runs/tree/views")
     return folder
 
 

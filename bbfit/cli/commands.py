@@ -186,7 +186,7 @@ def evaluate_command(
 ) -> None:
     """Score fitted billboards on the held-out views of a folder, which they were not fitted to.
 
-    For example: bbfit evaluate runs/tree/cloud.safetensors views/tree --out scores.json
+    For example: bbfit evaluate runs/tree/cloud.safetensors runs/tree/views --out scores.json
 
     Args:
         cloud: The cloud.safetensors of a run's folder.
@@ -244,7 +244,7 @@ def export_command(
 ) -> None:
     """Write fitted billboards as a model for an engine or another program.
 
-    For example: bbfit export runs/tree/cloud.safetensors --out tree.glb --profile godot
+    For example: bbfit export runs/tree/cloud.safetensors --out planes.glb --profile godot
 
     Args:
         cloud: The cloud.safetensors of a run's folder.

@@ -52,7 +52,7 @@ class ScatterConfig:
     spacing: Annotated[float, Range(0.1, 1e5)] = 6.0
     """Least distance between two scattered trees in meters. An area has about 0.7 trees for each square of this side."""
     mix: tuple[str, ...] = ()
-    """Species or trees of the library that are scattered, with their shares as NAME=SHARE, for example oak=3 birch=1.
+    """Species or trees of the library that are scattered, with their shares as NAME=SHARE, for example acer=3 apple=1.
     Default: all trees of the library in equal shares."""
 
     def __post_init__(self) -> None:
@@ -64,7 +64,7 @@ class ScatterConfig:
         for each in self.mix:
             name, sign, share = each.rpartition("=")
             if not sign or not name or not _is_share(share):
-                fail("mix", f"expected NAME=SHARE with a share above 0, got {each!r}", "for example oak=3 birch=1")
+                fail("mix", f"expected NAME=SHARE with a share above 0, got {each!r}", "for example acer=3 apple=1")
 
     @property
     def given(self) -> bool:

@@ -109,7 +109,7 @@ class BillboardCloud:
 
     @property
     def vertex_count(self) -> int:
-        """Vertices of the exported mesh: four per quad, two quads for a two-sided billboard."""
+        """Vertices of the billboards as rectangles: four for each texture. An export with other outlines has others."""
         return 4 * (len(self) + int(self.two_sided.sum()))
 
     @property
