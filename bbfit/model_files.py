@@ -6,6 +6,7 @@ import glob
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from bbfit.checks import check_folder, check_output_file, fail
 from bbfit.provenance import installed_version
@@ -44,6 +45,11 @@ def names_beside(path: Path, *, texture: bool = False, normals: bool = False, mi
         others = [path.with_suffix(suffix).name for suffix in (".mtl", *([".png"] if texture else []))] + maps
     levels = [f"{glob.escape(path.stem)}_mip*.png"] if mip_files else []
     return [path.name, *others, *levels]
+
+
+def relative_uri(file: str) -> str:
+    """The URI of a file beside or below the file that refers to it (RFC 3986). Bytes of its name that are no text become codes too."""
+    return quote(file, errors="surrogateescape")
 
 
 def normals_path(path: Path) -> Path:

@@ -16,7 +16,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -144,11 +144,15 @@ def results(folder: Path, pattern: str) -> list[Path]:
     return [path for path in sorted(folder.glob(pattern)) if path.is_file() and not _ASIDE.search(path.name)]
 
 
-def remove_results(folder: Path, *patterns: str) -> None:
-    """Remove the files of earlier work from a folder, after :meth:`Written.begin` has refused or renamed those of the user."""
+def remove_results(folder: Path, *patterns: str, but: Collection[Path] = ()) -> None:
+    """Remove the files of earlier work from a folder, ``but`` some.
+
+    :meth:`Written.begin` comes first, which refuses or renames those of the user.
+    """
     for pattern in patterns:
         for path in results(folder, pattern):
-            path.unlink()
+            if path not in but:
+                path.unlink()
 
 
 class Written:
@@ -181,7 +185,7 @@ class Written:
                 fail("out", f"{shown} is an input, which the results would replace", "choose another place for the results")
             relative = self._relative(path)
             known = self._files.get(relative)
-            begun = any(fnmatch(relative, name) for name in self._begun.get(by, ()))
+            begun = any(relative == name or ("*" in name and fnmatch(relative, name)) for name in self._begun.get(by, ()))
             if not begun and (known is None or known["by"] != by):
                 maker = "did not write" if known is None else f"wrote by another step ({known['by']})"
                 fail("out", f"{shown} exists, and is a file that bbfit {maker}", "move it away, or choose another place for the results")

@@ -18,7 +18,7 @@ from bbfit.budget.sizes import finest_within_bytes
 from bbfit.checks import fail
 from bbfit.evaluation.report import Report
 from bbfit.exporting.config import ExportConfig
-from bbfit.exporting.model import ShippedModel, shipped_model
+from bbfit.exporting.model import ShippedModel, check_material, shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.fitting.loop import Step
 from bbfit.fitting.requirements import check_device
@@ -96,12 +96,15 @@ class RunConfig:
             views would not suffice for the fit.
         """
         self.export.check()
+        check_material(self.export, maps=self.fit.light == "maps")
         if self.fit.translucency and not self.export.program.transmits:
             fail("translucency", "only Babylon.js shows it", "add --profile babylon, or leave out --translucency")
         self.limits.check()
         if rendered:
             self.limits.at_most("max_input_pixels", "size", "a view", self.views.size**2, "pixels")
             self.limits.at_most("max_input_frames", "count", "the tree", self.views.count, "views")
+        if self.budget.vertices is not None and self.export.split:
+            fail("split", "its pieces have more vertices than a budget of vertices allows", "leave out --split or --vertices")
         if self.budget.given:
             if self.fit.light == "maps":
                 fail("budget", "it does not count the bytes of maps", "leave out --budget, or fit with --light baked")
@@ -119,12 +122,12 @@ class RunConfig:
         """The options of the export, with the outline that the results call for unless one is given.
 
         A budget of bytes has several: the first that fits is exported, and the choice and the fit count with the last. A budget of vertices
-        has hulls of 4 corners. The preset ``thesis`` has rectangles and no mip levels.
+        has hulls of 4 corners, which no profile splits. The preset ``thesis`` has rectangles and no mip levels.
         """
         if self.fit.preset == "thesis":
             return ((replace(self.export, mipmaps=False) if self.export.mipmaps is None else self.export).comparable(),)
         if self.budget.vertices is not None:
-            return (self.export.compact(4),)
+            return (replace(self.export.compact(4), split=False),)
         return (self.export,) if self.budget.bytes is None else self.export.outlines()
 
     def seeded(self, seed: int) -> RunConfig:
@@ -217,7 +220,8 @@ def _finished(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on
     record, views = prepared.record, prepared.views
     made = fitted(prepared, config, on_progress=on_progress, on_step=on_step)
     model, max_bytes = made.model, config.budget.most_bytes
-    seconds = {name: spent for name, spent in record.seconds.items() if name not in ("export", "evaluate", "report")}
+    later = ("export", "evaluate", "report", *(() if config.budget.given else ("budget",)))
+    seconds = {name: spent for name, spent in record.seconds.items() if name not in later}
     seconds["export"] = made.seconds
     grown = record.head["config"]["species"]
     subject, original = subject_of(views, record.folder / "cloud.safetensors", grown and grown["name"]), original_tree(views, prepared.tree)
@@ -225,6 +229,7 @@ def _finished(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on
     report = Report.load(record.folder / "metrics.json")
     record.run(export_stage(record.folder, model, report, max_bytes), on_progress)
     record.run(report_stage(record.folder, report, model, views, _facts(record)), on_progress)
+    record.finish()
     return RunResult(record.folder, made.cloud, report, tuple(record.skipped), made.missed)
 
 

@@ -26,10 +26,10 @@ VERSIONS: Mapping[str, int] = {
     "export": 18,
     "evaluate": 19,
     "report": 13,
-    "lod": 10,
+    "lod": 11,
     "compare": 9,
     "frames": 2,
-    "library": 3,
+    "library": 4,
     "forest": 3,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""

@@ -20,7 +20,7 @@ from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.outputs import WRITTEN_FILE
 from bbfit.pipeline import RunConfig, RunResult, run
-from bbfit.stages.billboards import fit_stage
+from bbfit.stages.billboards import budget_stage, fit_stage
 from bbfit.views.dataset import ViewDataset
 
 VIEWS = Path(__file__).resolve().parents[1] / "data" / "views"
@@ -173,6 +173,25 @@ def test_only_what_is_lost_is_made_again(tmp_path: Path) -> None:
     assert run(VIEWS, tmp_path, CONFIG).skipped == STAGES[1:] and kept(tmp_path) == [False] * 3
 
 
+def test_an_encoder_that_is_installed_later_repeats_what_counts_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    views, export = ViewDataset.load(VIEWS), ExportConfig(textures="auto")
+    keys = []
+    for missing in ("install it", None):
+        monkeypatch.setattr("bbfit.exporting.config.ktx2_missing", lambda missing=missing: missing)
+        choice = budget_stage(tmp_path, views, None, FIT, BudgetConfig(bytes="12k"), export)
+        keys.append((choice.key, fit_stage(tmp_path, views, None, FIT, (12_000, export)).key, fit_stage(tmp_path, views, None, FIT).key))
+    assert keys[0][0] != keys[1][0] and keys[0][1] != keys[1][1] and keys[0][2] == keys[1][2]
+
+
+def test_a_split_model_is_no_larger_than_its_budget_of_vertices(tmp_path: Path) -> None:
+    """The profile would cut billboards that cross, and a run without a budget then has no seconds of its choice."""
+    export = ExportConfig(alpha="blend", profile="three")
+    fit = dataclasses.replace(FIT, alpha="blend")
+    done = run(VIEWS, tmp_path, dataclasses.replace(CONFIG, fit=fit, export=export))
+    assert done.report.vertices.model <= 8 and "budget" in done.report.seconds
+    assert "budget" not in run(VIEWS, tmp_path, RunConfig(fit=dataclasses.replace(fit, billboards=2))).report.seconds
+
+
 def test_a_run_without_a_budget_chooses_nothing(tmp_path: Path) -> None:
     result = run(VIEWS, tmp_path, RunConfig(fit=dataclasses.replace(FIT, billboards=1)))
     assert result.missed is None
@@ -208,7 +227,7 @@ def test_a_budget_of_vertices_or_bytes_draws_compact_outlines() -> None:
     quads = RunConfig(budget=size, export=ExportConfig(corners=4)).exports
     assert quads == (ExportConfig(outline="pieces", corners=4), ExportConfig(outline="hull", corners=4))
     assert RunConfig(budget=size, export=ExportConfig(outline="pieces")).exports == (ExportConfig(outline="pieces"),)
-    assert RunConfig(budget=dataclasses.replace(size, vertices=8)).exports == (ExportConfig(outline="hull", corners=4),)
+    assert RunConfig(budget=dataclasses.replace(size, vertices=8)).exports == (ExportConfig(outline="hull", corners=4, split=False),)
     assert [export.outline for export in RunConfig(fit=FitConfig(preset="thesis")).exports] == ["rectangle"]
 
 

@@ -237,6 +237,24 @@ def test_an_export_has_the_outline_of_its_run(views_folder: Path, tmp_path: Path
     assert exported(cloud) == default  # of another version
 
 
+def test_mip_files_of_a_larger_atlas_are_removed(views_folder: Path, tmp_path: Path) -> None:
+    """By a run and by an export; files of the user stay."""
+
+    def levels(folder: Path, *options: str) -> list[str]:
+        assert main(["fit", str(views_folder), "--out", str(folder), *QUICK, "--mip-files", *options]) == 0
+        assert main(["export", str(folder / "cloud.safetensors"), "--out", str(tmp_path / "planes.obj"), "--mip-files", *options[2:]]) == 0
+        stored = json.loads((folder / "run.json").read_text())["stages"]["export"]["outputs"]
+        found = sorted(path.name for path in folder.glob("model_mip*.png"))
+        assert found == sorted(name for name in stored if "mip" in name)
+        assert len(list(tmp_path.glob("planes_mip*.png"))) == len(found)
+        return found
+
+    (tmp_path / "planes_map.png").write_text("mine")
+    large = levels(tmp_path / "run", "--texel-density", "1")
+    small = levels(tmp_path / "run", "--texel-density", "0.1", "--padding", "1")
+    assert 0 < len(small) < len(large) and (tmp_path / "planes_map.png").read_text() == "mine"
+
+
 def test_run_within_a_budget_is_fit_within_it(views_folder: Path, tmp_path: Path) -> None:
     for command in ("run", "fit"):
         options = ["--out", str(tmp_path / command), *TRIALS, "--vertices", "4", "--texels", "1k"]

@@ -128,6 +128,15 @@ def test_a_result_that_was_changed_is_kept_under_another_name(tmp_path: Path, ca
     assert "a.txt has changed since bbfit wrote it; it is now a.txt.changed" in caplog.text and "b1" not in caplog.text
 
 
+def test_a_name_in_brackets_is_no_pattern(tmp_path: Path) -> None:
+    Written(tmp_path).begin("lod", ["oak [1].glb"])
+    (tmp_path / "oak [1].glb").write_text("half done")
+    (tmp_path / "oak 1.glb").write_text("mine")
+    Written(tmp_path).begin("lod", ["oak [1].glb"])
+    with pytest.raises(InputError, match=r"oak 1\.glb exists"):
+        Written(tmp_path).begin("lod", ["oak 1.glb"])
+
+
 def test_what_was_begun_and_killed_may_be_replaced(tmp_path: Path) -> None:
     Written(tmp_path).begin("fit", ["cloud", "mip*.png"])
     (tmp_path / "cloud").write_text("half done")

@@ -160,6 +160,36 @@ def test_the_head_is_recorded_beside_the_stages(tmp_path: Path, stage: Stage) ->
     assert content["versions"]["python"] and content["versions"]["numpy"]
 
 
+def test_the_head_stays_as_it_is_and_changes_without_a_stage(tmp_path: Path, stage: Stage, runs: list[str]) -> None:
+    """Work of another kind in the folder of a run keeps the run's head, and a run whose stages are all current writes its own."""
+
+    def head() -> dict[str, object]:
+        return {name: value for name, value in json.loads((tmp_path / RECORD_FILE).read_text()).items() if name != "stages"}
+
+    Record(tmp_path, {"source": "tree.glb"}).run(stage)
+    Record(tmp_path).run(replace(stage, inputs=("views", 2)))
+    assert head() == {"source": "tree.glb"} and runs == ["fit", "fit"]
+    moved = Record(tmp_path, {"source": "moved.glb"})
+    assert not moved.run(replace(stage, inputs=("views", 2)))
+    moved.finish()
+    assert head() == {"source": "moved.glb"}
+    time = (tmp_path / RECORD_FILE).stat().st_mtime_ns
+    Record(tmp_path, {"source": "moved.glb"}).finish()
+    assert (tmp_path / RECORD_FILE).stat().st_mtime_ns == time
+
+
+def test_outputs_with_other_names_repeat_a_stage(tmp_path: Path, stage: Stage) -> None:
+    """The files of the earlier names are still there."""
+    Record(tmp_path).run(stage)
+    (tmp_path / "other").mkdir()
+
+    def work(on_progress: OnProgress) -> None:
+        (tmp_path / "other" / "cloud.txt").write_text("cloud")
+
+    assert Record(tmp_path).run(replace(stage, outputs=("other/cloud.txt",), work=work))
+    assert (tmp_path / "other" / "cloud.txt").is_file()
+
+
 def test_stages_share_a_record(tmp_path: Path, stage: Stage, runs: list[str]) -> None:
     """A stage can run another one, as a comparison does for the size of bbfit's model."""
     record = Record(tmp_path)

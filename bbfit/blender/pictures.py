@@ -22,6 +22,7 @@ from bbfit.geometry.camera import Z_UP_TO_Y_UP, Camera, camera_to_nerf
 from bbfit.geometry.light import direction, to_z_up
 from bbfit.geometry.orbit import hull_vertices
 from bbfit.images import read_rgba
+from bbfit.inputs import InputLimits
 from bbfit.outputs import claimed_folder
 from bbfit.tree_files.tree_file import TreeFile
 
@@ -127,7 +128,7 @@ def depth_path(picture: Path) -> Path:
 def is_intact(path: Path, size: int) -> bool:
     """Whether a picture exists, can be decoded, and has the right size."""
     try:
-        return read_rgba(path).shape == (size, size, 4)
+        return read_rgba(path, InputLimits(max_input_pixels=size**2)).shape == (size, size, 4)
     except InputError:
         return False
 

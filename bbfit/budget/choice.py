@@ -122,6 +122,9 @@ def check_budget(config: FitConfig, budget: BudgetConfig) -> None:
         fail("preset", f"{config.preset!r} cannot be combined with a budget", "leave out one of them")
     if budget.vertices is not None and budget.vertices < _vertices(config):
         fail("vertices", f"{budget.vertices} are too few for one billboard of sides {config.sides!r}", "allow more, or sides one")
+    least = _least(config) * _vertices(config) // 4
+    if budget.most_texels is not None and budget.most_texels < least:
+        fail("texels", f"{budget.most_texels} are too few for {least} textures", "allow more")
     config.resolve()
 
 
@@ -151,6 +154,11 @@ def _vertices(config: FitConfig) -> int:
     return 4 if config.sides == "one" else 8
 
 
+def _least(config: FitConfig) -> int:
+    """The fewest billboards of a choice: one shows the crown."""
+    return 1 + (config.trunk_billboards or 0)
+
+
 class _Chooser:
     """The course of a choice: which trials are run, and which of them is chosen."""
 
@@ -160,7 +168,7 @@ class _Chooser:
         most = config.most_billboards
         if budget.vertices is not None:
             most = min(most, budget.vertices // _vertices(config))
-        least = min(most, 1 + (config.trunk_billboards or 0))
+        least = min(most, _least(config))
         self._counts = sorted({count for count in COUNTS if least <= count < most} | {most})
         self._spends = budget.texels is not None or budget.bytes is not None
         self._grows = budget.auto or budget.target_psnr is not None
@@ -188,7 +196,7 @@ class _Chooser:
     def _others(self, count: int) -> list[Spent]:
         """Other ways to spend the vertices of a few billboards."""
         others = list[Spent | None]()
-        if 1 < count <= _FEW and self._config.sides == "one":
+        if 1 < count <= _FEW and self._config.sides == "one" and count // 2 > (self._config.trunk_billboards or 0):
             others.append(spent(self._trials, self._budget, count // 2, "two", self._placement))
         if count <= _FEW and self._config.placement is None:
             others.append(spent(self._trials, self._budget, count, self._config.sides, "even"))

@@ -56,7 +56,8 @@ class BudgetConfig:
     @property
     def half(self) -> BudgetConfig:
         """The same with half of the texels and bytes."""
-        halves = {name: limit // 2 for name, limit in (("texels", self.most_texels), ("bytes", self.most_bytes)) if limit is not None}
+        limits = {"texels": self.most_texels, "bytes": self.most_bytes}
+        halves = {name: max(1, limit // 2) for name, limit in limits.items() if limit is not None}
         return replace(self, **halves)  # type: ignore[arg-type]
 
 

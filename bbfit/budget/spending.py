@@ -50,7 +50,9 @@ def spent(
     unless ``anyway``, and no more after one that exceeds the limit and has less PSNR than ``least``. The PSNR is that of the trial with
     what the difference in texels is expected to gain or to cost. With a target, no gain is counted.
     """
-    limit, most = budget.most_bytes, budget.most_texels
+    limit, most, textures = budget.most_bytes, budget.most_texels, count * (1 if sides == "one" else 2)
+    if most is not None and most < textures:
+        return None
     if limit is None:
         trial = trials.run(count, sides, placement, most)
         return Spent(trial, trial.psnr, most, _missing(trial, _granted(trial)))
@@ -58,7 +60,7 @@ def spent(
     def left(trial: Trial) -> float:
         return min(texels_within([trial], trial.textures, limit), most or math.inf)
 
-    textures, own = count * (1 if sides == "one" else 2), list[Trial]()
+    own = list[Trial]()
     for _ in range(_MOST_AIMS):
         texels = allowed(own[-1:] or trials.done, budget, textures)
         if texels < _LEAST_EACH * textures and not anyway:

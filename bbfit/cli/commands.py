@@ -254,7 +254,7 @@ def export_command(
     from bbfit.exporting.model import shipped_model
     from bbfit.geometry.cloud import BillboardCloud
     from bbfit.model_files import check_model_path, names_beside
-    from bbfit.outputs import check_room, single_files
+    from bbfit.outputs import check_room, remove_results, single_files
     from bbfit.stages.describing import described_by_run
     from bbfit.stages.recorded import as_in_run
 
@@ -266,6 +266,7 @@ def export_command(
     with single_files("bbfit export", out.parent, names, [cloud]), progress() as on_progress:
         shipped = described_by_run(shipped_model(billboards, export, on_progress=on_progress), cloud)
         paths = shipped.save(out)
+        remove_results(out.parent, *(name for name in names if "*" in name), but=paths)  # mip levels of an earlier, larger atlas
     for path in paths:
         out_console.print(f"{path}  {path.stat().st_size:,} bytes", soft_wrap=True)
     if out.suffix.lower() == ".glb":

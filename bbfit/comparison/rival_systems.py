@@ -51,7 +51,7 @@ def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]
     size, count, crossed = fits(config, shared)["bbfit"], config.billboards, config.crossed
     few, more, steps = config.mesh_vertices, config.mesh_vertices_many, config.mesh_steps
     return {
-        "crossed": System(f"{crossed} crossed planes, baked", partial(_baked, partial(crossed_planes, count=crossed)), (crossed,)),
+        "crossed": System(f"{crossed} crossed planes, baked", partial(_baked, crossed_planes, crossed), (crossed,)),
         "slicing": System(
             f"slicing and blending, {config.directions} x {config.slices} slices", _sliced, (config.directions, config.slices)
         ),
@@ -78,17 +78,18 @@ def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]
 
 
 def _cloud(count: int) -> System:
-    return System(f"billboard cloud, {count} planes, baked", partial(_baked, partial(billboard_cloud, count=count)), (count,))
+    return System(f"billboard cloud, {count} planes, baked", partial(_baked, billboard_cloud, count), (count,))
 
 
-def _baked(bake: Callable[..., BillboardCloud], subject: Subject, folder: Path) -> SystemResult:
-    baked = folder / "baked"
-    cloud, seconds = baking(baked, lambda: bake(subject.tree, config=subject.bake, folder=baked, on_progress=subject.on(folder, "bake")))
+def _baked(bake: Callable[..., BillboardCloud], count: int, subject: Subject, folder: Path) -> SystemResult:
+    baked, on_progress = folder / f"baked_{count}", subject.on(folder, "bake")
+    cloud, seconds = baking(baked, lambda: bake(subject.tree, count=count, config=subject.bake, folder=baked, on_progress=on_progress))
     return billboards(subject, shipped_model(cloud, _RECTANGLE), seconds)
 
 
 def _sliced(subject: Subject, folder: Path) -> SystemResult:
-    baked, config = folder / "baked", subject.config
+    config = subject.config
+    baked = folder / f"baked_{config.directions}x{config.slices}"
     directions = {"directions": config.directions, "slices": config.slices}
     slices, seconds = baking(
         baked, lambda: slicing(subject.tree, subject.bake, **directions, folder=baked, on_progress=subject.on(folder, "bake"))
@@ -126,7 +127,7 @@ def _octahedral(options: dict[str, Any], subject: Subject, folder: Path) -> Syst
     if options:
         subject.row("octahedral")  # which renders the frames
     hemisphere, on_progress = subject.config.hemisphere, subject.on(folder, "bake")
-    baked = folder.parent / "octahedral" / ("baked" if hemisphere else "baked_all_around")
+    baked = folder.parent / "octahedral" / f"baked_{subject.config.frames}{'' if hemisphere else '_all_around'}"
     render = partial(octahedral_impostor, subject.tree, subject.config.frames, subject.bake, hemisphere=hemisphere)
     impostor, seconds = baking(baked, lambda: render(folder=baked, on_progress=on_progress))
     started = time.perf_counter()

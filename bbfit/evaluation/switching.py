@@ -24,6 +24,9 @@ from bbfit.rendering.cards import CardRenderer
 from bbfit.views.dataset import ViewDataset
 from bbfit.views.view_set import ViewSet
 
+# The most halvings of textures: each doubles the padding around them, so an atlas of a handful of texels would become large.
+_MOST_HALVINGS = 5
+
 
 @dataclass(frozen=True)
 class DrawingCost:
@@ -98,7 +101,8 @@ def cloud_candidate(cloud: BillboardCloud, views: ViewSet, export: ExportConfig)
         return DrawingCost(triangles, fragments_per_square_meter(CardRenderer(cards).fragments, views))
 
     outlines = get_args(Outline) if export.outline is None else (export.outline,)
-    return Candidate(shipped_model(cloud).draw, lambda: {outline: cost(outline) for outline in outlines}, cloud.texel_density)
+    shown = replace(export, textures="png", mip_files=False, split=False)  # parts of a billboard look like the whole
+    return Candidate(shipped_model(cloud, shown).draw, lambda: {outline: cost(outline) for outline in outlines}, cloud.texel_density)
 
 
 def mesh_cost(triangles: NDArray[np.floating], views: ViewSet) -> DrawingCost:
@@ -149,7 +153,7 @@ def _measured(switch: Switch, candidate: Candidate, views: ViewDataset) -> Switc
     colors, held_out_colors = (mean_color_error(candidate.draw, split, share) for split in (views.train, views.test))
     density = candidate.texel_density
     halvings = 0 if density is None or math.isinf(switch.scale) else max(0, math.floor(math.log2(density / switch.scale)))
-    return replace(switch, color_errors=(colors, held_out_colors), halvings=halvings)
+    return replace(switch, color_errors=(colors, held_out_colors), halvings=min(halvings, _MOST_HALVINGS))
 
 
 def _fastest(found: Sequence[Sequence[Switch]], fragments_per_triangle: float, tree: DrawingCost | None) -> list[Switch | None]:

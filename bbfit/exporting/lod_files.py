@@ -11,7 +11,7 @@ from typing import Any
 
 from bbfit.exporting.config import LodConfig
 from bbfit.exporting.lod import LodLevel
-from bbfit.model_files import generator
+from bbfit.model_files import generator, relative_uri
 
 LOD_FILE = "lod.json"
 """The name of the description."""
@@ -64,10 +64,13 @@ def program_files(profile: str | None, document: Mapping[str, Any]) -> dict[str,
     """These files by their names, for a :func:`lod_document`."""
     scripts = files("bbfit.exporting") / "lod_programs"
     made = _PROGRAMS.get(profile, {})
-    return {
-        file.format(name=document["name"]): (scripts / file).read_bytes() if make is None else make(document).encode()
-        for file, make in made.items()
-    }
+    contents = {file: (scripts / file).read_bytes() if make is None else _text_bytes(make(document)) for file, make in made.items()}
+    return {file.format(name=document["name"]): content for file, content in contents.items()}
+
+
+def _text_bytes(text: str) -> bytes:
+    """Text as UTF-8, with the bytes of file names that are no text as they are."""
+    return text.encode(errors="surrogateescape")
 
 
 def _godot_scene(document: Mapping[str, Any]) -> str:
@@ -110,7 +113,8 @@ def _tileset(document: Mapping[str, Any]) -> str:
     for level in document["levels"]:
         error = _CESIUM_PIXELS * max(0.0, level["distance_meters"] - extent["radius"]) / focal
         children = {"children": [tile]} if tile else {}
-        tile = {"boundingVolume": sphere, "geometricError": error, "refine": "REPLACE", "content": {"uri": level["file"]}} | children
+        content = {"uri": relative_uri(level["file"])}
+        tile = {"boundingVolume": sphere, "geometricError": error, "refine": "REPLACE", "content": content} | children
     height = extent["high"][1] - extent["low"][1]
     least = max(_CESIUM_PIXELS * height, tile["geometricError"])
     return json.dumps({"asset": {"version": "1.1", "generator": generator()}, "geometricError": least, "root": tile}, indent=1) + "\n"

@@ -167,6 +167,12 @@ class ShippedModel:
         return list(contents)
 
 
+def check_material(config: ExportConfig, *, maps: bool) -> None:
+    """Require that a cloud can have the material that is requested. Raises InputError for one without light and a cloud with maps."""
+    if maps and config.material in ("unlit", "emissive"):
+        fail("material", "the cloud has maps, whose colors contain no light", "leave out --material, or fit with --light baked")
+
+
 def shipped_model(
     cloud: BillboardCloud, config: ExportConfig | None = None, halvings: int = 0, on_progress: OnExport = silent_export
 ) -> ShippedModel:
@@ -177,8 +183,7 @@ def shipped_model(
     """
     resolved = (config or ExportConfig()).resolve()
     resolved.check()  # before the polygons and the mip levels are computed
-    if cloud.surface is not None and config is not None and config.material in ("unlit", "emissive"):
-        fail("material", "the cloud has maps, whose colors contain no light", "leave out --material, or fit with --light baked")
+    check_material(config or ExportConfig(), maps=cloud.surface is not None)
     alpha = AlphaMode(resolved.alpha or cloud.alpha.kind, resolved.alpha_cutoff or cloud.alpha.cutoff)
     cloud = replace(cloud if resolved.program.transmits else cloud.opaque(), alpha=alpha)
     return ShippedModel(cloud if resolved.program.masks else smoothed(cloud), resolved, halvings, on_progress=on_progress)

@@ -33,7 +33,7 @@ from bbfit.forest.prototypes import Prototype, read_prototype
 from bbfit.forest.tiles import ForestTile, read_tile
 from bbfit.inputs import InputLimits
 from bbfit.library.manifest import Library
-from bbfit.model_files import generator
+from bbfit.model_files import generator, relative_uri
 from bbfit.outputs import output_folder, remove_results
 from bbfit.stages.stage import OnProgress
 
@@ -127,14 +127,16 @@ class _Writer:
         for tree, described in enumerate(self._library.trees):
             for level in range(len(described.levels)):
                 prototype = read_prototype(self._library, tree, level, InputLimits())
-                self._uris[prototype.name] = uri = f"{SHARED}/{prototype.name}.bin"
-                write_bytes(self._out / uri, prototype.binary)
+                binary = f"{SHARED}/{prototype.name}.bin"
+                self._uris[prototype.name] = relative_uri(binary)
+                write_bytes(self._out / binary, prototype.binary)
                 for image in filter(None, prototype.images):
                     if image not in self._uris:
-                        same = [uri for key, uri in self._uris.items() if isinstance(key, Path) and key.samefile(image)]
-                        self._uris[image] = same[0] if same else f"{SHARED}/{len(self._uris)}_{image.name}"
+                        same = [known for key, known in self._uris.items() if isinstance(key, Path) and key.samefile(image)]
+                        picture = f"{SHARED}/{len(self._uris)}_{image.name}"
+                        self._uris[image] = same[0] if same else relative_uri(picture)
                         if not same:
-                            write_bytes(self._out / self._uris[image], image.read_bytes())
+                            write_bytes(self._out / picture, image.read_bytes())
                 self._prototypes[tree, level] = replace(prototype, binary=b"")
         names = [{"name": name, "value": value} for name, value in self._names.items()]
         properties = {

@@ -12,6 +12,7 @@ from bbfit.layout import TEST_FILE
 from bbfit.library.config import LibraryConfig
 from bbfit.library.files import STAGE, WORK, FinishedTree, library_outputs, library_stage
 from bbfit.library.manifest import Library, read_library
+from bbfit.library.shared_atlas import check_padding
 from bbfit.library.trees import library_tree
 from bbfit.lod import check_levels, check_unset, with_measured_speed
 from bbfit.outputs import claimed_folder
@@ -81,13 +82,14 @@ def build_library(
             name, reason = next(iter(failures.items()))
             fail("library", f"no tree succeeded; {name}: {reason}")
         finished = [FinishedTree(source, seed, done[source.name]) for source, seed in chosen if source.name in done]
-        record.run(library_stage(record, finished, failures, config, stages.export), on_progress)
+        record.run(library_stage(record, finished, failures, config, stages), on_progress)
         return read_library(folder, stages.limits)
 
 
 def _check(folder: Path, chosen: list[tuple[Source, int]], config: LibraryConfig, stages: RunConfig) -> None:
     """Check the options of all trees before the first one. Devices and packages of a cluster are not known here."""
     check_unset(config, stages)
+    check_padding(stages.export.padding)
     mesh = all(source.tree is None or source.tree.suffix.lower() in MESH_SUFFIXES for source, _ in chosen)
     here = config.ray is None
     check_levels(config, stages if here else replace(stages, fit=replace(stages.fit, device="cpu")), mesh=mesh)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bbfit.exporting.config import ExportConfig, ResolvedExport
+from bbfit.exporting.config import ResolvedExport
 from bbfit.exporting.gltf import glb_bytes, texture_files
 from bbfit.exporting.lod import LodLevel, glb_counts
 from bbfit.exporting.lod_files import level_file
@@ -22,11 +22,13 @@ from bbfit.library.stored_cards import read_cards
 from bbfit.library.trees import CARDS, card_file
 from bbfit.lod import LEVELS, with_textures
 from bbfit.outputs import check_room
+from bbfit.pipeline import RunConfig
 from bbfit.provenance import VERSIONS, digest_file
 from bbfit.reporting.contact_sheet import SheetLevel, SheetTree, contact_sheet
 from bbfit.reporting.library_tables import times_markdown
 from bbfit.stages.stage import OnProgress, Record, Stage
 from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import ViewSet
 from bbfit.workers.sources import Source
 from bbfit.workers.tasks import Facts
 
@@ -78,14 +80,14 @@ def library_outputs(names: Sequence[str], config: LibraryConfig) -> tuple[str, .
 
 
 def library_stage(
-    record: Record, trees: Sequence[FinishedTree], failures: Mapping[str, str], config: LibraryConfig, export: ExportConfig
+    record: Record, trees: Sequence[FinishedTree], failures: Mapping[str, str], config: LibraryConfig, stages: RunConfig
 ) -> Stage:
     """Pack the textures of all levels into one atlas, and write the files of the library, ``library.json`` last.
 
     ``record`` is that of the library's folder. ``failures`` are the reasons why further trees are missing. The stage raises ``InputError``
     if the atlas would be too large, or the disk is full; the library of an earlier start is then as it was.
     """
-    folder, export = record.folder, with_textures(export).resolve()
+    folder, export = record.folder, with_textures(stages.export).resolve()
     levels = {tree.source.name: _levels(folder, tree) for tree in trees}
     earlier = dict(record.stages[STAGE]["outputs"]) if STAGE in record.stages else {}
 
@@ -112,14 +114,16 @@ def library_stage(
             models |= {name: glb_bytes(own, export, files=addresses) for name, own in zip(names, page.cards, strict=True)}
             shared |= dict(zip(names, page.cards, strict=True))
         passed()
-        entries = [_entry(folder, tree, levels[tree.source.name], models, shared, export) for tree in trees]
+        names = [tree.source.name for tree in trees]
+        views = {name: ViewDataset.load(folder / WORK / name / "views", limits=stages.limits) for name in names}
+        entries = [_entry(tree, views[name], levels[name], models, shared, export) for name, tree in zip(names, trees, strict=True)]
         passed()
         check_room("out", folder, sum(map(len, (*textures.values(), *models.values()))))
         (folder / LIBRARY_FILE).unlink(missing_ok=True)  # until all files are there, the folder is no library
         (folder / TREES).mkdir(exist_ok=True)
         for file, data in {**textures, **models}.items():
             write_bytes(folder / file, data)
-        contact_sheet([_sheet_tree(folder, entry, shared) for entry in entries], folder / CONTACT_FILE)
+        contact_sheet([_sheet_tree(entry, views[entry.name].test, shared) for entry in entries], folder / CONTACT_FILE)
         passed()
         described = tuple(_page(page, number, pictures[number], export) for number, page in enumerate(pages))
         screen = Screen(config.screen_height, config.screen_fov_degrees)
@@ -157,15 +161,15 @@ def _page(page: SharedPage, number: int, pictures: Mapping[str, bytes], export: 
 
 
 def _entry(
-    folder: Path,
     tree: FinishedTree,
+    views: ViewDataset,
     levels: Sequence[_Level],
     models: Mapping[str, bytes],
     shared: Mapping[str, Cards],
     export: ResolvedExport,
 ) -> LibraryTree:
     """A tree of the manifest, with the counts and the scores of its files."""
-    views, shipped, scores = ViewDataset.load(folder / WORK / tree.source.name / "views"), list[LodLevel](), list[LevelScore | None]()
+    shipped, scores = list[LodLevel](), list[LevelScore | None]()
     for own in levels:
         (vertices, triangles), size = glb_counts(models[own.file]), len(models[own.file])
         near, score = own.level.psnr, None
@@ -179,9 +183,8 @@ def _entry(
     return LibraryTree(source.name, source.species, seed, low, high, tuple(shipped), tuple(scores), tree.facts["seconds"])  # type: ignore[arg-type]
 
 
-def _sheet_tree(folder: Path, tree: LibraryTree, cards: Mapping[str, Cards]) -> SheetTree:
-    """One held-out view of a tree, and its levels as their files show them in that view."""
-    views = ViewDataset.load(folder / WORK / tree.name / "views").test
+def _sheet_tree(tree: LibraryTree, views: ViewSet, cards: Mapping[str, Cards]) -> SheetTree:
+    """One of the held-out views of a tree, and its levels as their files show them in that view."""
     index = next(filter(views.shows, range(len(views))), 0)
     shown = list[SheetLevel]()
     for level, score in zip(tree.levels, tree.scores, strict=True):

@@ -43,6 +43,12 @@ def safe_level(padding: int) -> int:
     return padding.bit_length() - 1
 
 
+def check_padding(padding: int) -> None:
+    """Require the padding of blocks of texels, which textures of several models share a picture with."""
+    if padding < BLOCK:
+        fail("padding", f"expected at least {BLOCK} for textures that models share, got {padding}", "give --padding 8")
+
+
 def shared_pages(models: Sequence[Cards], padding: int, most: int, *, own_levels: bool) -> list[SharedPage]:
     """Pack the textures of models into one picture, or into as few as needed if a side would exceed ``most`` texels.
 
@@ -54,8 +60,7 @@ def shared_pages(models: Sequence[Cards], padding: int, most: int, *, own_levels
     Raises InputError if the textures of one model alone do not fit, or the padding is smaller than 4. All models have maps, or none has,
     and all have mip levels, or none has.
     """
-    if padding < BLOCK:
-        fail("padding", f"expected at least {BLOCK} for textures that models share, got {padding}", "give --padding 8")
+    check_padding(padding)
     cells = [_cells(cards, padding) for cards in models]
     return [
         _page(numbers, models, places, padding, own_levels) for numbers, places in _split(list(range(len(models))), cells, padding, most)

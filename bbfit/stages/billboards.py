@@ -13,7 +13,7 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.budget.sizes import fitted_within_bytes
 from bbfit.budget.trials import Trial, lookup
 from bbfit.checks import InputError, check_record
-from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.config import ExportConfig, ResolvedExport
 from bbfit.files import read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.loop import Step, fit, fit_inputs
@@ -36,7 +36,7 @@ def budget_stage(
     ``pareto.json`` is written after every trial, so that an interrupted choice repeats none.
     """
     path = folder / "pareto.json"
-    inputs = (*fit_inputs(views, fit_config, tree), budget, export)
+    inputs = (*fit_inputs(views, fit_config, tree), budget, *_sized(export), VERSIONS["fit"])
 
     def work(on_progress: OnProgress) -> None:
         def on_trial(trials: list[Trial], total: int) -> None:
@@ -99,8 +99,13 @@ def fit_stage(
         loss_plot(result.losses, folder / "loss.png")
         return result.seconds
 
-    within = None if limit is None else (*limit, VERSIONS["budget"])
+    within = None if limit is None else (limit[0], *_sized(limit[1]), VERSIONS["budget"])
     return Stage("fit", (*fit_inputs(views, config, tree), within), FIT_OUTPUTS, work, temporary=(checkpoint.name,))
+
+
+def _sized(export: ExportConfig) -> tuple[ResolvedExport, int]:
+    """What the size of a model depends on besides its cloud: also the encoders that are installed."""
+    return export.resolve(), VERSIONS["export"]
 
 
 def _known_trials(path: Path, key: str) -> list[Trial]:

@@ -16,6 +16,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.model import ShippedModel
 from bbfit.files import write_bytes
+from bbfit.outputs import remove_results
 from bbfit.provenance import VERSIONS, digest_file
 from bbfit.reporting.html import RunFacts, report_page
 from bbfit.reporting.plots import comparison_picture
@@ -40,13 +41,15 @@ def export_stage(folder: Path, model: ShippedModel, report: Report, most_bytes: 
     The GLB contains names and facts of the ``report`` on the model, unless it would have more than ``most_bytes`` bytes with them.
     """
     model = shipped_with_facts(model, report, most_bytes)
+    outputs = export_outputs(model.config, normals=model.cloud.surface is not None)
 
     def work(on_progress: OnProgress) -> None:
+        written = list[Path]()
         for step, suffix in enumerate((".glb", ".obj"), 1):
-            model.save(folder / f"model{suffix}")
+            written += model.save(folder / f"model{suffix}")
             on_progress("export", step, 2)
+        remove_results(folder, *(name for name in outputs if "*" in name), but=written)  # mip levels of an earlier, larger atlas
 
-    outputs = export_outputs(model.config, normals=model.cloud.surface is not None)
     return Stage("export", (model.config, digest_file(folder / "cloud.safetensors"), model.description), outputs, work)
 
 

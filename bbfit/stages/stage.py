@@ -62,15 +62,17 @@ class Record:
     def __init__(self, folder: Path, head: Mapping[str, Any] | None = None, inputs: Iterable[Path] = ()) -> None:
         """Read the record of ``folder``, if it exists.
 
-        ``head`` contains the other fields of the record (:func:`record_head`). ``inputs`` are files that no stage may replace.
+        ``head`` contains the other fields of the record (:func:`record_head`), by default those that it has. ``inputs`` are files that no
+        stage may replace.
         """
-        self.folder, self.head, self.skipped, self._inputs = folder, dict(head or {}), list[str](), tuple(inputs)
+        self.folder, self.skipped, self._inputs = folder, list[str](), tuple(inputs)
         path = folder / RECORD_FILE
         try:
             earlier = read_json("run", path) if path.is_file() else {}
         except InputError:
             earlier = {}  # without a record, the stages are repeated
-        self.stages = recorded_stages(earlier)
+        self.stages, self._stored = recorded_stages(earlier), _head_of(earlier)
+        self.head = dict(self._stored if head is None else head)
         self._written = Written(folder)
         for name, entry in self.stages.items():
             self._written.adopt(name, entry["outputs"])
@@ -84,11 +86,11 @@ class Record:
 
     def is_current(self, stage: Stage) -> bool:
         """Whether the stage was finished with the same inputs, and its output files have not changed since."""
-        return self._is_current(stage.name, stage.key)
+        return self._is_current(stage, stage.key)
 
-    def _is_current(self, name: str, key: str) -> bool:
-        entry = self.stages.get(name)
-        if entry is None or entry["inputs"] != key:
+    def _is_current(self, stage: Stage, key: str) -> bool:
+        entry = self.stages.get(stage.name)
+        if entry is None or entry["inputs"] != key or not {name for name in stage.outputs if "*" not in name} <= entry["outputs"].keys():
             return False
         return all((file := self.folder / path).is_file() and digest_file(file) == digest for path, digest in entry["outputs"].items())
 
@@ -107,7 +109,7 @@ class Record:
         file of the user or an input, and ``InputError`` or ``OSError`` if the work does. The record then stays as it was.
         """
         key = stage.key  # before the work, during which an input file may change
-        if self._is_current(stage.name, key):
+        if self._is_current(stage, key):
             self.skipped.append(stage.name)
             return False
         names = (*stage.outputs, *stage.temporary) if stage.claims else ()
@@ -121,13 +123,22 @@ class Record:
         elapsed = time.perf_counter() - started if seconds is None else seconds
         digests = self._written.digests(stage.outputs)
         self.stages[stage.name] = {"inputs": key, "outputs": digests, "seconds": round(elapsed, 3)}
-        self._written.begin(RECORD_FILE, (RECORD_FILE,), self._inputs)
-        write_json(self.folder / RECORD_FILE, self.head | {"stages": self.stages})
-        self._written.finish(RECORD_FILE, self._written.digests((RECORD_FILE,)))
+        self._write()
         for name in stage.temporary:
             (self.folder / name).unlink(missing_ok=True)
         self._written.finish(stage.name, digests)
         return True
+
+    def finish(self) -> None:
+        """Write the record if its other fields have changed since its last stage, which may have been skipped."""
+        if self.head != self._stored:
+            self._write()
+
+    def _write(self) -> None:
+        self._written.begin(RECORD_FILE, (RECORD_FILE,), self._inputs)
+        write_json(self.folder / RECORD_FILE, self.head | {"stages": self.stages})
+        self._stored = _head_of(read_json("run", self.folder / RECORD_FILE))
+        self._written.finish(RECORD_FILE, self._written.digests((RECORD_FILE,)))
 
 
 def record_head(source: str, config: Mapping[str, Any], seeds: Mapping[str, int]) -> dict[str, Any]:
@@ -140,6 +151,11 @@ def recorded_stages(record: Any) -> dict[str, dict[str, Any]]:
     """The stages in the contents of a ``run.json``, which may be anything, with their ``inputs``, ``outputs`` and ``seconds``."""
     stages = record.get("stages") if isinstance(record, dict) else None
     return {name: _entry(stage) for name, stage in stages.items() if _is_entry(stage)} if isinstance(stages, dict) else {}
+
+
+def _head_of(record: Any) -> dict[str, Any]:
+    """The fields besides the stages in the contents of a ``run.json``."""
+    return {name: value for name, value in record.items() if name != "stages"} if isinstance(record, dict) else {}
 
 
 def _is_entry(entry: Any) -> bool:

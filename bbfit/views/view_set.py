@@ -17,6 +17,7 @@ from bbfit.checks import InputTypeError, check_shape, fail
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.light import Light
 from bbfit.images import premultiply, read_rgba, shrunk, to_bytes
+from bbfit.inputs import InputLimits
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,8 @@ class ViewSet:
     @staticmethod
     def of_files(paths: Sequence[Path], cameras: Camera) -> ViewSet:
         """Views from files of straight-alpha RGBA pictures, which are read when they are needed, with V cameras."""
-        return ViewSet(tuple(paths), cameras, lambda path: torch.from_numpy(read_rgba(path)))
+        limits = InputLimits(max_input_pixels=cameras.width * cameras.height)
+        return ViewSet(tuple(paths), cameras, lambda path: torch.from_numpy(read_rgba(path, limits)))
 
     def __len__(self) -> int:
         return len(self.paths)

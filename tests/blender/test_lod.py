@@ -147,6 +147,11 @@ def test_started_again_nothing_is_done_twice(built: LodResult) -> None:
     assert {path: path.stat().st_mtime_ns for path in before} == before and not stages
 
 
+def test_another_place_with_the_same_name_gets_its_file(built: LodResult, tmp_path: Path) -> None:
+    again = build_lod(TREE, tmp_path / "oak.glb", LEVELS, SMALL, work=built.folder)
+    assert again.path.read_bytes() == built.path.read_bytes()
+
+
 def test_without_the_tree_the_finest_cloud_is_shown_from_the_start(built: LodResult, tmp_path: Path) -> None:
     config = replace(LEVELS, original=False)
     result = build_lod(TREE, tmp_path / "oak.glb", config, replace(SMALL, export=ExportConfig(textures="png")), work=built.folder)

@@ -296,6 +296,22 @@ def test_fewer_are_tried_only_if_the_limit_costs_enough(choosing: Choosing, texe
     assert world.line == line
 
 
+@pytest.mark.parametrize(("texels", "most"), [(20, 16), (40, 32), (100, 64), (1, 1)])
+def test_no_more_are_tried_than_there_are_texels(choosing: Choosing, texels: int, most: int) -> None:
+    """Each texture has one, also for a target that none reaches."""
+    for budget in (BudgetConfig(texels=texels), BudgetConfig(texels=texels, target_psnr=99.0)):
+        world = World(rising, texels=1)
+        assert choosing(world, budget, curve=False).config.billboards == most
+        assert max(count for count, *_ in world.asked) == most
+
+
+def test_half_as_many_two_sided_ones_are_tried_if_the_trunk_leaves_some(choosing: Choosing) -> None:
+    for trunk, others in ((2, [(4, "two", "clusters"), (8, "one", "even")]), (4, [(8, "one", "even")])):
+        world = World(curve(n8=30.0))
+        choosing(world, BudgetConfig(vertices=32), FitConfig(trunk_billboards=trunk))
+        assert world.others == others
+
+
 def test_two_sided_billboards_have_twice_the_vertices(choosing: Choosing) -> None:
     """They are not tried again with half as many, nor are one-sided ones."""
     world = World(rising)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 import torch
 from billboard_scene import crossing_billboards, write_views
 
-from bbfit.evaluation.switching import Candidate, DrawingCost, Switch, _fastest, mesh_cost, switches
-from bbfit.exporting.config import LodConfig
+from bbfit.evaluation.switching import Candidate, DrawingCost, Switch, _fastest, cloud_candidate, mesh_cost, switches
+from bbfit.exporting.config import ExportConfig, LodConfig
+from bbfit.exporting.model import shipped_model
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera, look_at, orthographic_intrinsics
 from bbfit.views.view_set import ViewSet
 
@@ -62,6 +65,16 @@ def test_a_level_waits_for_a_finer_one_only_without_speed(tmp_path: Path) -> Non
     tree = DrawingCost(100_000, 100.0)
     left_out, alone = switches([gray, exact], views, LodConfig(fragments_per_triangle=1.0), tree=tree)
     assert left_out is None and alone and alone.scale > first.scale
+
+
+@pytest.mark.parametrize("export", [ExportConfig(alpha_cutoff=0.9), ExportConfig(alpha="blend", profile="three")], ids=["cutoff", "blend"])
+def test_errors_are_those_of_the_model_that_is_shipped(tmp_path: Path, export: ExportConfig) -> None:
+    cloud = replace(crossing_billboards(), alpha=AlphaMode("mask"))
+    views = write_views(tmp_path, cloud)
+    draw, camera = cloud_candidate(cloud, views.train, export).draw, views.train.cameras[0]
+    own = (draw(camera) - shipped_model(cloud, export).draw(camera)).abs()
+    default = (draw(camera) - shipped_model(cloud).draw(camera)).abs()
+    assert float(own.mean()) < 1e-4 < 1e-3 < float(default.mean())
 
 
 @pytest.mark.parametrize("size", [32, 64])

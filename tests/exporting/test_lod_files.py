@@ -7,6 +7,7 @@ import json
 import math
 import re
 from typing import Any, get_args
+from urllib.parse import unquote
 
 import pytest
 
@@ -16,7 +17,7 @@ from bbfit.exporting.lod_files import LOD_VERSION, level_file, lod_document, pro
 
 DISTANCES = (0.0, 40.0, 90.5)
 BOUNDS = ((-3.0, 0.0, -2.0), (3.0, 8.0, 2.5))
-NAME = 'an "old" oak'
+NAME = 'an "old" oak #1, 50 % \udcff'
 
 
 @pytest.fixture
@@ -62,7 +63,7 @@ def parsed(scene: str) -> list[tuple[str, dict[str, str], dict[str, str]]]:
 
 def test_godot_shows_each_level_in_its_range(document: dict[str, Any]) -> None:
     (scene,) = program_files("godot", document).values()
-    head, *sections = parsed(scene.decode())
+    head, *sections = parsed(scene.decode(errors="surrogateescape"))
     assert head == ("gd_scene", {"load_steps": "5", "format": "3"}, {})
     files = {section[1]["id"]: json.loads(section[1]["path"]) for section in sections if section[0] == "ext_resource"}
     assert list(files.values()) == [level["file"] for level in document["levels"]]
@@ -90,7 +91,9 @@ def test_a_tileset_refines_where_the_finer_level_is_needed(document: dict[str, A
     while tile:
         chain.append(tile)
         (tile,) = tile.get("children", [None])
-    assert [tile["content"]["uri"] for tile in chain] == [level["file"] for level in document["levels"]][::-1]
+    assert [unquote(tile["content"]["uri"], errors="surrogateescape") for tile in chain] == [level["file"] for level in document["levels"]][
+        ::-1
+    ]
     errors = [tileset["geometricError"], *(tile["geometricError"] for tile in chain)]
     assert errors == sorted(errors, reverse=True) and errors[-1] == 0
     for tile, distance in zip(chain, DISTANCES[::-1], strict=True):

@@ -238,6 +238,7 @@ def test_the_trees_themselves_can_be_the_finest_levels(built: Library, tmp_path:
         ({"trees": [TREE.with_name("none.glb")]}, "none.glb does not exist"),
         ({"trees": [], "species": ["oak"]}, "species: "),
         ({"trees": [TREE], "seeds": [1, 1]}, "seeds: expected different ones"),
+        ({"trees": [TREE], "stages": replace(SMALL, export=ExportConfig(padding=2))}, "padding: expected at least 4"),
         ({"trees": [TREE], "stages": RunConfig(fit=replace(SMALL.fit, billboards=3))}, "billboards: planes sets"),
     ],
 )

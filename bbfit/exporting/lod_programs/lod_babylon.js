@@ -13,7 +13,7 @@ export async function loadLod(url, scene, { height, fov } = {}) {
   const factor = height && fov ? focal(height, fov) / focal(config.screen_height, (config.screen_fov_degrees * Math.PI) / 180) : 1;
   const tree = new TransformNode(name, scene);
   for (const [index, level] of levels.entries()) {
-    const container = await LoadAssetContainerAsync(new URL(level.file, new URL(url, location)).href, scene);
+    const container = await LoadAssetContainerAsync(new URL(encodeURIComponent(level.file), new URL(url, location)).href, scene);
     container.addAllToScene();
     const [root] = container.rootNodes;
     root.parent = tree;

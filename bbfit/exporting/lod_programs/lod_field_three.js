@@ -16,7 +16,7 @@ export async function loadField(url, matrices, { height, fov, loader = new GLTFL
   const { config, extent, levels } = await (await fetch(url)).json();
   const factor = height && fov ? focal(height, fov) / focal(config.screen_height, config.screen_fov_degrees) : 1;
   const loaded = levels.map(async ({ file, distance_meters }) => {
-    const { scene } = await loader.loadAsync(new URL(file, new URL(url, location)).href);
+    const { scene } = await loader.loadAsync(new URL(encodeURIComponent(file), new URL(url, location)).href);
     return { object: scene, distance: factor * distance_meters };
   });
   return new TreeField(await Promise.all(loaded), extent, matrices, { fade, farthest });

@@ -8,7 +8,7 @@ export async function loadLod(url, app, camera, { height } = {}) {
   const { config, extent, levels, name } = await (await fetch(url)).json();
   const factor = height ? focal(height, camera.camera.fov) / focal(config.screen_height, config.screen_fov_degrees) : 1;
   const tree = new Entity(name);
-  for (const { file } of levels) tree.addChild(await load(app, new URL(file, new URL(url, location)).href));
+  for (const { file } of levels) tree.addChild(await load(app, new URL(encodeURIComponent(file), new URL(url, location)).href));
   const center = new Vec3().lerp(new Vec3(extent.low), new Vec3(extent.high), 0.5);
   const choose = () => {
     const distance = tree.getWorldTransform().transformPoint(center).distance(camera.getPosition());

@@ -11,7 +11,7 @@ export async function loadLod(url, { height, fov, loader = new GLTFLoader(), fad
   const factor = height && fov ? focal(height, fov) / focal(config.screen_height, config.screen_fov_degrees) : 1;
   const lod = new FadingLod(new Vector3(...extent.low).lerp(new Vector3(...extent.high), 0.5), fade);
   for (const { file, distance_meters } of levels) {
-    const { scene } = await loader.loadAsync(new URL(file, new URL(url, location)).href);
+    const { scene } = await loader.loadAsync(new URL(encodeURIComponent(file), new URL(url, location)).href);
     scene.userData.shown = { value: new Vector2(0, 1) };
     scene.traverse(({ material }) => material && dither(material, scene.userData.shown));
     lod.addLevel(scene, factor * distance_meters);
