@@ -81,7 +81,7 @@ def with_filled_gaps(cards: Cards, on_step: Callable[[int, int], None] = lambda 
     change when the camera turns by a degree, because cards that come and go flicker, and that of the mean alpha. Masks are drawn with
     smooth edges. ``on_step`` is called after each step with its number and their total.
     """
-    with one_thread(), torch.enable_grad():
+    with one_thread(), torch.inference_mode(False), torch.enable_grad():  # a model is often made as it is first drawn
         return _filled(cards, on_step)
 
 

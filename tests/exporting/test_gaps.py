@@ -114,6 +114,18 @@ def test_the_same_cards_get_the_same_gaps() -> None:
     assert np.array_equal(*(with_filled_gaps(cards).atlas.image for _ in range(2)))
 
 
+def test_a_model_that_is_first_drawn_without_gradients_has_the_same_gaps() -> None:
+    """As an evaluation draws it, which makes its cards."""
+    cloud = crown("mask")
+    camera = cameras(FAR)
+    made, drawn = shipped_model(cloud), shipped_model(cloud)
+    assert made.glb
+    with torch.inference_mode():
+        pictures = made.draw(camera), drawn.draw(camera)
+    assert torch.equal(*pictures) and drawn.glb == made.glb
+    assert not np.array_equal(made.cards.atlas.image, shipped_model(cloud, ExportConfig(mipmaps=False)).cards.atlas.image)
+
+
 def test_only_pictures_that_programs_average_have_filled_gaps() -> None:
     cloud, steps = crown("mask"), list[tuple[str, int, int]]()
     empty = cards_of(cloud).atlas.image
