@@ -263,7 +263,7 @@ def test_trees_are_compared_by_means_and_spreads(tmp_path: Path) -> None:
     with Image.open(done.folder / "pareto.png") as picture:
         assert min(picture.size) > 400
     shutil.rmtree(done.folder / "trees" / "tree")  # and is made again
-    compare_trees(tmp_path / "out", config, stages, species=("apple",), seeds=(0, 1), trees=trees)
+    done = compare_trees(tmp_path / "out", config, stages, species=("apple",), seeds=(0, 1), trees=trees)
     assert (done.folder / "trees" / "tree" / "compare.json").is_file()
     times = {path: path.stat().st_mtime_ns for path in done.folder.glob("trees/*/*/result.json")}
     again = compare_trees(tmp_path / "out", config, stages, species=("apple",), seeds=(0, 1), trees=trees)

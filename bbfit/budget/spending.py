@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bbfit.budget.config import BudgetConfig
+from bbfit.budget.sizes import texels_of_pictures
 from bbfit.budget.trials import Trial, Trials
 from bbfit.fitting.config import Placement, Sides
 
@@ -88,16 +89,17 @@ def allowed(trials: Sequence[Trial], budget: BudgetConfig, textures: int) -> flo
 def texels_within(trials: Sequence[Trial], textures: int, most_bytes: float) -> float:
     """Estimate the limit of texels with which a model of a number of textures has ``most_bytes`` bytes; at most 0 if there is none.
 
-    The estimate follows the trial that is nearest in number of textures, and then in bytes. The bytes of the pictures are taken to be
-    proportional to texels. Small billboards have simpler outlines, so all other bytes may grow more slowly than the number of textures. Of
-    what is possible, the estimate is the highest: a trial shows whether it was too high.
+    The estimate follows the trial that is nearest in number of textures, and then in bytes. The bytes of the pictures grow with the texels
+    and with the gaps between textures (:func:`~bbfit.budget.sizes.texels_of_pictures`). Small billboards have simpler outlines, so all
+    other bytes may grow more slowly than the number of textures. Of what is possible, the estimate is the highest: a trial shows whether
+    it was too high.
     """
     if not trials:
         return (most_bytes - min(_BYTES_EACH * textures, _MOST_BESIDES * most_bytes)) / _BYTES_PER_TEXEL
     nearest = min(trials, key=lambda trial: (abs(math.log(trial.textures / textures)), abs(math.log(trial.bytes / most_bytes))))
     ratio = textures / nearest.textures
     left = most_bytes - (nearest.bytes - nearest.texture_bytes) * min(ratio, ratio**_GROWTH)
-    return _granted(nearest) * left / nearest.texture_bytes
+    return texels_of_pictures(left / nearest.texture_bytes, _granted(nearest), nearest.textures, textures)
 
 
 def has_all_texels(trial: Trial) -> bool:
