@@ -19,11 +19,8 @@ from bbfit.views.dataset import ViewDataset
 # The most steps of a fit that is repeated with fewer texels, the factor on its learning rate, the fraction of the limit that it aims at,
 # the fraction that is enough, and the most repetitions.
 _STEPS, _RATE, _AIM, _ENOUGH, _MOST_FITS = 100, 1 / 3, 0.98, 0.93, 5
-# The gaps around a texture take about as many bytes as so many texels. In 17 models of 32 to 384 masks of an acer and an aspen, with 8 to
-# 360 texels each, the bytes of a texel then differ by 15 % (a standard deviation within a tree), and by 30 % without gaps.
-_GAPS = 20
-# With which power of a model's texels its pictures grow, and the triangles of pieces, once a fit is repeated with fewer texels. With a
-# seventh to two thirds of the texels of an acer's 379 masks it was 0.52 to 0.60 and 0.03 to 0.15.
+# With which power of a model's texels its pictures grow, and the triangles of pieces. With a seventh to two thirds of the texels of an
+# acer's 379 masks it was 0.52 to 0.60 and 0.03 to 0.15.
 _PICTURES, _PIECES = 0.55, 0.15
 # How many times a limit the estimated size of a model with another outline may be, so that the model is made and measured.
 _DOUBT = 1.02
@@ -44,14 +41,6 @@ def _parts(glb: bytes) -> tuple[int, int]:
     tree, contents = split_glb(glb)
     pictures = sum(len(contents[image["bufferView"]]) for image in tree["images"])
     return pictures, sum(map(len, contents)) - pictures
-
-
-def texels_of_pictures(share: float, texels: float, textures: int, count: int) -> float:
-    """Estimate the texels of ``count`` textures whose pictures have a ``share`` of the bytes of those of ``textures`` with ``texels``.
-
-    The estimate may be less than 0: then the gaps alone take more.
-    """
-    return share * (texels + _GAPS * textures) - _GAPS * count
 
 
 def fitted_within_bytes(views: ViewDataset, result: FitResult, max_bytes: int, export: ExportConfig) -> BillboardCloud:

@@ -17,7 +17,8 @@ from billboard_scene import crossing_billboards
 from bbfit.budget import trials as trials_module
 from bbfit.budget.choice import MIN_GAIN_DB, START, Choice, choose, pareto_front
 from bbfit.budget.config import BudgetConfig
-from bbfit.budget.sizes import _GAPS, model_bytes, within_bytes
+from bbfit.budget.sizes import model_bytes, within_bytes
+from bbfit.budget.spending import _GAPS
 from bbfit.budget.trials import Trial, lookup, short_config
 from bbfit.checks import InputError
 from bbfit.evaluation.scoring import evaluate, views_psnr

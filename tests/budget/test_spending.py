@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from bbfit.budget.config import BudgetConfig
-from bbfit.budget.sizes import _GAPS
-from bbfit.budget.spending import has_all_texels, spent, texels_within
+from bbfit.budget.spending import _GAPS, has_all_texels, spent, texels_within
 from bbfit.budget.trials import Trial, Trials
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
