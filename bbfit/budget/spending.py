@@ -19,6 +19,8 @@ _AIM, _MOST_OFF, _MOST_GAIN_DB, _MOST_AIMS = 0.92, 4.0, 0.4, 3
 _LEAST_EACH = 8
 # The least density at which a trial counts as dense as its configuration asks for.
 _DENSE = 0.98
+# A full fit of as many texels as a trial takes up to 4 % more bytes, and to fit it again costs up to 0.4 dB: it may use this share.
+_FULL = 0.95
 # The gaps around a texture take about as many bytes as so many texels. In 17 models of 32 to 384 masks of an acer and an aspen, with 8 to
 # 360 texels each, the bytes of a texel then differ by 15 % (a standard deviation within a tree), and by 30 % without gaps.
 _GAPS = 20
@@ -38,7 +40,7 @@ class Spent:
     psnr: float
     """Estimated PSNR of a short fit at the limits, in dB."""
     max_texels: int | None
-    """Limit of texels with which a short fit is expected to use all that it may. A full fit uses a little more and compresses better."""
+    """Limit of texels with which a full fit is expected to use nearly all that it may."""
     missing: float
     """What the same billboards are expected to gain without limits, in dB."""
 
@@ -60,8 +62,8 @@ def spent(
         trial = trials.run(count, sides, placement, most)
         return Spent(trial, trial.psnr, most, _missing(trial, _granted(trial)))
 
-    def left(trial: Trial) -> float:
-        return min(texels_within([trial], trial.textures, limit), most or math.inf)
+    def left(trial: Trial, share: float = 1.0) -> float:
+        return min(texels_within([trial], trial.textures, share * limit), most or math.inf)
 
     own = list[Trial]()
     for _ in range(_MOST_AIMS):
@@ -79,7 +81,7 @@ def spent(
         return None
     trial = min(able, key=lambda trial: abs(_gain(trial, left(trial))))
     gain = min(_gain(trial, left(trial)), _MOST_GAIN_DB if budget.target_psnr is None else 0.0)
-    return Spent(trial, trial.psnr + gain, int(left(trial)), _missing(trial, left(trial)))
+    return Spent(trial, trial.psnr + gain, max(textures, int(left(trial, _FULL))), _missing(trial, left(trial)))
 
 
 def allowed(trials: Sequence[Trial], budget: BudgetConfig, textures: int) -> float:

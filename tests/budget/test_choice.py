@@ -18,7 +18,7 @@ from bbfit.budget import trials as trials_module
 from bbfit.budget.choice import MIN_GAIN_DB, START, Choice, choose, pareto_front
 from bbfit.budget.config import BudgetConfig
 from bbfit.budget.sizes import model_bytes, within_bytes
-from bbfit.budget.spending import _GAPS
+from bbfit.budget.spending import _FULL, _GAPS
 from bbfit.budget.trials import Trial, lookup, short_config
 from bbfit.checks import InputError
 from bbfit.evaluation.scoring import evaluate, views_psnr
@@ -407,7 +407,7 @@ def test_bytes_are_kept_and_made_use_of_whatever_a_texel_takes(choosing: Choosin
     assert 50_000 <= found.trials[found.chosen].bytes <= 200_000
     assert all(trial.bytes == pytest.approx(AIM * 100_000, abs=2 * rate) for trial in found.trials[len(world.line) - 1 :])
     assert found.config.max_texels is not None
-    assert rate * (found.config.max_texels + 4 * _GAPS) == pytest.approx(100_000, abs=3 * rate)
+    assert rate * (found.config.max_texels + 4 * _GAPS) == pytest.approx(_FULL * 100_000, abs=3 * rate)
 
 
 def test_bytes_that_are_not_needed_are_not_asked_for_again(choosing: Choosing) -> None:
@@ -415,7 +415,7 @@ def test_bytes_that_are_not_needed_are_not_asked_for_again(choosing: Choosing) -
     world = World(rising, texels=100)
     found = choosing(world, BudgetConfig(vertices=16, bytes="100k"), curve=False)
     assert world.line == [4] and len(world.asked) == 3
-    assert found.config.max_texels == pytest.approx(100_000 / 2 - 4 * _GAPS, abs=1)
+    assert found.config.max_texels == pytest.approx(_FULL * 100_000 / 2 - 4 * _GAPS, abs=1)
 
 
 def test_what_a_billboard_takes_besides_is_found_out(choosing: Choosing) -> None:
@@ -425,7 +425,7 @@ def test_what_a_billboard_takes_besides_is_found_out(choosing: Choosing) -> None
     assert summary(found) == (12, "one", "clusters") and world.line == [12, 8]
     for trial in found.trials[1:]:
         assert trial.bytes == pytest.approx(AIM * 20_000, abs=2)
-    assert found.config.max_texels == pytest.approx((20_000 - 4800) / 2 - 12 * _GAPS, abs=3)
+    assert found.config.max_texels == pytest.approx((_FULL * 20_000 - 4800) / 2 - 12 * _GAPS, abs=3)
 
 
 def test_so_many_that_no_texel_is_left_are_not_tried(choosing: Choosing) -> None:
@@ -449,7 +449,7 @@ def test_a_budget_of_bytes_that_can_be_kept_is_kept(choosing: Choosing) -> None:
 def test_bytes_and_texels_hold_at_once(choosing: Choosing) -> None:
     world = World(rising, texels=10**6)
     found = choosing(world, BudgetConfig(vertices=16, bytes=40_000, texels="1M"))
-    assert found.config.max_texels == pytest.approx(20_000 - 4 * _GAPS, abs=3)
+    assert found.config.max_texels == pytest.approx(_FULL * 20_000 - 4 * _GAPS, abs=3)
     world = World(rising, texels=10**6)
     found = choosing(world, BudgetConfig(vertices=16, bytes="1M", texels=3000))
     assert {asked[3] for asked in world.asked} == {3000} and found.config.max_texels == 3000
@@ -525,7 +525,11 @@ def test_a_target_that_only_more_than_is_allowed_reaches_is_not_reached(choosing
     world = World(rising, texels=300, bare=lambda count: 3000 * count)
     found = choosing(world, BudgetConfig(target_psnr=32, bytes=19_700))
     assert max(world.line) == 6
-    assert summary(found) == (6, "one", "clusters") and not found.met and found.config.max_texels == pytest.approx(850 - 6 * _GAPS, abs=2)
+    assert (
+        summary(found) == (6, "one", "clusters")
+        and not found.met
+        and found.config.max_texels == pytest.approx((_FULL * 19_700 - 18_000) / 2 - 6 * _GAPS, abs=2)
+    )
     # A texel limit does not stand in the way: trials keep it.
     found = choosing(World(rising), BudgetConfig(target_psnr=32, texels=500))
     assert summary(found) == (8, "one", "clusters") and found.met and found.config.max_texels == 500
@@ -829,7 +833,7 @@ def test_bytes_on_real_views() -> None:
     found = choose(sealed(DATA / "views"), dataclasses.replace(QUICK, placement="even"), BudgetConfig(bytes="20k", vertices=8))
     best = found.trials[found.chosen]
     assert (best.billboards, best.max_texels is not None) == (2, True) and best.texels <= (best.max_texels or 0)
-    share, gaps = (20_000 - best.bytes + best.texture_bytes) / best.texture_bytes, 2 * _GAPS
+    share, gaps = (_FULL * 20_000 - best.bytes + best.texture_bytes) / best.texture_bytes, 2 * _GAPS
     # A trial that is not dense has all that it may.
     assert found.config.max_texels == pytest.approx(share * ((best.max_texels or 0) + gaps) - gaps, abs=1)
     within = [trial for trial in found.trials if trial.bytes <= 20_000]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from bbfit.budget.config import BudgetConfig
-from bbfit.budget.spending import _GAPS, has_all_texels, spent, texels_within
+from bbfit.budget.spending import _FULL, _GAPS, has_all_texels, spent, texels_within
 from bbfit.budget.trials import Trial, Trials
 from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
@@ -87,7 +87,7 @@ def test_what_a_trial_leaves_of_the_limit_counts_as_used_and_what_it_exceeds_as_
     gain = 0.1 * (2 - 2 / min(left / first, 2))
     assert found.missing == pytest.approx(0.1 * (2 / min(left / first, 2) - 1), abs=1e-5)
     assert found.psnr == pytest.approx(20 + (gain if target is None else min(gain, 0)), abs=1e-4)
-    assert found.max_texels == pytest.approx(left, abs=3)
+    assert found.max_texels == pytest.approx(_FULL * (left + gaps) - gaps, abs=3)
 
 
 def test_no_more_is_tried_of_what_exceeds_the_limit_and_is_bad_enough(trials_of: Callable[..., Trials]) -> None:
