@@ -231,7 +231,7 @@ def test_a_budget_of_vertices_or_bytes_draws_compact_outlines() -> None:
     assert [export.outline for export in RunConfig(fit=FitConfig(preset="thesis")).exports] == ["rectangle"]
 
 
-@pytest.mark.parametrize(("limit", "outline"), [("10M", "pieces"), ("6k", "hull")])
+@pytest.mark.parametrize(("limit", "outline"), [("10M", "pieces"), ("5k", "hull")])
 def test_bytes_that_are_left_are_spent_on_the_outline(tmp_path: Path, limit: str, outline: str) -> None:
     """The record names it, and a second run finds it done."""
     config = RunConfig(fit=dataclasses.replace(FIT, least_billboards=1, most_billboards=1), budget=BudgetConfig(bytes=limit))
