@@ -24,7 +24,7 @@ from bbfit.exporting.lod_files import LOD_FILE, level_file, lod_document, progra
 from bbfit.exporting.model import shipped_model
 from bbfit.files import read_json, write_bytes, write_json
 from bbfit.fitting.initialize import pixels_per_meter
-from bbfit.geometry.camera import Camera
+from bbfit.geometry.camera import Camera, focal_pixels
 from bbfit.inputs import reading
 from bbfit.outputs import claimed_folder, output_folder, used_folder
 from bbfit.pipeline import RunConfig, RunResult, needs_blender, run
@@ -165,8 +165,7 @@ def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: R
     meshes = [_thinned(record, tree, count, views, stages, on_progress) for count in config.thinned]
     stages = replace(stages, tree=tree.path if tree.is_mesh else None)
     runs = [_fitted(folder, stages, planes, on_progress) for planes in config.planes]
-    export = export_config(views, stages.export)
-    export = with_textures(export)
+    export = with_textures(export_config(views, stages.outlined))
     record.run(_join_stage(folder, out, original, [*meshes, *runs], views, config, export), on_progress)
     description = folder / LEVELS / LOD_FILE
     stored = read_json("levels of detail", description)
@@ -319,7 +318,7 @@ def _levels(views: ViewDataset, models: list[_Model], config: LodConfig, name: s
     view_scale = float(pixels_per_meter(views.train.cameras))
     low, high = _bounds(views)
     height, radius = high[1] - low[1], math.dist(low, high) / 2
-    focal = config.screen_height / 2 / math.tan(math.radians(config.screen_fov_degrees) / 2)
+    focal = focal_pixels(config.screen_height, config.screen_fov_degrees)
     next_scales = [*(model.switch.scale for model in models[1:]), 0.0]
     levels = list[LodLevel]()
     for model, next_scale in zip(models, next_scales, strict=True):

@@ -125,10 +125,15 @@ class RunConfig:
         has hulls of 4 corners, which no profile splits. The preset ``thesis`` has rectangles and no mip levels.
         """
         if self.fit.preset == "thesis":
-            return ((replace(self.export, mipmaps=False) if self.export.mipmaps is None else self.export).comparable(),)
+            return (replace(self.outlined, mipmaps=False) if self.export.mipmaps is None else self.outlined,)
         if self.budget.vertices is not None:
             return (replace(self.export.compact(4), split=False),)
         return (self.export,) if self.budget.bytes is None else self.export.outlines()
+
+    @property
+    def outlined(self) -> ExportConfig:
+        """The options of the export without a budget, with rectangles for the preset ``thesis`` unless an outline is given."""
+        return self.export.comparable() if self.fit.preset == "thesis" else self.export
 
     def seeded(self, seed: int) -> RunConfig:
         """The same options with one seed for growing, rendering and fitting."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import json
 import shutil
@@ -18,6 +19,7 @@ from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.glb import split_glb
 from bbfit.images import read_rgba
 from bbfit.outputs import WRITTEN_FILE
 from bbfit.pipeline import RunConfig, RunResult, run
@@ -85,6 +87,15 @@ def test_only_what_depends_on_a_change_is_done_again(views_folder: Path, tmp_pat
     for damage in ("{", '{"stages": {"fit": {"inputs": 3}, "evaluate": 5, "old": {"x": 1}}}'):
         (tmp_path / "run.json").write_text(damage)
         assert run(views_folder, tmp_path, other).skipped == ()
+
+
+def test_a_report_shows_an_atlas_that_webp_cannot_hold(views_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    largest = 32
+    monkeypatch.setattr("bbfit.stages.results.WEBP_SIDE", largest)
+    page = (run(views_folder, tmp_path, CONFIG).folder / "report.html").read_text()
+    shown = json.loads(page.split('<script type="application/json" id="data">')[1].split("</script>")[0])
+    assert max(read_rgba(tmp_path / "model.png").shape) > largest
+    assert [image["mimeType"] for image in split_glb(base64.b64decode(shown["glb"]))[0]["images"]] == ["image/png"]
 
 
 def test_a_killed_run_goes_on_to_the_same_result(views_folder: Path, tmp_path: Path, done: RunResult) -> None:

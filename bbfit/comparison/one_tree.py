@@ -20,11 +20,9 @@ from bbfit.reporting.comparison_tables import CompareRow, compare_csv, compare_m
 from bbfit.stages.results import original_tree
 from bbfit.stages.stage import OnProgress, Record, Stage, silent
 from bbfit.stages.trees import convert_stage, views_stage
-from bbfit.tree_files.tree_file import TreeFile
+from bbfit.tree_files.tree_file import Y_UP_MESHES, TreeFile
 from bbfit.views.dataset import ViewDataset
 
-# The formats that all systems read without a conversion: Y up, with materials.
-_READABLE = (".glb", ".gltf", ".obj")
 _TABLES = ("compare.csv", "compare.md", "compare.json", "quality.png", "systems.png")
 
 
@@ -79,7 +77,7 @@ def compare(
         check_blender(stages.views)
     with claimed_folder("out", out) as folder:
         record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
-        record.check({"tables": _TABLES} | ({} if tree.suffix in _READABLE else {"convert": ("tree.glb",)}))
+        record.check({"tables": _TABLES} | ({} if tree.suffix in Y_UP_MESHES else {"convert": ("tree.glb",)}))
         return CompareResult(folder, _compared(tree, record, systems, config, stages, on_progress))
 
 
@@ -116,7 +114,7 @@ def _compared(
     record.run(views_stage(folder, tree, stages.views), on_progress)
     views = ViewDataset.load(folder / "views", limits=stages.limits)
     views.check()
-    if tree.suffix not in _READABLE:
+    if tree.suffix not in Y_UP_MESHES:
         record.run(convert_stage(folder, tree, "tree.glb"), on_progress)
         tree = TreeFile.open(folder / "tree.glb")
     comparison = Systems(tree, views, record, config, stages, on_progress)

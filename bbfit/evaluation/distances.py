@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bbfit.exporting.config import LodConfig
+from bbfit.geometry.camera import focal_pixels
 
 SCREEN = LodConfig()
 """The screen: 1080 lines with a vertical field of view of 50 degrees, and an error of at most one pixel, as in levels of detail."""
@@ -56,7 +56,7 @@ def viewing_distances(silhouette_pixels: float, pixels_per_meter: float, coverag
     the largest first, at least one, with the ratio of the model's coverage to the tree's (:class:`~bbfit.evaluation.report.SizeScore`). A
     picture of half the size shows the tree as from twice the distance.
     """
-    nearest = SCREEN.screen_height / 2 / math.tan(math.radians(SCREEN.screen_fov_degrees) / 2) / pixels_per_meter
+    nearest = focal_pixels(SCREEN.screen_height, SCREEN.screen_fov_degrees) / pixels_per_meter
     far = list[float]()
     for width, coverage in coverages:
         if coverage is None or abs(coverage - 1) > MOST_OFF:

@@ -11,8 +11,8 @@ from bbfit.checks import check_shape, fail
 from bbfit.exporting.atlas import BLOCK
 from bbfit.exporting.config import ktx2_missing
 
-# The longest side of a WebP picture in texels.
-_WEBP_SIDE = 16383
+WEBP_SIDE = 16383
+"""The longest side of a WebP picture in texels."""
 
 
 def encode_ktx2(levels: list[NDArray[np.uint8]], *, srgb: bool = True) -> bytes:
@@ -55,8 +55,8 @@ def encode_webp(image: NDArray[np.uint8], lossless: bool = True) -> bytes:
     from PIL import Image
 
     check_shape("image", image.shape, (None, None, image.shape[-1] if image.shape[-1] in (3, 4) else 4))
-    if max(image.shape) > _WEBP_SIDE:
-        fail("image", f"WebP has at most {_WEBP_SIDE} texels a side, got {image.shape[1]} x {image.shape[0]}", "write it as PNG")
+    if max(image.shape) > WEBP_SIDE:
+        fail("image", f"WebP has at most {WEBP_SIDE} texels a side, got {image.shape[1]} x {image.shape[0]}", "write it as PNG")
     file = io.BytesIO()
     if lossless:
         Image.fromarray(image).save(file, "WEBP", lossless=True, quality=80, method=6, exact=True)  # here the effort of the search

@@ -11,6 +11,7 @@ from typing import Any
 
 from bbfit.exporting.config import LodConfig
 from bbfit.exporting.lod import LodLevel
+from bbfit.geometry.camera import focal_pixels
 from bbfit.model_files import generator, relative_uri
 
 LOD_FILE = "lod.json"
@@ -106,7 +107,7 @@ def _tileset(document: Mapping[str, Any]) -> str:
     Z up; Cesium turns their GLBs, which have Y up. The tree goes where its height would be a pixel.
     """
     config, extent = document["config"], document["extent"]
-    focal = config["screen_height"] / 2 / math.tan(math.radians(config["screen_fov_degrees"]) / 2)
+    focal = focal_pixels(config["screen_height"], config["screen_fov_degrees"])
     x, y, z = ((low + high) / 2 for low, high in zip(extent["low"], extent["high"], strict=True))
     sphere = {"sphere": [x, -z, y, extent["radius"]]}
     tile: dict[str, Any] = {}

@@ -31,6 +31,7 @@ from bbfit.forest.journal import Journal
 from bbfit.forest.placements import Placements
 from bbfit.forest.prototypes import Prototype, read_prototype
 from bbfit.forest.tiles import ForestTile, read_tile
+from bbfit.geometry.camera import focal_pixels
 from bbfit.inputs import InputLimits
 from bbfit.library.manifest import Library
 from bbfit.model_files import generator, relative_uri
@@ -112,7 +113,7 @@ class _Writer:
         corners = np.array([[tree.low, tree.high] for tree in trees])
         self._heights, self._depths = corners[:, 1, 1], np.minimum(corners[:, 0, 1], 0.0)
         self._radii = np.hypot(np.abs(corners[:, :, 0]).max(1), np.abs(corners[:, :, 2]).max(1))
-        pixel = 2 * math.tan(math.radians(screen.fov_degrees) / 2) / screen.height  # in meters at a distance of a meter
+        pixel = 1 / focal_pixels(screen.height, screen.fov_degrees)  # in meters at a distance of a meter
         self._counts = np.array([len(tree.levels) for tree in trees])
         steps = int(self._counts.max())
         # For each step from the coarsest level on: the level of each tree, its triangles and its error.

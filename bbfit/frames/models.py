@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,6 +12,7 @@ from bbfit.checks import check_file, check_folder, check_record, fail
 from bbfit.exporting.lod import LodLevel
 from bbfit.exporting.lod_files import LOD_FILE
 from bbfit.files import read_json
+from bbfit.geometry.camera import focal_pixels
 from bbfit.glb import gltf_parts
 from bbfit.inputs import InputLimits, reading
 from bbfit.lod import thinned_file
@@ -126,7 +126,7 @@ def _levels(folder: Path, views: ViewSet | None) -> DrawnModel:
     levels = tuple(LodLevel(**level) for level in stored["levels"])
     check_record("levels", levels, tuple[LodLevel, ...])
     # lod.json has distances for its own screen. Over its focal length they hold for any other.
-    focal = float(stored["config"]["screen_height"]) / 2 / math.tan(math.radians(float(stored["config"]["screen_fov_degrees"])) / 2)
+    focal = focal_pixels(float(stored["config"]["screen_height"]), float(stored["config"]["screen_fov_degrees"]))
     names = ", ".join(level.content for level in levels)
     files = tuple(check_file("levels of detail", folder / "levels" / level.file) for level in levels)
     distances = tuple(level.distance_meters / focal for level in levels)

@@ -164,8 +164,15 @@ def pinhole_intrinsics(fov_x_degrees: float, width: int, height: int) -> Tensor:
     The field of view spans pixel *edges*, as in Blender and in the NeRF-synthetic layout. The principal point, which is relative to pixel
     centers, is therefore ((width - 1) / 2, (height - 1) / 2).
     """
-    focal = 0.5 * width / math.tan(math.radians(fov_x_degrees) / 2)
-    return _intrinsics(focal, width, height)
+    return _intrinsics(focal_pixels(width, fov_x_degrees), width, height)
+
+
+def focal_pixels(side: float, fov_degrees: float) -> float:
+    """The focal length in pixels of a picture whose side of ``side`` pixels has a field of view of ``fov_degrees``.
+
+    A length of a meter that faces the camera has this many pixels at a distance of a meter.
+    """
+    return side / 2 / math.tan(math.radians(fov_degrees) / 2)
 
 
 def orthographic_intrinsics(extent_x: float, width: int, height: int) -> Tensor:

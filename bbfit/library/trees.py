@@ -49,7 +49,7 @@ def library_tree(
     plain = replace(stages, grow=RunConfig().grow, views=views, export=replace(stages.export, textures="png", fallback=True))
     built = build_lod(tree, folder / f"{name}.glb", config.levels, plain, work=folder)
     dataset = ViewDataset.load(folder / "views", limits=stages.limits)
-    export = with_textures(export_config(dataset, stages.export))
+    export = with_textures(export_config(dataset, stages.outlined))
     with claimed_folder("out", folder / CARDS) as place:
         Record(place).run(_cards_stage(place, built, export))
     assert dataset.request and dataset.request.tree.bounds

@@ -21,10 +21,8 @@ from bbfit.geometry.camera import Camera, orthographic_intrinsics
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import bleed_color, read_rgba
 from bbfit.scratch import ScratchFolder
-from bbfit.tree_files.tree_file import TreeFile
+from bbfit.tree_files.tree_file import Y_UP_MESHES, TreeFile
 
-# Endings of Y-up files whose triangles are read directly; others go through Blender.
-_MESH_SUFFIXES = (".glb", ".gltf", ".obj")
 # What of the light from all around the inside of a stem reflects at most. In uncut pictures of an acer and an aspen nothing is as dark,
 # in those of a willow one texel in ten thousand.
 _INSIDE = 0.03
@@ -147,7 +145,7 @@ def tree_triangles(tree: str | Path | TreeFile) -> NDArray[np.float64]:
     :meth:`~bbfit.tree_files.tree_file.TreeFile.mesh` are raised.
     """
     tree = TreeFile.open(tree)
-    if tree.suffix not in _MESH_SUFFIXES:
+    if tree.suffix not in Y_UP_MESHES:
         with ScratchFolder() as scratch:
             return tree_triangles(tree_as_glb(tree, scratch / "tree.glb"))
     return np.asarray(tree.mesh().triangles, np.float64)

@@ -12,7 +12,8 @@ from typing import Any
 
 from bbfit.evaluation.report import Report, Subject
 from bbfit.evaluation.scoring import OriginalTree, evaluate_model
-from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.config import Encoding, ExportConfig
+from bbfit.exporting.encoders import WEBP_SIDE
 from bbfit.exporting.gltf import glb_bytes
 from bbfit.exporting.model import ShippedModel
 from bbfit.files import write_bytes
@@ -114,7 +115,8 @@ def report_stage(
         on_progress("report", 0, 1)
         losses = [float(row["loss"]) for row in csv.DictReader((folder / "loss.csv").read_text().splitlines())]
         picture = pareto.read_bytes() if pareto else None
-        readable = replace(model.config, textures="webp", fallback=False, mip_files=False, quantized=True)  # browsers read these
+        textures: Encoding = "webp" if max(model.cards.atlas.image.shape) <= WEBP_SIDE else "png"
+        readable = replace(model.config, textures=textures, fallback=False, mip_files=False, quantized=True)  # browsers read these
         known = RunFacts(**facts, losses=losses, pareto=picture)
         page = report_page(report, model, views.test, known, glb_bytes(model.cards, readable), views.lit_test)
         write_bytes(folder / "report.html", page.encode(errors="backslashreplace"))

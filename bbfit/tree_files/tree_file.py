@@ -42,6 +42,8 @@ _CHECKS = {".obj": check_obj, ".ply": check_ply, ".stl": check_stl}
 _NO_PICTURES = (*UP_AXES, ".mtl", ".bin")
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 """The formats whose triangles can be read without Blender."""
+Y_UP_MESHES = (".glb", ".gltf", ".obj")
+"""Those whose triangles are drawn as they are: they have Y up, and materials."""
 
 
 @dataclass(frozen=True)

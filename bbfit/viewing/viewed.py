@@ -16,6 +16,7 @@ from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputError, check_folder, check_record, fail
 from bbfit.exporting.config import ExportConfig
 from bbfit.files import read_json
+from bbfit.geometry.camera import focal_pixels
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
 from bbfit.geometry.light import Light, angles_degrees, direction
@@ -191,7 +192,7 @@ def _open_lod(folder: Path, original_bytes: int) -> ViewedTree:
     stored = read_json("run", folder / LOD_FILE)
     coarser, records, with_tree = list[ViewerLevel](), list[dict[str, Any]](), False
     config = stored["config"]
-    focal = config["screen_height"] / 2 / math.tan(math.radians(config["screen_fov_degrees"]) / 2)
+    focal = focal_pixels(config["screen_height"], config["screen_fov_degrees"])
     for index, level in enumerate(stored["levels"]):
         scale = focal / level["distance_meters"] if index and level["distance_meters"] else math.inf
         if level["planes"] is None:

@@ -93,6 +93,14 @@ def test_levels_take_over_where_their_error_is_within_the_bound(built: LodResult
     assert before.screen_coverage == 0
 
 
+def test_levels_have_the_outline_of_their_runs(tmp_path: Path) -> None:
+    """The preset thesis draws rectangles, and its runs are scored with them."""
+    thesis = replace(SMALL, fit=replace(SMALL.fit, preset="thesis", refinement_rounds=None, candidates=None, restarts=None))
+    (level,) = build_lod(TREE, tmp_path / "oak.glb", LodConfig(planes=(2,), original=False), thesis).levels
+    metrics = read_json("metrics", tmp_path / "oak" / "2" / "metrics.json")
+    assert level.vertices == metrics["vertices"]["model"] == 8
+
+
 def test_colors_count_too(built: LodResult) -> None:
     """The distance is the larger of both, or that of the views' size; from there on, the colors of no training view are further off."""
     views = ViewDataset.load(built.folder / "views")
