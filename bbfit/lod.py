@@ -15,17 +15,17 @@ from typing import TypeVar
 from torch import Tensor
 
 from bbfit.blender.requirements import check_blender
-from bbfit.checks import check_folder, check_output_file, check_record, fail
+from bbfit.checks import check_folder, check_output_file, fail
 from bbfit.evaluation.scoring import views_psnr
 from bbfit.evaluation.switching import Candidate, DrawingCost, Switch, cloud_candidate, mesh_cost, switches
-from bbfit.exporting.config import ExportConfig, LodConfig, Outline, Profile
+from bbfit.exporting.config import ExportConfig, LodConfig, Outline, Profile, check_no_mip_files
 from bbfit.exporting.lod import LodLevel, glb_counts, is_self_contained, lod_glb
-from bbfit.exporting.lod_files import LOD_FILE, level_file, lod_document, program_file_names, program_files
+from bbfit.exporting.lod_files import LOD_FILE, level_file, lod_document, program_file_names, program_files, read_levels
 from bbfit.exporting.model import shipped_model
-from bbfit.files import read_json, write_bytes, write_json
+from bbfit.files import write_bytes, write_json
 from bbfit.fitting.initialize import pixels_per_meter
 from bbfit.geometry.camera import Camera, focal_pixels
-from bbfit.inputs import reading
+from bbfit.inputs import InputLimits
 from bbfit.outputs import claimed_folder, output_folder, used_folder
 from bbfit.pipeline import RunConfig, RunResult, needs_blender, run
 from bbfit.provenance import digest_file
@@ -141,6 +141,7 @@ def check_unset(config: LodConfig, stages: RunConfig) -> None:
     """Require that options which the levels decide are left out. Raises ``InputError``."""
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "planes sets the number of billboards of each level", "omit billboards and budgets")
+    check_no_mip_files(stages.export)
     if config.triangles is not None and not config.original:
         fail("triangles", f"{config.triangles} are requested of a tree that is no level", "leave out one of triangles and no-original")
 
@@ -166,13 +167,8 @@ def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: R
     stages = replace(stages, tree=tree.path if tree.is_mesh else None)
     runs = [_fitted(folder, stages, planes, on_progress) for planes in config.planes]
     export = with_textures(export_config(views, stages.outlined))
-    record.run(_join_stage(folder, out, original, [*meshes, *runs], views, config, export), on_progress)
-    description = folder / LEVELS / LOD_FILE
-    stored = read_json("levels of detail", description)
-    with reading("levels of detail", description, "remove it, then start bbfit lod again"):
-        levels = tuple(LodLevel(**level) for level in stored["levels"])
-        check_record("levels", levels, tuple[LodLevel, ...])
-    return LodResult(out, folder, levels)
+    record.run(_join_stage(folder, out, original, [*meshes, *runs], views, config, export, stages.limits), on_progress)
+    return LodResult(out, folder, read_levels(folder / LEVELS).levels)
 
 
 def with_textures(export: ExportConfig) -> ExportConfig:
@@ -190,6 +186,7 @@ def _join_stage(
     views: ViewDataset,
     config: LodConfig,
     export: ExportConfig,
+    limits: InputLimits,
 ) -> Stage:
     """Join the original (if it is a level) and the other models, finest first, to one file."""
 
@@ -197,12 +194,16 @@ def _join_stage(
         steps = 2 * len(made) + 1
         on_progress("join", 0, steps)
         candidates = [
-            Candidate(each.draw, partial(_mesh_costs, each.file, views.train))
+            Candidate(each.draw, partial(_mesh_costs, TreeFile.open(each.file, limits), views.train))
             if isinstance(each, _Thinned)
             else cloud_candidate(each.cloud, views.train, export)
             for each in made
         ]
-        tree = mesh_cost(tree_triangles(original), views.train) if original and config.fragments_per_triangle is not None else None
+        tree = (
+            mesh_cost(tree_triangles(TreeFile.open(original, limits)), views.train)
+            if original and config.fragments_per_triangle is not None
+            else None
+        )
         found = switches(candidates, views, config, tree=tree, on_level=lambda done: on_progress("join", done, steps))
         models = [_Model(original.read_bytes(), None, Switch(cost=tree))] if original else []
         for number, (each, switch) in enumerate(zip(made, found, strict=True), 1 + len(made)):
@@ -262,7 +263,7 @@ def _model(made: _Thinned | RunResult, switch: Switch, export: ExportConfig, vie
     return _Model(shipped.glb, len(made.cloud), switch, made.report.mean.over.mean.psnr, shipped.draw, int(made.folder.name))
 
 
-def _mesh_costs(file: Path, views: ViewSet) -> dict[Outline | None, DrawingCost]:
+def _mesh_costs(file: TreeFile, views: ViewSet) -> dict[Outline | None, DrawingCost]:
     return {None: mesh_cost(tree_triangles(file), views)}
 
 

@@ -245,6 +245,7 @@ def fitted(
     record, tree, views, on_progress = prepared.record, prepared.tree, prepared.views, on_progress or silent
     folder, fit_config, missed = record.folder, config.fit, None
     exports = [export_config(views, export) for export in config.exports]
+    record.head["config"]["export"]["up"] = exports[-1].up
     if config.budget.given:
         record.run(budget_stage(folder, views, tree, fit_config, config.budget, exports[-1]), on_progress)
         fit_config, met = read_choice(folder)
@@ -282,7 +283,7 @@ def prepare(
         head = _head(species.name, config, grown=species, rendered=True)
         config.check(mesh=True, rendered=True, blender=needs_blender(Path(out)))
         with _record(out, head, config, [config.grow.species_file, config.views.hdri]) as record:
-            tree = _grown(record, grow_stage(record.folder, species, config.grow), on_progress)
+            tree = _grown(record, grow_stage(record.folder, species, config.grow), config.limits, on_progress)
             yield _rendered(record, tree, config, on_progress)
     elif config.species is not None or replace(config.grow, seed=0) != RunConfig().grow:
         fail("run", f"{path} is given, so no tree is grown", "omit the species and the options for growing")
@@ -336,14 +337,14 @@ def needs_blender(folder: Path) -> bool:
     return not (folder / "views" / TEST_FILE).is_file()
 
 
-def _grown(record: Record, stage: Stage, on_progress: OnProgress) -> TreeFile:
+def _grown(record: Record, stage: Stage, limits: InputLimits, on_progress: OnProgress) -> TreeFile:
     """Grow the tree of a run in its folder, which must not contain views of another tree."""
     path, earlier = record.folder / "tree.glb", record.stages.get(stage.name)
     is_other = earlier["inputs"] != stage.key if earlier else not path.exists()
     if is_other and (record.folder / "views").exists():
         fail("out", f"{record.folder} contains the views of another tree", "choose another folder for this one")
     record.run(stage, on_progress)
-    return TreeFile.open(path)
+    return TreeFile.open(path, limits)
 
 
 def _head(source: str, config: RunConfig, *, grown: Species | None = None, rendered: bool) -> dict[str, Any]:

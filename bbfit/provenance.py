@@ -23,7 +23,7 @@ VERSIONS: Mapping[str, int] = {
     "views": 8,
     "budget": 17,
     "fit": 27,
-    "export": 18,
+    "export": 19,
     "evaluate": 20,
     "report": 13,
     "lod": 11,

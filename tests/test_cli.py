@@ -226,6 +226,7 @@ def test_an_export_has_the_outline_of_its_run(views_folder: Path, tmp_path: Path
     original = (run / "model.glb").read_bytes()
     default = exported(cloud, "--outline", "pieces")
     assert exported(cloud) == original != default
+    assert exported(cloud, "--corners", "8") != original  # the run has hulls of 4 corners
     assert main(["evaluate", str(cloud), str(views_folder), "--out", str(tmp_path / "again.json")]) == 0
     assert bbfit.Report.load(tmp_path / "again.json").vertices.model == bbfit.Report.load(run / "metrics.json").vertices.model <= 4
     record = (run / "run.json").read_text()

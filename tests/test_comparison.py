@@ -7,7 +7,7 @@ import json
 import shutil
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from khronos import WARNING, messages
 from PIL import Image
 
 from bbfit.blender.config import ViewsConfig
+from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputError
 from bbfit.comparison.config import LIT, SYSTEMS, CompareConfig
 from bbfit.comparison.many_trees import compare_trees
@@ -28,11 +29,15 @@ from bbfit.evaluation.scoring import evaluate_model
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
 from bbfit.exporting.model import shipped_model
+from bbfit.files import write_json
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.inputs import InputLimits
+from bbfit.layout import REQUEST_FILE
 from bbfit.pipeline import RunConfig
 from bbfit.rendering.cards import CardRenderer
 from bbfit.reporting.comparison_summary import COSTS, front, summaries
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.config import GrowConfig
 from bbfit.views.dataset import ViewDataset
 
@@ -278,6 +283,8 @@ def test_bad_input(tmp_path: Path) -> None:
         CompareConfig(slices=0)
     with pytest.raises(InputError, match="billboards: the comparison sets their numbers"):
         compare(TREE, tmp_path, SMALL, RunConfig(fit=FitConfig(billboards=3)))
+    with pytest.raises(InputError, match="mip_files: only bbfit run, fit, sweep and export"):
+        compare(TREE, tmp_path, SMALL, replace(STAGES, export=ExportConfig(mip_files=True)))
     (tmp_path / "bad.glb").write_bytes(TREE.read_bytes()[:3000])
     with pytest.raises(InputError, match=r"bad\.glb"):
         compare_trees(tmp_path / "out", SMALL, STAGES, trees=(tmp_path / "bad.glb",))
@@ -285,6 +292,29 @@ def test_bad_input(tmp_path: Path) -> None:
         compare_trees(tmp_path / "out", SMALL, STAGES, species=("apple",), seeds=(1, 1))
     with pytest.raises(InputError, match="there are no trees"):
         compare_trees(tmp_path / "out", SMALL, STAGES)
+
+
+def test_systems_that_need_suns_cannot_join_views_without_them(tmp_path: Path) -> None:
+    (tmp_path / "views").mkdir()
+    write_json(tmp_path / "views" / REQUEST_FILE, asdict(ViewsRequest.of(TreeFile.open(TREE), STAGES.views)))
+    with pytest.raises(InputError, match=r"^systems: baked-maps: .*views has no views under other suns"):
+        compare(TREE, tmp_path, replace(SMALL, systems=("bbfit", "baked-maps")), STAGES)
+
+
+def test_fits_have_the_limits_of_the_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tree that was opened with other folders or larger limits is opened again by each fit."""
+
+    class Reached(Exception):
+        pass
+
+    def reached(source: Path, out: Path, config: RunConfig, **_: object) -> None:
+        assert config.limits.allow_folders == (tmp_path,)
+        raise Reached
+
+    monkeypatch.setattr("bbfit.comparison.own_systems.prepare", reached)
+    stages = replace(STAGES, limits=InputLimits(allow_folders=(tmp_path,)))
+    with pytest.raises(Reached):
+        compare(TREE, tmp_path / "out", replace(SMALL, systems=("bbfit",)), stages)
 
 
 def test_trees_that_only_blender_reads_as_they_stand_are_converted(tmp_path: Path) -> None:

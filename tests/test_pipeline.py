@@ -23,6 +23,7 @@ from bbfit.glb import split_glb
 from bbfit.images import read_rgba
 from bbfit.outputs import WRITTEN_FILE
 from bbfit.pipeline import RunConfig, RunResult, run
+from bbfit.stages.recorded import as_in_run
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
 CONFIG = RunConfig(fit=FitConfig(billboards=2, candidates=2, refinement_rounds=0, steps=20, checkpoint_every=5))
@@ -205,6 +206,8 @@ def test_an_obj_of_a_z_up_tree_is_z_up(views_folder: Path, tmp_path: Path) -> No
     (views / "views.json").write_text(json.dumps({"tree": {"up_axis": "z", "vertices": 5000, "bytes": 90_000}}))
     result = run(views, tmp_path / "out", CONFIG)
     assert "Z up" in (tmp_path / "out" / "model.obj").read_text().splitlines()[0]
+    assert as_in_run(ExportConfig(), tmp_path / "out" / "cloud.safetensors").up == "z"
+    assert as_in_run(ExportConfig(up="y"), tmp_path / "out" / "cloud.safetensors").up == "y"
     vertices = json.loads((tmp_path / "out" / "metrics.json").read_text())["vertices"]
     model = shipped_model(result.cloud).cards.vertex_count
     assert vertices == {"model": model, "original": 5000, "ratio": model / 5000}

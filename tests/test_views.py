@@ -123,6 +123,7 @@ def test_turned_views_go_with_their_views(turned: Path, views_folder: Path) -> N
     torch.testing.assert_close(pairs.turned.cameras.intrinsics, expected.intrinsics, rtol=0, atol=1e-9)
     assert all(torch.equal(pairs.turned.image(number), test.image(index)) for number, index in enumerate((1, 3)))
     assert views.fingerprint == plain.fingerprint  # so fits stay current
+    assert views.full_fingerprint != plain.full_fingerprint  # but scores do not
     views.check()
 
 

@@ -108,7 +108,7 @@ def finest_within_bytes(
         each = _parts(model.glb)[1] / vertices
         for export in finer:
             polygons = pieces if export.outline == "pieces" else len(model.cards.cards)
-            if size + each * (polygons * export.corners - vertices) <= _DOUBT * max_bytes:
+            if size + each * (polygons * export.resolve().corners - vertices) <= _DOUBT * max_bytes:
                 other = shipped_model(cloud, export, on_progress=on_progress)
                 if len(other.glb) <= max_bytes:
                     return other

@@ -204,7 +204,7 @@ def evaluate_command(
     from bbfit.outputs import claimed_folder, single_files, used_folder
     from bbfit.reporting.tables import report_table
     from bbfit.stages.describing import subject_of
-    from bbfit.stages.recorded import as_in_run
+    from bbfit.stages.recorded import as_in_run, grown_species
     from bbfit.stages.results import completed, original_tree
     from bbfit.tree_files.tree_file import TreeFile
     from bbfit.views.dataset import ViewDataset
@@ -230,7 +230,7 @@ def evaluate_command(
                 lit=dataset.lit_test,
                 on_progress=partial(on_progress, "evaluate"),
             )
-        report = completed(replace(report, seconds={**seconds, **report.seconds}), model, subject_of(dataset, cloud))
+        report = completed(replace(report, seconds={**seconds, **report.seconds}), model, subject_of(dataset, cloud, grown_species(cloud)))
         report.save(out)
     out_console.print(report_table(report, thesis=False))
     out_console.print(f"measures in {out}", soft_wrap=True)

@@ -98,7 +98,7 @@ def _compared(
             place, grow = folder / "trees" / source.name, replace(stages.grow, seed=seed)
             tree = None if source.tree is None else TreeFile.open(source.tree, stages.limits)
             kind = tree.digest if tree else (load_species(source.species, grow.species_file), grow)
-            key = cache_key("compare", source.name, kind, config.compared, stages.views, stages.fit, stages.export, VERSIONS)
+            key = cache_key("compare", source.name, kind, config.compared, stages.views, stages.fit, stages.export.resolve(), VERSIONS)
             earlier = results.get(key)
             if earlier is not None and earlier.reason is None and (place / "compare.json").is_file():
                 outcomes[source.name] = earlier

@@ -11,6 +11,7 @@ from bbfit.checks import fail
 from bbfit.comparison.config import LIT, SYSTEMS, CompareConfig
 from bbfit.comparison.own_systems import fits
 from bbfit.comparison.systems import Systems
+from bbfit.exporting.config import check_no_mip_files
 from bbfit.files import write_bytes, write_json
 from bbfit.layout import REQUEST_FILE
 from bbfit.outputs import claimed_folder
@@ -72,7 +73,11 @@ def compare(
     """
     config, stages, on_progress = config or CompareConfig(), stages or RunConfig(), on_progress or silent
     tree = TreeFile.open(tree, stages.limits)
-    systems, stages = checked_systems(config, stages, _suns(Path(out)))
+    earlier, requested = _suns(Path(out)), stages.views.suns
+    systems, stages = checked_systems(config, stages, earlier or 0)
+    if earlier == 0 and requested == 0 and stages.views.suns:
+        needing = " and ".join(system for system in systems if system in LIT)
+        fail("systems", f"{needing}: {out}/views has no views under other suns", "choose another output folder, or remove that folder")
     if needs_blender(Path(out)):
         check_blender(stages.views)
     with claimed_folder("out", out) as folder:
@@ -88,6 +93,7 @@ def checked_systems(config: CompareConfig, stages: RunConfig, suns: int = 0) -> 
     """
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "the comparison sets their numbers", "omit billboards and budgets")
+    check_no_mip_files(stages.export)
     chosen = config.systems or (SYSTEMS if stages.views.hdri is None else tuple(system for system in SYSTEMS if system not in LIT))
     systems = [system for system in SYSTEMS if system in chosen]
     suns = max(suns, stages.views.suns, 1 if set(systems) & set(LIT) else 0)
@@ -98,12 +104,12 @@ def checked_systems(config: CompareConfig, stages: RunConfig, suns: int = 0) -> 
     return systems, stages
 
 
-def _suns(folder: Path) -> int:
-    """The number of suns of views that an earlier comparison rendered, with more systems perhaps."""
+def _suns(folder: Path) -> int | None:
+    """The number of suns of views that an earlier comparison rendered, with other systems perhaps; ``None`` without such views."""
     path = folder / "views" / REQUEST_FILE
     request = ViewsRequest.load(path) if path.is_file() else None
-    suns = 0 if request is None else request.config.get("suns", 0)
-    return suns if isinstance(suns, int) else 0
+    suns = None if request is None else request.config.get("suns", 0)
+    return suns if isinstance(suns, int) else None
 
 
 def _compared(
@@ -116,7 +122,7 @@ def _compared(
     views.check()
     if tree.suffix not in Y_UP_MESHES:
         record.run(convert_stage(folder, tree, "tree.glb"), on_progress)
-        tree = TreeFile.open(folder / "tree.glb")
+        tree = TreeFile.open(folder / "tree.glb", stages.limits)
     comparison = Systems(tree, views, record, config, stages, on_progress)
     rows = []
     on_progress("systems", 0, len(systems))

@@ -95,7 +95,7 @@ def _run(stages: RunConfig, subject: Subject, folder: Path) -> SystemResult:
     def report(stage: str, done: int, total: int, note: str = "") -> None:
         subject.on_progress(f"{folder.name} {stage}", done, total, note)
 
-    config = replace(stages, tree=subject.tree.path)
+    config = replace(stages, tree=subject.tree.path, limits=subject.stages.limits)
     with prepare(subject.folder / "views", folder / "run", config, on_progress=report) as prepared:
         made = fitted(prepared, config, on_progress=report)
         seconds = made.seconds + sum(prepared.record.seconds.get(stage, 0.0) for stage in ("budget", "fit"))

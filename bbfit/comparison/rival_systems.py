@@ -250,5 +250,5 @@ def _rendered(model: bytes, subject: Subject, folder: Path, seconds: float, note
         seconds,
         ViewSet.of_files(paths, cameras).draw,
         note=note,
-        fragments=partial(triangle_fragments, torch.tensor(tree_triangles(path))),
+        fragments=partial(triangle_fragments, torch.tensor(tree_triangles(path, subject.stages.limits))),
     )

@@ -68,8 +68,8 @@ class Systems:
             costs = CompareCosts(result.planes, result.vertices, size, round(result.seconds, 1), shaded, result.shader, triangles)
             write_json(folder / "result.json", CompareRow(system, chosen.title, costs, measures, result.note, light, far).to_json())
 
-        shared = (subject.stages.fit, subject.stages.export, _VERSIONS)
-        inputs = (system, subject.tree.digest, subject.views.fingerprint, chosen.inputs, subject.config.tree_height, *shared)
+        shared = (subject.stages.fit, subject.stages.export.resolve(), _VERSIONS)
+        inputs = (system, subject.tree.digest, subject.views.full_fingerprint, chosen.inputs, subject.config.tree_height, *shared)
         outputs = (
             f"{system}/result.json",
             f"{system}/model*.glb",

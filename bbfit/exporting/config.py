@@ -88,10 +88,10 @@ class ExportConfig:
     hull: one convex polygon; rectangle: all of it.
     Default: pieces; a run with a budget of bytes draws pieces or hulls of 5 to 8 corners, the finest outline that fits;
     a run with a budget of vertices draws hulls of 4; the preset thesis and a comparison of vertices draw rectangles."""
-    pieces: Count = 8
-    """With pieces: the most pieces of a billboard on average, at least 1. Cuts that save too little are left out."""
-    corners: Annotated[int, Range(4, 8)] = 8
-    """With pieces or hull: the most corners of each polygon, 4 to 8."""
+    pieces: Count | None = None
+    """With pieces: the most pieces of a billboard on average, at least 1. Cuts that save too little are left out. Default: 8."""
+    corners: Annotated[int, Range(4, 8)] | None = None
+    """With pieces or hull: the most corners of each polygon, 4 to 8. Default: 8."""
     textures: Textures | None = None
     """Format of a GLB's texture beside PNG, which every program reads: webp is smaller, once --no-fallback omits the PNG;
     ktx2 stays compressed on the graphics card and includes mip levels that keep their coverage (needs the extra ktx2);
@@ -131,7 +131,7 @@ class ExportConfig:
 
     def compact(self, corners: int) -> ExportConfig:
         """The same options with hulls of at most so many corners, 4 to 8, unless they ask for other outlines."""
-        return replace(self, outline="hull", corners=min(self.corners, corners)) if self.outline is None else self
+        return replace(self, outline="hull", corners=min(self.corners or 8, corners)) if self.outline is None else self
 
     def outlines(self) -> tuple[ExportConfig, ...]:
         """The same options with each outline that a budget of bytes may draw: from the one that shades fewest pixels, the default's, to the
@@ -140,7 +140,7 @@ class ExportConfig:
         if self.outline is not None:
             return (self,)
         steps: tuple[tuple[Outline, int], ...] = (("pieces", 8), ("pieces", 6), ("pieces", 5), ("hull", 6), ("hull", 5))
-        return tuple(dict.fromkeys(replace(self, outline=outline, corners=min(self.corners, corners)) for outline, corners in steps))
+        return tuple(dict.fromkeys(replace(self, outline=outline, corners=min(self.corners or 8, corners)) for outline, corners in steps))
 
     def mipmapped(self, alpha: AlphaMode) -> bool:
         """Whether a model with an alpha mode is read with mip levels."""
@@ -156,7 +156,7 @@ class ExportConfig:
         if isinstance(self, ResolvedExport):
             return self
         chosen: dict[str, Any] = {"split": self.program.split, "material": self.program.material, "textures": "png", "outline": "pieces"}
-        chosen["quantized"] = self.program.quantized
+        chosen |= {"pieces": 8, "corners": 8, "quantized": self.program.quantized}
         chosen |= {name: value for name, value in vars(self).items() if value is not None or name not in chosen}
         if chosen["textures"] == "auto":
             chosen["textures"] = "png" if ktx2_missing() else "ktx2"
@@ -173,11 +173,19 @@ class ExportConfig:
         return ktx2_missing() if self.textures == "auto" else None
 
 
+def check_no_mip_files(config: ExportConfig) -> None:
+    """Require that an export writes no mip levels as files. Raises InputError."""
+    if config.mip_files:
+        fail("mip_files", "only bbfit run, fit, sweep and export write them", "leave out --mip-files, or give --textures ktx2")
+
+
 class ResolvedExport(ExportConfig):
     """An :class:`ExportConfig` with every choice made. Where ``alpha`` or ``alpha_cutoff`` is None, that of the cloud holds."""
 
     split: bool
     outline: Outline
+    pieces: int
+    corners: int
     textures: Encoding
     quantized: bool
     material: Material
@@ -185,7 +193,7 @@ class ResolvedExport(ExportConfig):
     @property
     def has_mips(self) -> bool:
         """Whether the files include mip levels of their own."""
-        return self.mip_files or self.textures == "ktx2"
+        return self.mip_files or (self.textures == "ktx2" and self.mipmaps is not False)
 
 
 @dataclass(frozen=True)

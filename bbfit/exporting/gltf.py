@@ -189,7 +189,7 @@ def _complete(tree: dict[str, Any], cards: Cards, pictures: list[str], config: R
     assert len({image["bufferView"] for image in tree["images"]}) == 1
     tree["images"] = [{"bufferView": tree["images"][0]["bufferView"]}]
     tree["textures"] = [{"sampler": 0, "name": name} for name in pictures]
-    tree["samplers"] = [_WITH_MIPS if config.textures == "ktx2" or config.mipmapped(cards.alpha) else _SAMPLER]
+    tree["samplers"] = [_WITH_MIPS if config.has_mips or config.mipmapped(cards.alpha) else _SAMPLER]
     used = set(tree.get("extensionsUsed", ()))
     for material in tree["materials"]:
         material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}

@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
+from bbfit.checks import check_record
 from bbfit.exporting.config import LodConfig
 from bbfit.exporting.lod import LodLevel
+from bbfit.files import read_json
 from bbfit.geometry.camera import focal_pixels
+from bbfit.inputs import reading
 from bbfit.model_files import generator, relative_uri
 
 LOD_FILE = "lod.json"
@@ -49,6 +53,29 @@ def lod_document(
         "config": asdict(config),
         "levels": [asdict(level) for level in levels],
     }
+
+
+@dataclass(frozen=True)
+class StoredLevels:
+    """What a ``lod.json`` contains."""
+
+    levels: tuple[LodLevel, ...]
+    """The levels, finest first."""
+    focal: float
+    """Focal length in pixels of the screen that their distances are for. Distances over it hold for any screen."""
+    triangles: int | None
+    """Triangles to which the tree itself was decimated; ``None`` if all of them stayed."""
+
+
+def read_levels(folder: Path) -> StoredLevels:
+    """Read the ``lod.json`` of a folder of levels. Raises MissingFileError or InputError if it is missing or damaged."""
+    path = folder / LOD_FILE
+    with reading("levels of detail", path, "start bbfit lod again"):
+        stored = read_json("levels of detail", path)
+        levels, config = tuple(LodLevel(**level) for level in stored["levels"]), stored["config"]
+        check_record("levels", levels, tuple[LodLevel, ...])
+        focal = focal_pixels(float(config["screen_height"]), float(config["screen_fov_degrees"]))
+        return StoredLevels(levels, focal, config.get("triangles"))
 
 
 def level_file(name: str, number: int | str) -> str:

@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from bbfit.checks import check_file, check_folder, check_record, fail
+from bbfit.checks import check_file, check_folder, fail
 from bbfit.exporting.lod import LodLevel
-from bbfit.exporting.lod_files import LOD_FILE
+from bbfit.exporting.lod_files import LOD_FILE, read_levels
 from bbfit.files import read_json
-from bbfit.geometry.camera import focal_pixels
 from bbfit.glb import gltf_parts
 from bbfit.inputs import InputLimits, reading
 from bbfit.lod import thinned_file
@@ -122,15 +121,12 @@ def _compared(folder: Path, row: CompareRow, views: ViewSet | None) -> DrawnMode
 
 
 def _levels(folder: Path, views: ViewSet | None) -> DrawnModel:
-    stored = read_json("levels of detail", folder / "levels" / LOD_FILE)
-    levels = tuple(LodLevel(**level) for level in stored["levels"])
-    check_record("levels", levels, tuple[LodLevel, ...])
-    # lod.json has distances for its own screen. Over its focal length they hold for any other.
-    focal = focal_pixels(float(stored["config"]["screen_height"]), float(stored["config"]["screen_fov_degrees"]))
+    stored = read_levels(folder / "levels")
+    levels = stored.levels
     names = ", ".join(level.content for level in levels)
     files = tuple(check_file("levels of detail", folder / "levels" / level.file) for level in levels)
-    distances = tuple(level.distance_meters / focal for level in levels)
-    whole = stored["config"].get("triangles") is None
+    distances = tuple(level.distance_meters / stored.focal for level in levels)
+    whole = stored.triangles is None
     pictures = () if views is None else tuple(_level_pictures(folder, level, views, whole=whole) for level in levels)
     return DrawnModel(f"{folder.resolve().name}-levels", f"levels of detail: {names}", "levels", files, distances, pictures)
 

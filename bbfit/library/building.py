@@ -8,13 +8,14 @@ from pathlib import Path
 
 from bbfit.blender.requirements import check_blender
 from bbfit.checks import InputError, fail
+from bbfit.exporting.encoders import WEBP_SIDE
 from bbfit.layout import TEST_FILE
 from bbfit.library.config import LibraryConfig
 from bbfit.library.files import STAGE, WORK, FinishedTree, library_outputs, library_stage
 from bbfit.library.manifest import Library, read_library
 from bbfit.library.shared_atlas import check_padding
 from bbfit.library.trees import library_tree
-from bbfit.lod import check_levels, check_unset, with_measured_speed
+from bbfit.lod import check_levels, check_unset, with_measured_speed, with_textures
 from bbfit.outputs import claimed_folder
 from bbfit.pipeline import RunConfig, needs_blender
 from bbfit.provenance import VERSIONS, cache_key, digest_file, identity
@@ -90,6 +91,8 @@ def _check(folder: Path, chosen: list[tuple[Source, int]], config: LibraryConfig
     """Check the options of all trees before the first one. Devices and packages of a cluster are not known here."""
     check_unset(config, stages)
     check_padding(stages.export.padding)
+    if stages.export.textures == "webp" and config.page_size > WEBP_SIDE:
+        fail("page_size", f"WebP has at most {WEBP_SIDE} texels a side, got {config.page_size}", "give less, or --textures png")
     mesh = all(source.tree is None or source.tree.suffix.lower() in MESH_SUFFIXES for source, _ in chosen)
     here = config.ray is None
     check_levels(config, stages if here else replace(stages, fit=replace(stages.fit, device="cpu")), mesh=mesh)
@@ -132,7 +135,7 @@ def _submitted(
     place, grow = folder / WORK / source.name, replace(stages.grow, seed=seed)
     tree = None if source.tree is None else TreeFile.open(source.tree, stages.limits)
     kind = tree.digest if tree else (load_species(source.species, grow.species_file), grow)
-    key = cache_key("library", source.name, kind, config.levels, stages.views, stages.fit, stages.export.resolve(), VERSIONS)
+    key = cache_key("library", source.name, kind, config.levels, stages.views, stages.fit, with_textures(stages.export).resolve(), VERSIONS)
     earlier = results.get(key)
     if earlier is not None and _is_current(earlier.facts, place):
         return earlier

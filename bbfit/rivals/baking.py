@@ -20,12 +20,14 @@ from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera, orthographic_intrinsics
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import bleed_color, read_rgba
+from bbfit.inputs import InputLimits
 from bbfit.scratch import ScratchFolder
 from bbfit.tree_files.tree_file import Y_UP_MESHES, TreeFile
 
 # What of the light from all around the inside of a stem reflects at most. In uncut pictures of an acer and an aspen nothing is as dark,
 # in those of a willow one texel in ten thousand.
 _INSIDE = 0.03
+_LIMITS = InputLimits()
 _TENSORS = ("centers", "rights", "ups", "half_extents", "depths")
 
 
@@ -138,16 +140,16 @@ def bake(
     return _assembled(slabs, parts, config)
 
 
-def tree_triangles(tree: str | Path | TreeFile) -> NDArray[np.float64]:
+def tree_triangles(tree: str | Path | TreeFile, limits: InputLimits = _LIMITS) -> NDArray[np.float64]:
     """Corners of all triangles of a tree in the world of its views, [T, 3, 3] in meters.
 
     Blender reads formats other than .glb, .gltf and .obj. The errors of :func:`~bbfit.blender.conversion.tree_as_glb` and
     :meth:`~bbfit.tree_files.tree_file.TreeFile.mesh` are raised.
     """
-    tree = TreeFile.open(tree)
+    tree = TreeFile.open(tree, limits)
     if tree.suffix not in Y_UP_MESHES:
         with ScratchFolder() as scratch:
-            return tree_triangles(tree_as_glb(tree, scratch / "tree.glb"))
+            return tree_triangles(tree_as_glb(tree, scratch / "tree.glb"), limits)
     return np.asarray(tree.mesh().triangles, np.float64)
 
 

@@ -91,9 +91,7 @@ def evaluate_stage(
         completed(report, model, subject, most_bytes).save(folder / "metrics.json")
         comparison_picture(model, views.test, folder / "comparison.png")
 
-    turned = None if views.turned is None else (views.turned.views.fingerprint, views.turned.turned.fingerprint)
-    lit = None if views.lit_test is None else views.lit_test.fingerprint
-    inputs = (subject, model.config, VERSIONS["export"], model.cloud.alpha, views.fingerprint, turned, lit, original, most_bytes)
+    inputs = (subject, model.config, VERSIONS["export"], model.cloud.alpha, views.full_fingerprint, original, most_bytes)
     return Stage("evaluate", inputs, EVALUATE_OUTPUTS, work)
 
 
@@ -124,8 +122,7 @@ def report_stage(
 
     shown = [folder / name for name in ("cloud.safetensors", "metrics.json", "loss.csv")] + ([pareto] if pareto else [])
     described = {name: value for name, value in facts.items() if name != "versions"}
-    lit = None if views.lit_test is None else views.lit_test.fingerprint
-    inputs = ([digest_file(file) for file in shown], described, views.fingerprint, lit)
+    inputs = ([digest_file(file) for file in shown], described, views.full_fingerprint)
     return Stage("report", inputs, REPORT_OUTPUTS, work)
 
 

@@ -13,7 +13,6 @@ from typing import Any
 from bbfit.blender.config import RING
 from bbfit.blender.requirements import check_blender
 from bbfit.checks import InputError, fail
-from bbfit.exporting.config import ExportConfig
 from bbfit.files import write_bytes
 from bbfit.fitting.loop import fit_inputs
 from bbfit.layout import TEST_FILE
@@ -115,7 +114,9 @@ def _check(folder: Path, sources: list[Source], cells: list[Cell], config: Sweep
     to_render = [source for source in sources if source.views is None]
     mesh = all(source.tree is None or source.tree.suffix.lower() in MESH_SUFFIXES for source in to_render)
     for cell in cells:
-        fit, export = (cell.config, stages.export) if config.ray is None else (replace(cell.config, device="cpu"), ExportConfig())
+        fit, export = cell.config, stages.export
+        if config.ray is not None:
+            fit, export = replace(fit, device="cpu"), replace(export, textures=None)
         replace(stages, fit=fit, export=export).check(mesh=mesh, rendered=bool(to_render), blender=False)
     if config.ray is None and any(needs_blender(_tree_folder(folder, source)) for source in to_render):
         check_blender(stages.views)
@@ -212,7 +213,7 @@ class _Sweep:
         """Submit the run of a cell, unless its result exists or the same run is already submitted."""
         fit, export = self._cells[number].config, self._stages.export
         versions = {name: VERSIONS[name] for name in ("export", "evaluate")}
-        request = {"fit": fit_inputs(views, fit, mesh), "export": export, "views": views.fingerprint, "versions": versions}
+        request = {"fit": fit_inputs(views, fit, mesh), "export": export.resolve(), "views": views.full_fingerprint, "versions": versions}
         key = cache_key("fit", request)[:_DIGITS]
         earlier = self._results.get(key)
         if earlier and self._is_final(earlier):

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.request import ViewsRequest
-from bbfit.checks import InputError, check_folder, check_record, fail
+from bbfit.checks import InputError, check_folder, fail
 from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.lod_files import LOD_FILE, read_levels
 from bbfit.files import read_json
-from bbfit.geometry.camera import focal_pixels
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.extent import shown_bounds
 from bbfit.geometry.light import Light, angles_degrees, direction
@@ -28,8 +28,8 @@ from bbfit.viewing.levels import ViewerLevel
 from bbfit.viewing.originals import MAX_BYTES, Original, find_original
 from bbfit.views.dataset import ViewDataset
 
-LOD_FILE, CLOUD_FILE = "levels/lod.json", "cloud.safetensors"
-"""Files of a folder of levels of detail and of a run's folder."""
+LEVELS, CLOUD_FILE = "levels", "cloud.safetensors"
+"""The folder of levels of detail in a folder of bbfit lod, and the cloud in a run's folder."""
 # The most views whose colors are given, and how far their cameras may be from eye level, in sines of the elevation.
 _SEEN, _LEVEL = 8, 0.1
 
@@ -102,8 +102,8 @@ def open_results(folder: str | Path, *, original_bytes: int = MAX_BYTES) -> View
     no such folder, or is damaged.
     """
     folder = check_folder("run", folder)
-    is_lod = (folder / LOD_FILE).is_file()
-    with reading("run", folder / LOD_FILE if is_lod else folder, "start bbfit again for this folder"):
+    is_lod = (folder / LEVELS / LOD_FILE).is_file()
+    with reading("run", folder, "start bbfit again for this folder"):
         return _open_lod(folder, original_bytes) if is_lod else _open_run(folder, original_bytes)
 
 
@@ -189,23 +189,19 @@ def _views(folder: Path, record: dict[str, Any]) -> Path | None:
 
 
 def _open_lod(folder: Path, original_bytes: int) -> ViewedTree:
-    stored = read_json("run", folder / LOD_FILE)
-    coarser, records, with_tree = list[ViewerLevel](), list[dict[str, Any]](), False
-    config = stored["config"]
-    focal = focal_pixels(config["screen_height"], config["screen_fov_degrees"])
-    for index, level in enumerate(stored["levels"]):
-        scale = focal / level["distance_meters"] if index and level["distance_meters"] else math.inf
-        if level["planes"] is None:
-            with_tree = True
-            continue
-        check_record("planes", level["planes"], int)
-        run = folder / str(level["planes"])
-        cloud = BillboardCloud.load(run / CLOUD_FILE)
-        halvings = 0 if math.isinf(scale) else max(0, math.floor(math.log2(cloud.texel_density / scale)))
-        coarser.append(ViewerLevel(cloud, scale, halvings))
-        records.append(_record(run))
-    if not coarser:
-        fail("run", f"{folder / LOD_FILE} names no billboards", "start bbfit lod again")
+    stored = read_levels(folder / LEVELS)
+    billboards = [level for level in stored.levels if level.planes is not None]
+    if not billboards:
+        fail("run", f"{folder / LEVELS / LOD_FILE} names no billboards", "start bbfit lod again")
+    runs = [folder / str(level.requested) for level in billboards]
+    records = [_record(run) for run in runs]
+    scales = [stored.focal / level.distance_meters if level.distance_meters else math.inf for level in billboards]
+    coarser = [
+        ViewerLevel(BillboardCloud.load(run / CLOUD_FILE), scale, level.halvings)
+        for run, scale, level in zip(runs, scales, billboards, strict=True)
+    ]
+    kinds = {level.content for level in stored.levels if level.planes is None}
+    with_tree, thinned = "tree" in kinds, sorted(kinds - {"tree"})
     converted = folder / "original.glb"
     original = find_original([converted] if converted.is_file() else sources(folder, records[0]), original_bytes)
     levels = (ViewerLevel(None, math.inf), *coarser) if with_tree and original.glb is not None else tuple(coarser)
@@ -219,4 +215,5 @@ def _open_lod(folder: Path, original_bytes: int) -> ViewedTree:
         light=light_of(folder / "views"),
         seen=seen_colors(folder / "views"),
         views=folder / "views",
+        notes=(f"not shown here: the tree thinned out to {' and '.join(thinned)}",) if thinned else (),
     )

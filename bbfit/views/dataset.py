@@ -168,6 +168,13 @@ class ViewDataset:
         """SHA-256 over both splits' fingerprints; the second pictures of ``turned`` do not count."""
         return sha256((self.train.fingerprint + self.test.fingerprint).encode()).hexdigest()
 
+    @property
+    def full_fingerprint(self) -> str:
+        """SHA-256 over the fingerprints of all pictures that scores depend on: also those of ``turned`` and ``lit_test``."""
+        turned = "" if self.turned is None else self.turned.views.fingerprint + self.turned.turned.fingerprint
+        lit = "" if self.lit_test is None else self.lit_test.fingerprint
+        return sha256(" ".join((self.fingerprint, turned, lit)).encode()).hexdigest()
+
 
 def _is_own(request: ViewsRequest | None) -> bool:
     return request is not None and request.complete and request.camera is not None

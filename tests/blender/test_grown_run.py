@@ -12,6 +12,7 @@ from bbfit.blender.config import ViewsConfig
 from bbfit.checks import InputError
 from bbfit.fitting.config import FitConfig
 from bbfit.pipeline import RunConfig, run
+from bbfit.stages.recorded import grown_species
 from bbfit.trees.config import GrowConfig
 from bbfit.trees.growth import grow
 from bbfit.trees.tree_writer import write_tree
@@ -40,6 +41,7 @@ def test_the_tree_is_the_one_that_was_asked_for(grown: Path, tmp_path: Path) -> 
     metrics = json.loads((grown / "metrics.json").read_text())
     assert metrics["vertices"]["original"] == sum(len(mesh.vertices) for mesh in scene.geometry.values())
     assert metrics["seconds"]["grow"] > 0
+    assert grown_species(grown / "cloud.safetensors") == "acer"  # bbfit evaluate keeps the name
 
 
 def test_a_standing_run_is_left_alone_and_a_lost_tree_grown_again(grown: Path) -> None:

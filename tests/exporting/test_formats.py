@@ -87,6 +87,7 @@ def test_other_textures_stand_beside_png_or_in_its_place(
         (AlphaMode("mask", 0.25), ExportConfig(), 9987),
         (AlphaMode("mask", 0.26), ExportConfig(), 9729),
         (AlphaMode("mask", 0.26), ExportConfig(textures="ktx2"), 9987),
+        (AlphaMode("mask", 0.26), ExportConfig(textures="ktx2", mipmaps=False), 9729),
         (AlphaMode("mask", 0.26), ExportConfig(alpha="blend"), 9987),
         (AlphaMode("mask"), ExportConfig(mipmaps=True), 9987),
         (AlphaMode("blend"), ExportConfig(mipmaps=False), 9729),

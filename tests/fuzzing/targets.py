@@ -501,9 +501,13 @@ _STAGES |= {"stages": {"fit": {"inputs": "0" * 64, "outputs": {"cloud.safetensor
 _OUTCOME = {
     "outcome": {"facts": {"report": {"over": {"mean": {"psnr": 30.0}}}}, "reason": None, "where": "here", "seconds": 1.0, "trace": None}
 }
+_LEVEL = {"name": "oak_LOD0", "planes": 8, "vertices": 40, "triangles": 20, "bytes": 100, "error_meters": 0.1, "error_pixels": 0.9}
+_LEVEL |= {"held_out_error_pixels": 1.0, "psnr": 25.0, "tree_pixels": None, "distance_meters": 0.0, "screen_coverage": 0.0}
+_LEVEL |= {"file": "trees/oak_LOD0.glb", "silhouette_distance_meters": 10.0, "color_distance_meters": 20.0, "color_error": 0.1}
+_LEVEL |= {"held_out_color_error": 0.1, "halvings": 0}
 _LOD = {
     "config": {"screen_height": 1080, "screen_width": 1920, "screen_fov_degrees": 40.0},
-    "levels": [{"planes": None, "distance_meters": 0.0}, {"planes": 2, "distance_meters": 10.0}],
+    "levels": [_LEVEL | {"planes": None, "psnr": None}, _LEVEL | {"planes": 2, "requested": 2, "distance_meters": 10.0}],
 }
 _RECORDS: dict[str, Any] = {
     "metrics.json": _report,
@@ -555,10 +559,6 @@ def _read_record(folder: Path) -> None:
 
 # Libraries.
 
-_LEVEL = {"name": "oak_LOD0", "planes": 8, "vertices": 40, "triangles": 20, "bytes": 100, "error_meters": 0.1, "error_pixels": 0.9}
-_LEVEL |= {"held_out_error_pixels": 1.0, "psnr": 25.0, "tree_pixels": None, "distance_meters": 0.0, "screen_coverage": 0.0}
-_LEVEL |= {"file": "trees/oak_LOD0.glb", "silhouette_distance_meters": 10.0, "color_distance_meters": 20.0, "color_error": 0.1}
-_LEVEL |= {"held_out_color_error": 0.1, "halvings": 0}
 _SCORE = {"tree_pixels": 40.0, "psnr": 25.0, "color_error": 0.2, "texels": 640}
 _LIBRARY: dict[str, Any] = {
     "version": 1,

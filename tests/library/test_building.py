@@ -7,6 +7,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,9 @@ from bbfit.library.stored_cards import read_cards
 from bbfit.pipeline import RunConfig
 from bbfit.rendering.cards import CardRenderer
 from bbfit.views.dataset import ViewDataset
+from bbfit.workers.results import Results
+from bbfit.workers.sources import sources
+from bbfit.workers.tasks import Task
 
 
 def copied(built: Library, folder: Path) -> Path:
@@ -107,6 +111,21 @@ def test_nothing_is_done_twice(built: Library, tmp_path: Path) -> None:
         on_progress=lambda stage, now, total, note="": told.append((stage, now, total)),
     )
     assert replace(same, folder=built.folder) == built and times(folder) == before and told == [("trees", 2, 2)]
+
+
+def test_an_encoder_that_is_installed_later_makes_trees_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With KTX2, cards have mip levels of their own."""
+    source, tasks = sources([], [TREE], [])[0], list[Task]()
+    workers = SimpleNamespace(submit=tasks.append)
+
+    def key() -> object:
+        return building._submitted(tmp_path, source, 0, LEVELS, SMALL, Results(tmp_path), workers)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("bbfit.exporting.config.ktx2_missing", lambda: "install it")
+    without = key()
+    assert without == key() and len(tasks) == 2
+    monkeypatch.setattr("bbfit.exporting.config.ktx2_missing", lambda: None)
+    assert key() != without
 
 
 def test_what_is_lost_is_made_again_and_the_rest_is_kept(built: Library, tmp_path: Path) -> None:
@@ -241,11 +260,16 @@ def test_the_trees_themselves_can_be_the_finest_levels(built: Library, tmp_path:
         ({"trees": [TREE], "seeds": [1, 1]}, "seeds: expected different ones"),
         ({"trees": [TREE], "stages": replace(SMALL, export=ExportConfig(padding=2))}, "padding: expected at least 4"),
         ({"trees": [TREE], "stages": RunConfig(fit=replace(SMALL.fit, billboards=3))}, "billboards: planes sets"),
+        ({"trees": [TREE], "stages": replace(SMALL, export=ExportConfig(mip_files=True))}, "mip_files: only bbfit run, fit, sweep and"),
+        (
+            {"trees": [TREE], "stages": replace(SMALL, export=ExportConfig(textures="webp")), "config": LibraryConfig(page_size=16384)},
+            "page_size: WebP has at most 16383 texels",
+        ),
     ],
 )
 def test_bad_wishes_are_refused_before_any_work(options: dict, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
-        build_library(options.pop("trees"), tmp_path / "out", LEVELS, **options)
+        build_library(options.pop("trees"), tmp_path / "out", options.pop("config", LEVELS), **options)
     assert not (tmp_path / "out").exists()
 
 

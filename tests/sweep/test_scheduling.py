@@ -15,6 +15,7 @@ from billboard_scene import crossing_billboards, write_views
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.checks import InputError, MissingFileError
+from bbfit.exporting.config import ExportConfig
 from bbfit.fitting.config import FitConfig
 from bbfit.pipeline import RunConfig, run
 from bbfit.reporting.sweep_tables import SweepRow
@@ -55,6 +56,13 @@ def times(folder: Path) -> dict[str, int]:
 def psnr(row: SweepRow) -> float:
     assert row.facts
     return float(row.facts["report"]["over"]["mean"]["psnr"])
+
+
+def test_options_of_the_export_are_checked_on_a_cluster_too(two_trees: list[Path], tmp_path: Path) -> None:
+    config = SweepConfig(grid="default", ray="auto")
+    lit = RunConfig(fit=FitConfig(light="maps"), export=ExportConfig(material="unlit", textures="ktx2"))
+    with pytest.raises(InputError, match=r"^material: the cloud has maps"):
+        run_sweep(tmp_path / "out", config, lit, views=two_trees)
 
 
 def test_every_configuration_of_every_tree_is_run(done: SweepResult) -> None:

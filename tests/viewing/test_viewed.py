@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 import trimesh
 
 from bbfit.checks import InputError, MissingFileError
+from bbfit.exporting.lod import LodLevel
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.glb import joined_glb, split_glb
 from bbfit.viewing.originals import find_original
@@ -97,18 +99,29 @@ def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
         open_results(DATA / "views")
 
 
-def lod_folder(folder: Path, cloud: BillboardCloud, *, original: bool = True) -> Path:
-    """A folder as bbfit lod leaves it: two billboards from 10 m, one from 40 m, for a screen whose focal length is 1000 pixels."""
-    levels = [{"planes": None, "distance_meters": 0.0}] if original else []
-    for planes, distance in ((2, 10.0 if original else 0.0), (1, 40.0)):
-        (folder / str(planes)).mkdir(parents=True)
-        cloud.take(range(planes)).save(folder / str(planes) / "cloud.safetensors")
+def lod_level(**known: object) -> LodLevel:
+    """A level with some values, and zeros or nothing for the others."""
+    kinds = {field.name: field.type for field in fields(LodLevel) if field.default is MISSING}
+    values = {name: {"str": "", "int": 0, "float": 0.0}.get(str(kind)) for name, kind in kinds.items()}
+    return LodLevel(**(values | known))  # type: ignore[arg-type]
+
+
+def lod_folder(folder: Path, cloud: BillboardCloud, *, original: bool = True, thinned: bool = False) -> Path:
+    """A folder as bbfit lod leaves it: two billboards from 10 m, one from 40 m, for a screen whose focal length is 1000 pixels.
+
+    Three billboards were requested for the first of them, of which the fit removed one.
+    """
+    levels = [lod_level()] if original else []
+    levels += [lod_level(psnr=30.0, triangles=1234, distance_meters=5.0 if original else 0.0)] if thinned else []
+    for requested, planes, distance in ((3, 2, 10.0 if levels else 0.0), (1, 1, 40.0)):
+        (folder / str(requested)).mkdir(parents=True)
+        cloud.take(range(planes)).save(folder / str(requested) / "cloud.safetensors")
         record = {"source": str(folder / "views"), "config": {"tree": str(DATA / "tree.glb"), "export": {"profile": "three"}}}
-        (folder / str(planes) / "run.json").write_text(json.dumps(record))
-        levels.append({"planes": planes, "distance_meters": distance})
+        (folder / str(requested) / "run.json").write_text(json.dumps(record))
+        levels.append(lod_level(planes=planes, requested=requested, distance_meters=distance))
     config = {"screen_height": 2000, "screen_fov_degrees": 90.0}
     (folder / "levels").mkdir()
-    (folder / "levels" / "lod.json").write_text(json.dumps({"config": config, "levels": levels}))
+    (folder / "levels" / "lod.json").write_text(json.dumps({"config": config, "levels": [asdict(level) for level in levels]}))
     return folder
 
 
@@ -123,6 +136,12 @@ def test_levels_of_detail_without_the_tree_begin_with_billboards(tmp_path: Path,
     tree = open_results(lod_folder(tmp_path / "lod", known_cloud, original=False))
     assert [(level.name, level.scale) for level in tree.levels] == [("2 billboards", math.inf), ("1 billboard", pytest.approx(25.0))]
     assert tree.original.glb is not None  # to compare with
+
+
+def test_levels_of_a_thinned_out_tree_are_a_note(tmp_path: Path, known_cloud: BillboardCloud) -> None:
+    tree = open_results(lod_folder(tmp_path / "lod", known_cloud, original=False, thinned=True))
+    assert [level.name for level in tree.levels] == ["2 billboards", "1 billboard"]
+    assert tree.notes == ("not shown here: the tree thinned out to 1,234 triangles",)
 
 
 @pytest.mark.parametrize("text", ["{", "{}", '{"config": {"screen_height": 1, "screen_fov_degrees": 50}, "levels": []}'])
