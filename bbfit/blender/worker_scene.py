@@ -36,6 +36,7 @@ def open_tree(path: str, files: list[str]) -> tuple[np.ndarray, dict[str, Any]]:
         raise InputRefused("Blender", f"its module bpy cannot be loaded ({error})", "install the missing library") from error
     load(path)
     check_files(path, files)
+    check_pictures(path)
     show_what_renders()
     points, faces = measure(path)
     add_plain_material()
@@ -78,6 +79,24 @@ def check_files(path: str, files: list[str]) -> None:
         if file.exists() and not file.is_dir() and str(file) not in files:
             hint = "put all files into one folder, or export the tree as one .glb file"
             raise InputRefused("tree", f"{path} refers to {name}, which bbfit did not find in its folder", hint)
+
+
+def check_pictures(path: str) -> None:
+    """Refuse a tree with a material whose picture is missing or damaged: Blender would show it in magenta."""
+    import bpy
+
+    for material in bpy.data.materials:
+        trees, seen = [material.node_tree] if material.node_tree else [], set()
+        while trees:
+            tree = trees.pop()
+            for node in tree.nodes if tree.name not in seen else ():
+                trees += [node.node_tree] if getattr(node, "node_tree", None) else []
+                image = getattr(node, "image", None)
+                if image is not None and image.source == "FILE" and not image.size[0] and any(out.is_linked for out in node.outputs):
+                    name = image.filepath or image.name
+                    hint = "put the picture where the tree expects it, or remove it from the material"
+                    raise InputRefused("tree", f"{path}: the picture {name} of {material.name} is missing or cannot be read", hint)
+            seen.add(tree.name)
 
 
 def append_scene(path: str) -> None:

@@ -280,9 +280,8 @@ class FitConfig:
         if self.translucency and self.light != "maps":
             fail("translucency", "it is one of the maps", "add --light maps")
         if self.least_billboards > self.most_billboards:
-            fail(
-                "least_billboards", f"{self.least_billboards} are more than most_billboards allows, {self.most_billboards}", "exchange them"
-            )
+            problem = f"{self.least_billboards} are more than most_billboards allows, {self.most_billboards}"
+            fail("least_billboards", problem, "lower it too")
         preset, given = _PRESETS[self.preset], {name: value for name, value in vars(self).items() if value is not None}
         alpha = given.get("alpha", preset["alpha"])
         values = _BY_ALPHA[alpha] | preset | given

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,8 @@ from bbfit.forest.placements import Placements
 from bbfit.forest.prototypes import read_prototype
 from bbfit.forest.tiles import FOREST_FILE, TILES, ForestTile, leaves, read_tile, write_tiles
 from bbfit.forest.tileset import JOURNAL, SCHEMA, SHARED, TILESET, write_tileset
-from bbfit.forest.usd_stage import STAGE, TEXTURES, TREES, USD_JOURNAL, USD_TILES, check_usd, write_usd
-from bbfit.forest.web_page import PAGE_FILES, PageConfig, write_page
+from bbfit.forest.usd_stage import STAGE, TEXTURES, TREES, USD_JOURNAL, USD_TILES, check_usd, check_usd_textures, write_usd
+from bbfit.forest.web_page import PAGE_FILES, PageConfig, check_page_textures, write_page
 from bbfit.inputs import InputLimits, reading
 from bbfit.library.manifest import LIBRARY_FILE, Library, read_library
 from bbfit.model_files import generator
@@ -102,7 +102,7 @@ def build_forest(
     if "usd" in config.formats:
         check_usd()
     trees = read_library(library, limits)
-    _check_trees(trees, limits)
+    _check_trees(trees, limits, config.formats)
     inputs = [path for path in (source, scatter.scatter_area, config.species_table) if path is not None]
     for path in inputs:
         limits.at_most("max_input_bytes", "placements", path, path.stat().st_size, "bytes")
@@ -221,7 +221,7 @@ class _Stages:
     def _write_tiles(self, forest: Forest, key: str, on_progress: OnProgress) -> None:
         out = output_folder("out", self._folder / "tiles")
         names = [species.name for species in forest.species]
-        write_tileset(out, (self._folder, forest.root, forest.origin, names), self._library, self._config, key, on_progress)
+        write_tileset(out, (self._folder, forest.root, forest.origin, names), self._library, self._config, self._limits, key, on_progress)
 
     def _write_usd(self, forest: Forest, key: str, on_progress: OnProgress) -> None:
         out = output_folder("out", self._folder / "usd")
@@ -237,16 +237,19 @@ class _Stages:
             done += len(placements)
             return placements
 
-        write_page(self._folder, self._library, forest.root, read, PageConfig(self._config.title))
+        write_page(self._folder, self._library, forest.root, read, PageConfig(self._config.title), self._limits)
 
 
-def _check_trees(library: Library, limits: InputLimits) -> None:
-    """Require that every tree can be used, before any work."""
+def _check_trees(library: Library, limits: InputLimits, formats: Sequence[Format]) -> None:
+    """Require that every tree can be used, and shown by each format, before any work."""
     for number, tree in enumerate(library.trees):
         if not tree.levels or tree.height <= 0 or not all(low < high for low, high in zip(tree.low, tree.high, strict=True)):
             fail("library", f"{library.folder}: the tree {tree.name} has no levels or no size", "build the library again")
         for level in range(len(tree.levels)):
-            read_prototype(library, number, level, limits)
+            prototype = read_prototype(library, number, level, limits)
+            for name, check in (("usd", check_usd_textures), ("page", check_page_textures)):
+                if name in formats:
+                    check(prototype.document, tree.name)
 
 
 def _tile(stored: dict[str, Any]) -> ForestTile:

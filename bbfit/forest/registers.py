@@ -108,7 +108,7 @@ class Register:
                         problem = f"{self.path}, row {number} has {len(cells)} cells, and the header has {len(header)}"
                         fail("placements", problem, f"put cells that contain {delimiter!r} into quotes")
                     if any(cells):
-                        yield number, dict(zip(header, cells, strict=False)), None
+                        yield number, dict(reversed([*zip(header, cells, strict=False)])), None  # of two columns of a name the first counts
             except UnicodeDecodeError as error:
                 encoding = "utf-16" if error.object[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "latin-1"
                 fail("placements", f"{self.path} is no text in {self._config.encoding} ({error.reason})", f"try --encoding {encoding}")

@@ -50,6 +50,7 @@ def write_tileset(
     forest: tuple[Path, ForestTile, Origin, Sequence[str]],
     library: Library,
     config: ForestConfig,
+    limits: InputLimits,
     key: str,
     on_progress: OnProgress,
 ) -> None:
@@ -63,7 +64,7 @@ def write_tileset(
         if not journal.known:
             (out / TILESET).unlink(missing_ok=True)  # until all tiles are there, the folder is no tileset
             remove_results(out, "*.glb", f"{SHARED}/*")
-        writer = _Writer(out, folder, origin, _names(species, library), library, config, journal)
+        writer = _Writer(out, folder, origin, _names(species, library), library, config, limits, journal)
         writer.write_shared()
         total, done = _size(root), 0
 
@@ -103,9 +104,11 @@ class _Writer:
         names: tuple[dict[str, int], NDArray[np.int64], NDArray[np.int64]],
         library: Library,
         config: ForestConfig,
+        limits: InputLimits,
         journal: Journal,
     ) -> None:
         self._out, self._folder, self._origin, self._library, self._config, self._journal = out, folder, origin, library, config, journal
+        self._limits = limits
         self._names, self._of_species, self._of_tree = names
         self._prototypes = dict[tuple[int, int], Prototype]()
         self._uris = dict[Path | str, str]()
@@ -127,7 +130,7 @@ class _Writer:
         """Write the files that tiles share: the geometry and the pictures of the trees, and the schema of their properties."""
         for tree, described in enumerate(self._library.trees):
             for level in range(len(described.levels)):
-                prototype = read_prototype(self._library, tree, level, InputLimits())
+                prototype = read_prototype(self._library, tree, level, self._limits)
                 binary = f"{SHARED}/{prototype.name}.bin"
                 self._uris[prototype.name] = relative_uri(binary)
                 write_bytes(self._out / binary, prototype.binary)

@@ -208,12 +208,16 @@ def _write_material(stage: Any, out: Path, prototype: Prototype, number: int, te
     return material
 
 
+def check_usd_textures(document: Mapping[str, Any], name: str) -> None:
+    """Require that the textures of the tree ``name``, whose glTF is ``document``, are PNG or JPEG, which USD knows. Raises InputError."""
+    if any("source" not in texture for texture in document.get("textures", [])):
+        fail("usd", f"the tree {name} of the library has no PNG or JPEG texture", "build the library with PNG too")
+
+
 def _texture(out: Path, prototype: Prototype, index: int, textures: set[str]) -> str:
     """The address of a texture, relative to the trees, after it was copied. USD knows PNG and JPEG."""
     texture = prototype.document["textures"][index]
-    source = texture.get("source")
-    if source is None:
-        fail("usd", f"the tree {prototype.name} of the library has no PNG or JPEG texture", "build the library with PNG too")
+    source = texture["source"]  # check_usd_textures
     file, image = prototype.images[source], prototype.document["images"][source]
     if file is None:
         view = prototype.document["bufferViews"][image["bufferView"]]

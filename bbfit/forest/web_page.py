@@ -7,7 +7,7 @@ import html
 import json
 import math
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -61,7 +61,14 @@ class PageConfig:
     """The largest file of a level of detail that the page loads. Finer levels are left out."""
 
 
-def write_page(folder: Path, library: Library, root: ForestTile, read: Read, config: PageConfig | None = None) -> Path:
+def write_page(
+    folder: Path,
+    library: Library,
+    root: ForestTile,
+    read: Read,
+    config: PageConfig | None = None,
+    limits: InputLimits | None = None,
+) -> Path:
     """Write the page of a forest to ``folder/page``, and return its ``index.html``, which opens by a double click.
 
     The page loads a tile's placements when the camera comes near, and a tree's levels of detail when a copy needs them. ``root`` is the
@@ -89,7 +96,7 @@ def write_page(folder: Path, library: Library, root: ForestTile, read: Read, con
     distance = config.draw_distance or near_distance(tiles)
     data = {
         "screen": {"height": library.screen.height, "fov": library.screen.fov_degrees},
-        "trees": [_tree(index, library, page, packed, config) for index in range(len(library.trees))],
+        "trees": [_tree(index, library, page, packed, config, limits or InputLimits()) for index in range(len(library.trees))],
         "tiles": [{"name": tile.name, "low": tile.low, "high": tile.high, "count": tile.count} for tile in tiles],
         "ground": {"low": low, "high": high, "cells": CELLS},
         "drawDistance": distance,
@@ -158,7 +165,7 @@ def _crown_area(tree: LibraryTree) -> float:
     return math.pi / 4 * (tree.high[0] - tree.low[0]) * (tree.high[2] - tree.low[2])
 
 
-def _tree(index: int, library: Library, page: Path, packed: dict[Path, str], config: PageConfig) -> dict[str, Any]:
+def _tree(index: int, library: Library, page: Path, packed: dict[Path, str], config: PageConfig, limits: InputLimits) -> dict[str, Any]:
     """What the page knows of a tree; writes its levels, and the pictures that are not ``packed`` yet."""
     tree, levels = library.trees[index], []
     for number, level in enumerate(tree.levels):
@@ -170,7 +177,7 @@ def _tree(index: int, library: Library, page: Path, packed: dict[Path, str], con
         pack = f"models/{index}-{number}"
         _write_pack(page, pack, glb)
         pictures = dict[str, str]()
-        for uri, picture in _pictures(path, glb, library).items():
+        for uri, picture in _pictures(path, glb, library, limits).items():
             if picture not in packed:
                 packed[picture] = f"pictures/{len(packed)}"
                 with reading("library", picture, _HINT):
@@ -181,16 +188,26 @@ def _tree(index: int, library: Library, page: Path, packed: dict[Path, str], con
     return {"name": tree.name, "low": tree.low, "high": tree.high, "levels": levels}
 
 
-def _pictures(path: Path, glb: bytes, library: Library) -> dict[str, Path]:
+def check_page_textures(document: Mapping[str, Any], name: str) -> None:
+    """Require that the page reads the textures of the tree ``name``, whose glTF is ``document``. Raises InputError."""
+    if any(_source(texture) is None for texture in document.get("textures", [])):
+        fail("page", f"the tree {name} of the library has KTX2 textures alone, which the page does not read", "build it with PNG textures")
+
+
+def _source(texture: Mapping[str, Any]) -> int | None:
+    """The picture of a texture that the page reads: PNG, JPEG or WebP."""
+    source: int | None = texture.get("source", texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source"))
+    return source
+
+
+def _pictures(path: Path, glb: bytes, library: Library, limits: InputLimits) -> dict[str, Path]:
     """The pictures beside a GLB that its textures show, by their addresses in the GLB."""
     content, _ = gltf_parts(glb, "library", path)
-    found, limits = dict[str, Path](), InputLimits()
+    check_page_textures(content, path.stem)
+    found = dict[str, Path]()
     with reading("library", path, _HINT):
         for texture in content.get("textures", []):
-            source = texture.get("source", texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source"))
-            if source is None:
-                fail("library", f"{path} has KTX2 textures alone, which the page does not read", "build the library with PNG textures")
-            uri = content["images"][source].get("uri")
+            uri = content["images"][_source(texture)].get("uri")
             if uri is not None and not uri.startswith("data:"):
                 found[uri] = limits.referenced("library", path, unquote(uri), library.folder).resolve()
     return found

@@ -79,10 +79,13 @@ class FieldPage:
 
 @contextmanager
 def open_pages(config: FramesConfig) -> Iterator[Mapping[Program, FieldPage]]:
-    """A page for each program. Raises InputError if playwright, a browser or a program is not installed.
+    """A page for each program that draws in a browser. Raises InputError if playwright, a browser or a program is not installed.
 
     The browser is driven from a thread of its own, because playwright refuses threads with an event loop, such as those of notebooks.
     """
+    if not any(PACKAGES[program] for program in config.programs):
+        yield {}
+        return
     try:
         from playwright.sync_api import sync_playwright
     except ImportError:

@@ -16,6 +16,7 @@ from typing import Any
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.fields import render_field
+from bbfit.blender.processes import require_bpy
 from bbfit.checks import check_record, fail
 from bbfit.exporting.lod import glb_counts
 from bbfit.files import read_json, write_bytes, write_json
@@ -27,7 +28,7 @@ from bbfit.frames.fields import Bounds, planted
 from bbfit.frames.models import DrawnModel, drawn_models
 from bbfit.inputs import InputLimits, reading
 from bbfit.outputs import claimed_folder, output_folder
-from bbfit.provenance import digest_file
+from bbfit.provenance import digest_file, installed_version
 from bbfit.reporting.frame_tables import FRAMES_FILE, FrameCosts, FrameRow, Machine, frames_csv, frames_json, frames_markdown, frames_plot
 from bbfit.scratch import ScratchFolder
 from bbfit.stages.stage import OnProgress, Record, Stage, silent
@@ -92,6 +93,8 @@ def measure_frames(
     config, limits, on_progress = config or FramesConfig(), limits or InputLimits(), on_progress or silent
     models, views = drawn_models(sources, limits)
     tree = None if tree is None else TreeFile.open(tree, limits)
+    if "cycles" in config.programs:
+        require_bpy()
     if ORIGINAL in [model.name for model in models]:
         fail("sources", f"{ORIGINAL} is the name of the tree itself", "rename the file")
     with claimed_folder("out", out) as folder, open_pages(config) as pages:
@@ -150,7 +153,7 @@ class _Fields:
             for pixels in config.tree_heights:
                 error = self._error(pixels, files)
                 name = f"fields/{program}_{model.name}_{pixels}"
-                inputs = (files, model.distances, self._bounds, _fields_of(config, program), pixels, renderer)
+                inputs = (files, model.distances, self._bounds, _fields_of(config, program), pixels, renderer, self._version(program))
                 measure = self._render if program == "cycles" else partial(self._measure, program)
                 work = partial(self._store, name, partial(measure, pixels, on_progress))
                 outputs = (f"{name}.json", f"{name}.png")
@@ -172,7 +175,9 @@ class _Fields:
             found = size_error(model, page, views, pixels, self._config.error_views)
             write_json(self._record.folder / name, None if found is None else asdict(found))
 
-        inputs = (files, model.distances, self._views.fingerprint, pixels, self._config.error_views, self._machine.browser)
+        pictures = [[digest_file(path) for path in each if path.is_file()] for each in model.pictures]
+        drawn = (self._views.fingerprint, pixels, self._config.error_views, self._machine.browser, self._version("three"))
+        inputs = (files, model.distances, pictures, *drawn)
         self._record.run(Stage(f"error {model.name} {pixels}", inputs, (name,), work, algorithm="frames"))
         stored = read_json("frames", self._record.folder / name)
         if stored is None:
@@ -181,6 +186,10 @@ class _Fields:
             error = SizeError(**stored)
             check_record("error", error, SizeError)
         return {"flip": error.flip, "psnr": error.psnr, "error_pixels": error.tree_pixels}
+
+    def _version(self, program: Program) -> str | None:
+        """The version of a program."""
+        return installed_version("bpy") if program == "cycles" else self._pages[program].call("machine")["version"]
 
     def _store(self, name: str, measure: Callable[[], tuple[list[dict[str, Any]], bytes]], _: OnProgress = silent) -> None:
         """Store the rows of a program and height, and a picture of the field with the fewest trees."""
@@ -192,7 +201,7 @@ class _Fields:
         """Draw more and more trees of a height until a frame takes too long."""
         page, model, config = self._pages[program], self._model, self._config
         self._load(page)
-        version, rows, picture = page.call("machine")["version"], list[dict[str, Any]](), b""
+        version, rows, picture = self._version(program) or program, list[dict[str, Any]](), b""
         for number, count in enumerate(config.counts):
             report(f"{model.name}, {pixels} px, {program}", number, len(config.counts), f"{count:,} trees")
             field = planted(self._bounds, pixels, count, config)

@@ -184,7 +184,7 @@ def _export(record: dict[str, Any]) -> ExportConfig:
 
 
 def _views(folder: Path, record: dict[str, Any]) -> Path | None:
-    near = [folder / "views", folder.parent / "views", *([Path(record["source"])] if record else [])]
+    near = [folder / "views", *([Path(record["source"])] if record else []), folder.parent / "views"]
     return next((path for path in near if path.is_dir()), None)
 
 

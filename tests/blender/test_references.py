@@ -159,6 +159,26 @@ def test_a_device_within_an_allowed_folder_is_not_opened(tmp_path: Path) -> None
         TreeFile.open(tmp_path / "a.obj", InputLimits(allow_folders=(Path("/dev"),)))
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("tree.obj", None),
+        ("tree.blend", None),
+        ("tree.obj", b"garbage"),
+        ("tree.fbx", b"garbage"),
+        ("tree.usda", b"garbage"),
+        ("tree.blend", b"garbage"),
+    ],
+)
+def test_a_picture_that_is_missing_or_damaged_is_named(trees: Path, tmp_path: Path, name: str, content: bytes | None) -> None:
+    """Blender would show the material in magenta."""
+    (trees / TEXTURE).unlink()
+    if content is not None:
+        (trees / TEXTURE).write_bytes(content)
+    with pytest.raises(InputError, match=r"leaf.* is missing or cannot be read; put the picture where"):
+        render_views(trees / name, tmp_path / "views", ViewsConfig(**SMALL))
+
+
 def test_a_damaged_usd_or_blend_is_refused_in_one_line(trees: Path) -> None:
     for name in ("tree.usdc", "tree.usdz", "tree.usda", "tree.blend", "library.blend"):
         data = (trees / name).read_bytes()

@@ -28,6 +28,7 @@ from bbfit.forest.placements import Placements, matrices, quaternions
 from bbfit.forest.registers import ROW
 from bbfit.forest.tiles import ForestTile, leaves
 from bbfit.glb import gltf_parts, joined_glb, split_glb
+from bbfit.inputs import InputLimits
 from bbfit.library.manifest import read_library
 
 SCATTER = ScatterConfig(scatter=(220, 160), spacing=7, mix=("oak=2", "birch=1"))
@@ -377,6 +378,27 @@ def test_a_library_with_a_damaged_tree_is_refused_before_anything_is_written(dam
     with pytest.raises(InputError, match="^library: .*" + message) as caught:
         build_forest(register(tmp_path), library, tmp_path / "out")
     assert len(str(caught.value).splitlines()) == 1 and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("usd", "the tree oak .* has no PNG or JPEG"), ("page", "the tree oak .* KTX2 textures alone")]
+)
+def test_textures_that_a_format_cannot_show_are_refused_before_any_work(name: Any, message: str, tmp_path: Path) -> None:
+    without = replaced(b'"source":0', b'"sourcx":0')
+    library = damaged(tmp_path / "library", lambda folder: without(folder / "trees" / "oak_LOD1.glb"))
+    with pytest.raises(InputError, match=f"^{name}: {message}"):
+        build_forest(register(tmp_path), library, tmp_path / "out", ForestConfig(formats=("glb", name)))
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_format_reads_pictures_in_allowed_folders(tmp_path: Path) -> None:
+    small_library(tmp_path / "library")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "library" / "atlas.png").rename(tmp_path / "elsewhere" / "atlas.png")
+    (tmp_path / "library" / "atlas.png").symlink_to(tmp_path / "elsewhere" / "atlas.png")
+    limits, formats = InputLimits(allow_folders=(tmp_path / "elsewhere",)), ("glb", "tiles", "usd", "page")
+    forest = build_forest(register(tmp_path), tmp_path / "library", tmp_path / "out", ForestConfig(formats=formats), limits=limits)
+    assert (forest.folder / "page" / "index.html").is_file() and (forest.folder / "tiles" / "tileset.json").is_file()
 
 
 @pytest.mark.parametrize(

@@ -124,6 +124,11 @@ TABLES = {
 }
 
 
+def test_of_two_columns_of_one_name_the_first_counts(tmp_path: Path) -> None:
+    _, rows = read(table(tmp_path, "x,y,height,height\n1,2,3,9\n4,5,6\n"))
+    assert rows["height"].tolist() == [3, 6]
+
+
 @pytest.mark.parametrize("name", TABLES)
 def test_bad_rows_are_named(name: str, tmp_path: Path) -> None:
     text, message = TABLES[name]

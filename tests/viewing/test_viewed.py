@@ -42,6 +42,11 @@ def test_a_run_has_its_tree_and_its_billboards(small_run: Path) -> None:
     np.testing.assert_allclose(tree.bounds, known, atol=0.6)
 
 
+def test_views_beside_a_run_of_other_views_are_not_its_views(copied: Path) -> None:
+    (copied.parent / "views").mkdir()
+    assert open_results(copied).views == (DATA / "views").resolve()
+
+
 def edited(folder: Path, change: dict[str, Any]) -> Path:
     """The folder, with changes to its run.json; those of ``config`` are merged into it."""
     record = json.loads((folder / "run.json").read_text())
