@@ -248,7 +248,7 @@ def fitted(
     record.head["config"]["export"]["up"] = exports[-1].up
     if config.budget.given:
         record.run(budget_stage(folder, views, tree, fit_config, config.budget, exports[-1]), on_progress)
-        fit_config, met = read_choice(folder)
+        fit_config, met = read_choice(folder, config.fit)
         missed = None if met else config.budget.target_psnr
         record.head["config"]["fit"] = _plain(asdict(fit_config))  # the fit uses the chosen configuration
     max_bytes = config.budget.most_bytes
@@ -288,7 +288,7 @@ def prepare(
     elif config.species is not None or replace(config.grow, seed=0) != RunConfig().grow:
         fail("run", f"{path} is given, so no tree is grown", "omit the species and the options for growing")
     elif views_folder is not None:
-        views = ViewDataset.load(views_folder, seed=config.fit.seed, limits=config.limits)
+        views = ViewDataset.load(views_folder, limits=config.limits)  # every fit and every score have one split
         mesh = None if config.tree is None else TreeFile.open(config.tree, config.limits)
         if mesh is not None:
             mesh.check_is_mesh()

@@ -7,6 +7,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,12 +19,17 @@ from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
+from bbfit.fitting.loop import fit_inputs
 from bbfit.geometry.cloud import BillboardCloud
+from bbfit.geometry.light import Light
 from bbfit.glb import split_glb
 from bbfit.images import read_rgba
+from bbfit.layout import TEST_FILE
 from bbfit.outputs import WRITTEN_FILE
 from bbfit.pipeline import RunConfig, RunResult, run
+from bbfit.stages.billboards import read_choice
 from bbfit.stages.recorded import as_in_run
+from bbfit.views.dataset import ViewDataset
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
 CONFIG = RunConfig(fit=FitConfig(billboards=2, candidates=2, refinement_rounds=0, steps=20, checkpoint_every=5))
@@ -88,6 +94,30 @@ def test_only_what_depends_on_a_change_is_done_again(views_folder: Path, tmp_pat
     for damage in ("{", '{"stages": {"fit": {"inputs": 3}, "evaluate": 5, "old": {"x": 1}}}'):
         (tmp_path / "run.json").write_text(damage)
         assert run(views_folder, tmp_path, other).skipped == ()
+
+
+def test_runs_and_scores_share_the_split_of_views_without_one(views_folder: Path, tmp_path: Path) -> None:
+    """Whatever the seed of the fit: otherwise bbfit evaluate would score it on views that it was fitted to."""
+    views = Path(shutil.copytree(views_folder, tmp_path / "views"))
+    (views / TEST_FILE).unlink()
+    run(views, tmp_path / "out", dataclasses.replace(CONFIG, fit=dataclasses.replace(CONFIG.fit, seed=5)))
+    scored = [view["name"] for view in json.loads((tmp_path / "out" / "metrics.json").read_text())["views"]]
+    assert sorted(scored) == sorted(ViewDataset.load(views).test.names)
+
+
+def test_a_choice_is_fitted_on_the_device_of_the_command(tmp_path: Path) -> None:
+    chosen = FitConfig(billboards=3, device="cuda:7", checkpoint_every=9).resolve()
+    (tmp_path / "pareto.json").write_text(json.dumps({"config": dataclasses.asdict(chosen), "met": True}))
+    assert read_choice(tmp_path, FitConfig(device="cpu:0")) == (dataclasses.replace(chosen, device="cpu:0", checkpoint_every=250), True)
+
+
+def test_maps_depend_on_the_light_of_the_views() -> None:
+    def inputs(strength: float) -> object:
+        light = Light.of(torch.tensor([[0.0, 1.0, 0.0]]), strength, 1.0)
+        views = SimpleNamespace(train=SimpleNamespace(light=light, fingerprint="a"), lit_train=SimpleNamespace(fingerprint="b"))
+        return fit_inputs(views, FitConfig(light="maps"), None)  # type: ignore[arg-type]
+
+    assert inputs(1.0) == inputs(1.0) != inputs(2.0)
 
 
 def test_a_report_shows_an_atlas_that_webp_cannot_hold(views_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -120,11 +120,15 @@ def check_budget(config: FitConfig, budget: BudgetConfig) -> None:
         )
     if config.preset != "default":
         fail("preset", f"{config.preset!r} cannot be combined with a budget", "leave out one of them")
-    if budget.vertices is not None and budget.vertices < _vertices(config):
-        fail("vertices", f"{budget.vertices} are too few for one billboard of sides {config.sides!r}", "allow more, or sides one")
-    least = _least(config) * _vertices(config) // 4
-    if budget.most_texels is not None and budget.most_texels < least:
-        fail("texels", f"{budget.most_texels} are too few for {least} textures", "allow more")
+    least = _least(config)
+    named = "one billboard" if least == 1 else f"{least} billboards"
+    if budget.vertices is not None and budget.vertices < least * _vertices(config):
+        fail("vertices", f"{budget.vertices} are too few for {named} of sides {config.sides!r}", "allow more, or sides one")
+    if config.most_billboards < least:
+        fail("most_billboards", f"{config.most_billboards} are too few for {named}, one of them for the crown", "allow more")
+    textures = least * _vertices(config) // 4
+    if budget.most_texels is not None and budget.most_texels < textures:
+        fail("texels", f"{budget.most_texels} are too few for {textures} textures", "allow more")
     config.resolve()
 
 
@@ -155,8 +159,8 @@ def _vertices(config: FitConfig) -> int:
 
 
 def _least(config: FitConfig) -> int:
-    """The fewest billboards of a choice: one shows the crown."""
-    return 1 + (config.trunk_billboards or 0)
+    """The fewest billboards of a choice: one shows the crown. Evenly placed billboards know no trunk."""
+    return 1 + (0 if config.placement == "even" else config.trunk_billboards or 0)
 
 
 class _Chooser:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal, DecimalException
 from typing import Annotated
 
 from bbfit.checks import Range, check_count, check_fields, fail
@@ -68,7 +68,7 @@ def amount(name: str, value: int | str) -> int:
     factor = _FACTORS.get(value[-1:].lower(), 1)
     try:
         number = Decimal(value if factor == 1 else value[:-1]) * factor
-    except InvalidOperation:
+    except DecimalException:
         fail(name, f"{value!r} is no number", "write for example 200000, 200k or 1.5M")
     if not number.is_finite() or abs(number) > _MOST or number != int(number):
         fail(name, f"{value!r} is not a whole number", "write for example 200000, 200k or 1.5M")

@@ -232,7 +232,10 @@ def _report_map_step(
 
 def fit_inputs(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> tuple[Any, ...]:
     """Return the inputs that determine the result of :func:`fit`: configuration, training views, and the mesh if the placement uses it."""
-    lit = views.lit_train.fingerprint if config.light == "maps" and views.lit_train is not None else None
+    lit: list[Any] | None = None
+    if config.light == "maps" and views.lit_train is not None:
+        baked = {} if views.train.light is None else vars(views.train.light)
+        lit = [views.lit_train.fingerprint, *(value.tolist() for value in baked.values())]
     return config, views.train.fingerprint, lit, None if tree is None or config.placement == "even" else tree.digest
 
 

@@ -61,8 +61,8 @@ def trunk_top(inside: Tensor) -> int | None:
 def trunk_points(points: Tensor, views: ViewSet) -> Tensor:
     """Select the points, float64 [P, 3], that views show below the crown (:func:`trunk_top`). Returns their indices, int64.
 
-    Of the views from near the horizon, at most 24 are used, and three quarters of those that show a trunk below the crown must agree on a
-    point. There are no such points if fewer than half of the views show a trunk, and if there are fewer than 12 points.
+    Of the views from near the horizon, 24 to 47 are used if there are more, and three quarters of those that show a trunk below the crown
+    must agree on a point. There are no such points if fewer than half of the views show a trunk, and if there are fewer than 12 points.
     """
     level = [index for index in torch.nonzero(is_level(views.cameras))[:, 0].tolist() if views.shows(index)]
     level = level[:: max(1, len(level) // _VIEWS)]

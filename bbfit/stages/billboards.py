@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import time
 from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -18,7 +19,7 @@ from bbfit.files import read_json, write_bytes, write_json
 from bbfit.fitting.config import FitConfig, ResolvedFit
 from bbfit.fitting.loop import Step, fit, fit_inputs
 from bbfit.inputs import reading
-from bbfit.provenance import VERSIONS
+from bbfit.provenance import EXECUTION, VERSIONS
 from bbfit.reporting.plots import Cost, loss_plot, pareto_plot
 from bbfit.stages.stage import OnProgress, Stage
 from bbfit.tree_files.tree_file import TreeFile
@@ -56,12 +57,16 @@ def budget_stage(
     return stage
 
 
-def read_choice(folder: Path) -> tuple[ResolvedFit, bool]:
-    """The configuration that a finished budget stage chose, and whether it reached the target PSNR (true without a target)."""
+def read_choice(folder: Path, given: FitConfig) -> tuple[ResolvedFit, bool]:
+    """The configuration that a finished budget stage chose, and whether it reached the target PSNR (true without a target).
+
+    Options that do not change results, such as the device, are those of ``given``: the stage may have run with others.
+    """
     path = folder / "pareto.json"
     content = read_json("budget", path)
     with reading("budget", path, "remove it to choose anew"):
-        config = ResolvedFit(**content["config"])
+        execution = {entry.name: getattr(given, entry.name) for entry in fields(FitConfig) if entry.metadata == EXECUTION}
+        config = ResolvedFit(**(content["config"] | execution))
         check_record("met", content["met"], bool)
         return config, content["met"]
 
@@ -93,11 +98,13 @@ def fit_stage(
             on_progress("place", done, total)
 
         result = fit(views, config, tree=tree, checkpoint=checkpoint, on_step=after, on_place=on_place)
-        cloud = result.cloud if limit is None else fitted_within_bytes(views, result, *limit)
+        started = time.perf_counter()
+        cloud = result.cloud if limit is None else fitted_within_bytes(views, result, *limit, on_step=after)
+        seconds = result.seconds + time.perf_counter() - started
         cloud.save(folder / "cloud.safetensors")
         write_bytes(folder / "loss.csv", _loss_table(result.losses))
         loss_plot(result.losses, folder / "loss.png")
-        return result.seconds
+        return seconds
 
     within = None if limit is None else (limit[0], *_sized(limit[1]), VERSIONS["budget"])
     return Stage("fit", (*fit_inputs(views, config, tree), within), FIT_OUTPUTS, work, temporary=(checkpoint.name,))

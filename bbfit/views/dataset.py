@@ -162,6 +162,10 @@ class ViewDataset:
         self.test.check(may_be_empty=True)
         if self.turned is not None:
             self.turned.turned.check(may_be_empty=True)
+        if self.lit_test is not None:
+            for pictures in (self.lit_test.skies, self.lit_test.suns, self.lit_test.albedo, self.lit_test.normal):
+                if pictures is not None:
+                    pictures.check(may_be_empty=True)
 
     @property
     def fingerprint(self) -> str:

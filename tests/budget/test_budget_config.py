@@ -39,6 +39,8 @@ def test_amounts(written: int | str, number: int) -> None:
     [
         ("many", "'many' is no number; write for example 200000, 200k or 1.5M"),
         ("k", "'k' is no number"),
+        ("1e9999999", "'1e9999999' is no number"),
+        ("1e9999999M", "'1e9999999M' is no number"),
         ("", "'' is no number"),
         ("60kb", "'60kb' is no number"),
         ("60 000", "'60 000' is no number"),

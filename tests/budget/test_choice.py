@@ -768,6 +768,18 @@ def test_each_trial_is_told(views: ViewDataset) -> None:
         (FitConfig(), BudgetConfig(vertices=8), 4, "^views: 4 training views are too few for a validation split; give at least 5$"),
         (FitConfig(), BudgetConfig(vertices=8), 1, "^views: 1 training views are too few"),
         (FitConfig(sides="two"), BudgetConfig(vertices=7), 12, "^vertices: 7 are too few for one billboard of sides 'two'; allow more"),
+        (
+            FitConfig(trunk_billboards=3),
+            BudgetConfig(vertices=12),
+            12,
+            "^vertices: 12 are too few for 4 billboards of sides 'one'; allow more",
+        ),
+        (
+            FitConfig(trunk_billboards=3, least_billboards=1, most_billboards=3),
+            BudgetConfig(texels=9000),
+            12,
+            "^most_billboards: 3 are too few",
+        ),
         (FitConfig(sides="pair"), BudgetConfig(vertices=4), 12, "^vertices: 4 are too few for one billboard of sides 'pair'"),
         (FitConfig(), BudgetConfig(bytes=100), 12, r"^budget: 1 billboard with \d,\d+ bytes exceeds it; allow more$"),
     ],

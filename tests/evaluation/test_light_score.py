@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from bbfit.checks import InputError
 from bbfit.evaluation.light import LightScore, score_light
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.model import ShippedModel, shipped_model
@@ -17,6 +18,7 @@ from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.geometry.light import SUNNY, Light, direction
 from bbfit.geometry.orbit import Orbit
+from bbfit.views.dataset import ViewDataset
 from bbfit.views.lit import LitViews
 from bbfit.views.view_set import ViewSet
 
@@ -64,6 +66,16 @@ def lit() -> LitViews:
     x, y, z, alpha = (torch.stack(shown)[..., channel : channel + 1] for channel in (3, 4, 5, 6))
     z_up = torch.cat([(alpha + part) / 2 for part in (x, -z, y)] + [alpha], -1)
     return LitViews(skies, under, (0, 1) * 3, albedo, pictures(list(z_up), "normal", None))
+
+
+def test_a_damaged_picture_under_a_sun_is_found_before_a_fit(lit: LitViews, views_folder: Path) -> None:
+    def damaged(path: Path) -> torch.Tensor:
+        raise InputError(f"image: {path} is cut short")
+
+    views = ViewDataset.load(views_folder)
+    replace(views, lit_test=lit).check()
+    with pytest.raises(InputError, match=r"sun.* is cut short"):
+        replace(views, lit_test=replace(lit, suns=replace(lit.suns, read=damaged))).check()
 
 
 def scored(model: ShippedModel, lit: LitViews, *, baked: bool = False) -> LightScore:

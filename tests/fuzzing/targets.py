@@ -543,7 +543,7 @@ def _read_record(folder: Path) -> None:
         report = Report.load(folder / "metrics.json")
         assert report.mean and json.dumps(report.to_json(), allow_nan=False)
     elif (folder / "pareto.json").is_file():
-        read_choice(folder)
+        read_choice(folder, FitConfig())
     elif (folder / "key.json").is_file():
         Results(folder).get("key")
     elif (folder / REQUEST_FILE).is_file():
