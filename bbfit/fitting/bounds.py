@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bbfit.geometry.alpha import VISIBLE
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.views.view_set import ViewSet
@@ -18,8 +19,6 @@ from bbfit.views.view_set import ViewSet
 _OBLIQUE = math.cos(math.radians(60))
 # Least alpha of a texel that bounds include.
 _OPAQUE = 0.3
-# Least alpha that does not round to 0 in 8 bits.
-_VISIBLE = 0.5 / 255
 # Billboards whose cosines differ by less than this face a view equally well.
 _TIE = 1e-3
 
@@ -95,12 +94,12 @@ def trimmed(cloud: BillboardCloud) -> BillboardCloud:
 
     Transparent billboards are removed. One remains if all of them are transparent.
     """
-    visible = [n for n, texture in enumerate(cloud.textures()) if (texture[..., 3] >= _VISIBLE).any()]
+    visible = [n for n, texture in enumerate(cloud.textures()) if (texture[..., 3] >= VISIBLE).any()]
     if len(visible) < len(cloud):
         cloud = cloud.take(visible or [0])
     parts, middles, sizes, crops = [], [], [], []
     for texture in cloud.textures():
-        mask = (texture[..., 3].amax(0) >= _VISIBLE).numpy().astype(np.uint8)
+        mask = (texture[..., 3].amax(0) >= VISIBLE).numpy().astype(np.uint8)
         x, y, width, height = cv2.boundingRect(mask)
         left, top = max(x - 1, 0), max(y - 1, 0)
         right, bottom = min(x + width + 1, mask.shape[1]), min(y + height + 1, mask.shape[0])

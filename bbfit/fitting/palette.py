@@ -12,12 +12,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bbfit.fitting.config import TRANSPARENT_COLORS
-from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.alpha import VISIBLE, AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, unpremultiply
 
-# Least alpha that does not round to 0 in 8 bits.
-_VISIBLE = 0.5 / 255
 # Texels that the palette is chosen from, those among them that the first colors are, iterations, and the seed of the choice.
 _SAMPLE, _FIRST, _ITERATIONS, _SEED = 40_000, 8_000, 12, 0
 # Of a mask's alpha, differences count within so much of the cutoff, where edges are.
@@ -47,7 +45,7 @@ def few_colors(texels: Tensor, alpha: AlphaMode, count: int) -> Tensor:
 
     Neighboring leaves differ by more than neighboring colors of the palette do, so that no bands show, and no dithering is needed.
     """
-    rounded, visible = (texels * 255).round() / 255, torch.nonzero(texels[:, 3] >= _VISIBLE)[:, 0]
+    rounded, visible = (texels * 255).round() / 255, torch.nonzero(texels[:, 3] >= VISIBLE)[:, 0]
     if len(visible) == 0:
         return rounded
     straight = texels[visible].detach().cpu().float()
@@ -67,7 +65,7 @@ def few_surfaces(cloud: BillboardCloud, count: int) -> Tensor:
     ``count`` - 1 values in the same way.
     """
     assert cloud.surface is not None
-    visible, across = cloud.texels[:, 3] >= _VISIBLE, cloud.surface[:, :2]
+    visible, across = cloud.texels[:, 3] >= VISIBLE, cloud.surface[:, :2]
     if visible.any():
         normals = nearest_means(cloud.tangent_normals, visible, count - 1)
         across = ((normalize(normals, dim=-1)[:, :2] + 1) / 2).clamp(0, 1).to(across)

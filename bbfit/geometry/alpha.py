@@ -11,6 +11,8 @@ from bbfit.checks import Range, check_choice, check_count, check_range, fail
 AlphaKind = Literal["mask", "blend", "hash", "coverage"]
 Cutoff = Annotated[float, Range(0, 1, open_low=True, open_high=True)]
 """Least alpha that shows with mask, in (0, 1)."""
+VISIBLE = 0.5 / 255
+"""Least alpha of a texel that is visible: a smaller one becomes 0 in 8 bits."""
 SAMPLES = 4
 """Samples of a pixel in most programs with multisampling, WebGL among them."""
 
