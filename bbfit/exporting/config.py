@@ -48,6 +48,8 @@ class Program:
     """Whether it reads vertices of integers (KHR_mesh_quantization)."""
 
 
+# Most corners of a polygon unless an option limits them.
+_CORNERS = 8
 _PROGRAMS: dict[Profile | None, Program] = {
     None: Program(split=False),
     "three": Program(quantized=True),
@@ -131,7 +133,7 @@ class ExportConfig:
 
     def compact(self, corners: int) -> ExportConfig:
         """The same options with hulls of at most so many corners, 4 to 8, unless they ask for other outlines."""
-        return replace(self, outline="hull", corners=min(self.corners or 8, corners)) if self.outline is None else self
+        return replace(self, outline="hull", corners=min(self.corners or _CORNERS, corners)) if self.outline is None else self
 
     def outlines(self) -> tuple[ExportConfig, ...]:
         """The same options with each outline that a budget of bytes may draw: from the one that shades fewest pixels, the default's, to the
@@ -140,7 +142,9 @@ class ExportConfig:
         if self.outline is not None:
             return (self,)
         steps: tuple[tuple[Outline, int], ...] = (("pieces", 8), ("pieces", 6), ("pieces", 5), ("hull", 6), ("hull", 5))
-        return tuple(dict.fromkeys(replace(self, outline=outline, corners=min(self.corners or 8, corners)) for outline, corners in steps))
+        return tuple(
+            dict.fromkeys(replace(self, outline=outline, corners=min(self.corners or _CORNERS, corners)) for outline, corners in steps)
+        )
 
     def mipmapped(self, alpha: AlphaMode) -> bool:
         """Whether a model with an alpha mode is read with mip levels."""
@@ -156,7 +160,7 @@ class ExportConfig:
         if isinstance(self, ResolvedExport):
             return self
         chosen: dict[str, Any] = {"split": self.program.split, "material": self.program.material, "textures": "png", "outline": "pieces"}
-        chosen |= {"pieces": 8, "corners": 8, "quantized": self.program.quantized}
+        chosen |= {"pieces": 8, "corners": _CORNERS, "quantized": self.program.quantized}
         chosen |= {name: value for name, value in vars(self).items() if value is not None or name not in chosen}
         if chosen["textures"] == "auto":
             chosen["textures"] = "png" if ktx2_missing() else "ktx2"

@@ -20,7 +20,7 @@ from bbfit.forest.prototypes import read_prototype
 from bbfit.forest.tiles import FOREST_FILE, TILES, ForestTile, leaves, read_tile, write_tiles
 from bbfit.forest.tileset import JOURNAL, SCHEMA, SHARED, TILESET, write_tileset
 from bbfit.forest.usd_stage import STAGE, TEXTURES, TREES, USD_JOURNAL, USD_TILES, check_usd, check_usd_textures, write_usd
-from bbfit.forest.web_page import PAGE_FILES, PageConfig, check_page_textures, write_page
+from bbfit.forest.web_page import PAGE_FILES, PageConfig, check_page_textures, page_loads, write_page
 from bbfit.inputs import InputLimits, reading
 from bbfit.library.manifest import LIBRARY_FILE, Library, read_library
 from bbfit.model_files import generator
@@ -247,9 +247,10 @@ def _check_trees(library: Library, limits: InputLimits, formats: Sequence[Format
             fail("library", f"{library.folder}: the tree {tree.name} has no levels or no size", "build the library again")
         for level in range(len(tree.levels)):
             prototype = read_prototype(library, number, level, limits)
-            for name, check in (("usd", check_usd_textures), ("page", check_page_textures)):
-                if name in formats:
-                    check(prototype.document, tree.name)
+            if "usd" in formats:
+                check_usd_textures(prototype.document, tree.name)
+            if "page" in formats and page_loads(tree, level, (library.folder / tree.levels[level].file).stat().st_size):
+                check_page_textures(prototype.document, tree.name)
 
 
 def _tile(stored: dict[str, Any]) -> ForestTile:

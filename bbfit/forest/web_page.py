@@ -172,7 +172,7 @@ def _tree(index: int, library: Library, page: Path, packed: dict[Path, str], con
         path = library.folder / level.file
         with reading("library", path, _HINT):
             glb = path.read_bytes()
-        if len(glb) > config.level_bytes and number < len(tree.levels) - 1:
+        if not page_loads(tree, number, len(glb), config):
             continue
         pack = f"models/{index}-{number}"
         _write_pack(page, pack, glb)
@@ -186,6 +186,11 @@ def _tree(index: int, library: Library, page: Path, packed: dict[Path, str], con
             pictures[uri] = packed[picture]
         levels.append({"pack": pack, "pictures": pictures, "distance": level.distance_meters})
     return {"name": tree.name, "low": tree.low, "high": tree.high, "levels": levels}
+
+
+def page_loads(tree: LibraryTree, level: int, size: int, config: PageConfig | None = None) -> bool:
+    """Whether the page loads a level of a tree, whose file has ``size`` bytes: it leaves out large ones, but not the coarsest."""
+    return size <= (config or PageConfig()).level_bytes or level == len(tree.levels) - 1
 
 
 def check_page_textures(document: Mapping[str, Any], name: str) -> None:
