@@ -75,14 +75,14 @@ def compare(
     tree = TreeFile.open(tree, stages.limits)
     earlier, requested = _suns(Path(out)), stages.views.suns
     systems, stages = checked_systems(config, stages, earlier or 0)
-    if earlier == 0 and requested == 0 and stages.views.suns:
-        needing = " and ".join(system for system in systems if system in LIT)
-        fail("systems", f"{needing}: {out}/views has no views under other suns", "choose another output folder, or remove that folder")
     if needs_blender(Path(out)):
         check_blender(stages.views)
     with claimed_folder("out", out) as folder:
         record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
         record.check({"tables": _TABLES} | ({} if tree.suffix in Y_UP_MESHES else {"convert": ("tree.glb",)}))
+        if earlier == 0 and requested == 0 and stages.views.suns:
+            needing = " and ".join(system for system in systems if system in LIT)
+            fail("systems", f"{needing}: {out}/views has no views under other suns", "choose another output folder, or remove that folder")
         return CompareResult(folder, _compared(tree, record, systems, config, stages, on_progress))
 
 
