@@ -204,7 +204,10 @@ def _open_lod(folder: Path, original_bytes: int) -> ViewedTree:
     with_tree, thinned = "tree" in kinds, sorted(kinds - {"tree"})
     converted = folder / "original.glb"
     original = find_original([converted] if converted.is_file() else sources(folder, records[0]), original_bytes)
-    levels = (ViewerLevel(None, math.inf), *coarser) if with_tree and original.glb is not None else tuple(coarser)
+    if with_tree and original.glb is not None:
+        levels = (ViewerLevel(None, math.inf), *coarser)
+    else:  # the finest that is shown is seen from near by
+        levels = (replace(coarser[0], scale=math.inf, halvings=0), *coarser[1:])
     boxes = np.stack([shown_bounds(level.cloud).numpy() for level in coarser if level.cloud is not None])
     return ViewedTree(
         name=folder.resolve().name,

@@ -123,7 +123,7 @@ def lod_folder(folder: Path, cloud: BillboardCloud, *, original: bool = True, th
         cloud.take(range(planes)).save(folder / str(requested) / "cloud.safetensors")
         record = {"source": str(folder / "views"), "config": {"tree": str(DATA / "tree.glb"), "export": {"profile": "three"}}}
         (folder / str(requested) / "run.json").write_text(json.dumps(record))
-        levels.append(lod_level(planes=planes, requested=requested, distance_meters=distance))
+        levels.append(lod_level(planes=planes, requested=requested, distance_meters=distance, halvings=int(distance > 0)))
     config = {"screen_height": 2000, "screen_fov_degrees": 90.0}
     (folder / "levels").mkdir()
     (folder / "levels" / "lod.json").write_text(json.dumps({"config": config, "levels": [asdict(level) for level in levels]}))
@@ -145,7 +145,8 @@ def test_levels_of_detail_without_the_tree_begin_with_billboards(tmp_path: Path,
 
 def test_levels_of_a_thinned_out_tree_are_a_note(tmp_path: Path, known_cloud: BillboardCloud) -> None:
     tree = open_results(lod_folder(tmp_path / "lod", known_cloud, original=False, thinned=True))
-    assert [level.name for level in tree.levels] == ["2 billboards", "1 billboard"]
+    assert [(level.name, level.scale) for level in tree.levels] == [("2 billboards", math.inf), ("1 billboard", pytest.approx(25.0))]
+    assert tree.levels[0].halvings == 0
     assert tree.notes == ("not shown here: the tree thinned out to 1,234 triangles",)
 
 
