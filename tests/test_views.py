@@ -127,6 +127,16 @@ def test_turned_views_go_with_their_views(turned: Path, views_folder: Path) -> N
     views.check()
 
 
+def test_scores_depend_on_the_light_of_the_views(folder: Path) -> None:
+    def lit(color: list[float]) -> ViewDataset:
+        light = {"sun_direction": [0, 1, 0], "sun_strength": 3.0, "sun_color": color, "ambient": 0.4}
+        edit(folder, lambda content: content.update(frames=[frame | {"light": light} for frame in content["frames"]]), ("train", "test"))
+        return ViewDataset.load(folder)
+
+    white, warm = lit([1, 1, 1]), lit([1, 0.8, 0.6])
+    assert white.fingerprint == warm.fingerprint and white.full_fingerprint != warm.full_fingerprint
+
+
 @pytest.mark.parametrize("of", ["./images/0000_none", None, 3, ["a"]])
 def test_turned_from_no_held_out_view_is_refused(turned: Path, of: object) -> None:
     edit(turned, lambda content: content["frames"][1].update(turned_from=of), ("turned",))

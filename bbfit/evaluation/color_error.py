@@ -13,12 +13,12 @@ from bbfit.evaluation.backgrounds import mean_flip_map
 from bbfit.evaluation.scoring import held_out
 from bbfit.geometry.camera import Camera
 from bbfit.images import shrunk
-from bbfit.views.view_set import ViewSet
+from bbfit.views.view_set import ViewSet, evenly
 
 # FLIP's filters reach 10 pixels at 67 pixels a degree; so far, the background around the tree counts.
 _AROUND = 10
-# Most views to compare, and the ratio of neighboring sizes.
-_VIEWS, _STEP = 24, 2**0.25
+# The ratio of neighboring sizes.
+_STEP = 2**0.25
 
 
 def color_error(target: Tensor, image: Tensor) -> float:
@@ -44,9 +44,9 @@ def mean_color_error(draw: Callable[[Camera], Tensor], views: ViewSet, share: fl
     At most 24 views count, evenly spaced. ``draw`` is as for :func:`~bbfit.evaluation.scoring.held_out`. Pictures are drawn at the views'
     size and averaged by area, as a screen with many samples a pixel shows them.
     """
-    count = min(_VIEWS, len(views))
-    pairs = (held_out(draw, views, number * len(views) // count) for number in range(count))
-    return sum(color_error(*(_reduced(picture, share) for picture in pair)) for pair in pairs) / max(1, count)
+    chosen = evenly(range(len(views)))
+    pairs = (held_out(draw, views, index) for index in chosen)
+    return sum(color_error(*(_reduced(picture, share) for picture in pair)) for pair in pairs) / max(1, len(chosen))
 
 
 def share_within(draw: Callable[[Camera], Tensor], views: ViewSet, most: float, share: float = 1.0) -> float:

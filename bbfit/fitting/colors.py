@@ -12,10 +12,10 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import premultiply, unpremultiply
 from bbfit.operators.config import Backend
 from bbfit.rendering.dispatch import render
-from bbfit.views.view_set import ViewSet
+from bbfit.views.view_set import ViewSet, evenly
 
-# Most views to compare. Texels are clamped to [0, 1], and layers hide each other, so one round of factors is not exact.
-_VIEWS, _ROUNDS = 24, 3
+# Texels are clamped to [0, 1], and layers hide each other, so one round of factors is not exact.
+_ROUNDS = 3
 # Largest factor of a channel, and its inverse the smallest.
 _LARGEST = 2.0
 # Texels on a side of the square whose mean color counts, and the least mean alpha there.
@@ -29,7 +29,7 @@ def matched_colors(cloud: BillboardCloud, views: ViewSet, backend: Backend = "au
     are larger than leaves, or few billboards stand in for depth, alpha is too low in the middle of the crown, and a fit of color and alpha
     together makes up for it with colors that are too dark or too strong. Before a background of another color, that shows.
     """
-    indices = [index * len(views) // _VIEWS for index in range(_VIEWS)] if len(views) > _VIEWS else list(range(len(views)))
+    indices = evenly(range(len(views)))
     cameras, target = views.cameras[indices], _mean_color(views.targets([index]) for index in indices)
     if target is None or len(cloud) == 0:
         return cloud

@@ -12,10 +12,10 @@ from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.config import Backend
 from bbfit.rendering.dispatch import render
-from bbfit.views.view_set import ViewSet
+from bbfit.views.view_set import ViewSet, evenly
 
-# Most views to compare, largest shift of alpha, iterations of the bisection, and Gauss-Newton steps.
-_VIEWS, _MAX_SHIFT, _BISECTIONS, _GAUSS_NEWTON_STEPS = 24, 0.3, 8, 2
+# Largest shift of alpha, iterations of the bisection, and Gauss-Newton steps.
+_MAX_SHIFT, _BISECTIONS, _GAUSS_NEWTON_STEPS = 0.3, 8, 2
 # Exponent that spreads alpha. It applies to the distance from the cutoff as a fraction of the largest possible distance.
 _SPREAD = 0.4
 # Largest side of the pictures in which the derivatives of coverage are measured, in pixels, and the slope of the ramp that replaces the
@@ -115,10 +115,8 @@ def scaled_coverage(cloud: BillboardCloud, views: ViewSet, backend: Backend = "a
 
 
 def _compared(views: ViewSet) -> list[int]:
-    """Indices of at most :data:`_VIEWS` views, evenly spaced among those that show something: an empty one has no relative error."""
-    shown = list(filter(views.shows, range(len(views))))
-    count = min(_VIEWS, len(shown))
-    return [shown[index * len(shown) // count] for index in range(count)]
+    """Indices of views, evenly spaced among those that show something: an empty one has no relative error."""
+    return evenly(list(filter(views.shows, range(len(views)))))
 
 
 def _root(excess: Callable[[float], float]) -> float:

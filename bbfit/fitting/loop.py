@@ -29,7 +29,7 @@ from bbfit.fitting.points import placement_points
 from bbfit.fitting.requirements import check_cameras, check_device, check_lights
 from bbfit.fitting.search import find_placement
 from bbfit.fitting.steps import BLEND, HARDEST, Stepper
-from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.alpha import VISIBLE, AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.images import bleed_color
@@ -210,6 +210,8 @@ def fit(
     if config.colors != "joint":
         fitted = matched_colors(smoothed_colors(fitted), views.train, config.backend)
     fitted = palettized(fitted, config.palette)
+    if not bool((fitted.texels[:, 3] >= max(VISIBLE, fitted.alpha.cutoff if config.alpha == "mask" else 0)).any()):
+        fail("fit", "no texel of the result is visible", "lower --least-alpha or --alpha-cutoff, or raise --steps")
     if config.placement != "even" or config.placement_learning_rate:
         fitted = trimmed(fitted)
     try:
@@ -232,10 +234,9 @@ def _report_map_step(
 
 def fit_inputs(views: ViewDataset, config: FitConfig, tree: TreeFile | None) -> tuple[Any, ...]:
     """Return the inputs that determine the result of :func:`fit`: configuration, training views, and the mesh if the placement uses it."""
-    lit: list[Any] | None = None
+    lit: tuple[str, str | None] | None = None
     if config.light == "maps" and views.lit_train is not None:
-        baked = {} if views.train.light is None else vars(views.train.light)
-        lit = [views.lit_train.fingerprint, *(value.tolist() for value in baked.values())]
+        lit = views.lit_train.fingerprint, None if views.train.light is None else views.train.light.fingerprint
     return config, views.train.fingerprint, lit, None if tree is None or config.placement == "even" else tree.digest
 
 

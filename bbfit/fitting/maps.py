@@ -32,13 +32,11 @@ from bbfit.operators.shading.reference import (
 from bbfit.rendering.dispatch import render
 from bbfit.views.dataset import ViewDataset
 from bbfit.views.lit import LitViews
-from bbfit.views.view_set import ViewSet
+from bbfit.views.view_set import ViewSet, evenly
 
 _LEARNING_RATE = 0.05
 # Exposures in a step.
 _BATCH = 2
-# Most cameras whose passes are baked onto the billboards to start from.
-_BAKED = 24
 # The least weight of a texel in those views, in pixels, for which they determine its maps.
 _LEAST_WEIGHT = 1e-3
 # The maps of a texel that no view shows: its normal is the plane's, and nothing hides the sky.
@@ -122,7 +120,7 @@ def baked_maps(cloud: BillboardCloud, lit: LitViews, backend: Backend = "auto") 
     plain = torch.tensor(_PLAIN, dtype=cloud.texels.dtype, device=cloud.texels.device).repeat(len(cloud.texels), 1)
     if lit.albedo is None or lit.normal is None:
         return cloud.texels, plain
-    chosen = [index * len(lit.skies) // _BAKED for index in range(_BAKED)] if len(lit.skies) > _BAKED else list(range(len(lit.skies)))
+    chosen = evenly(range(len(lit.skies)))
     cameras = lit.skies.cameras[chosen].to(cloud.texels.dtype).to(cloud.texels.device)
     color, light, normal = (torch.zeros_like(cloud.texels[:, :3]) for _ in range(3))
     texture = textures_of_texels(cloud).long()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 
 import torch
 from torch import Tensor
@@ -58,6 +59,11 @@ class Light:
     def __getitem__(self, indices: Sequence[int] | Tensor) -> Light:
         """The lights with these indices, a batch."""
         return Light(*(value[indices] for value in vars(self).values()))
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over all values."""
+        return sha256(b"".join(value.contiguous().numpy().tobytes() for value in vars(self).values())).hexdigest()
 
     @staticmethod
     def of(sun_directions: Tensor, sun_strength: float, ambient: float, sun_color: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Light:

@@ -27,6 +27,7 @@ from bbfit.stages.stage import RECORD_FILE
 from bbfit.viewing.levels import ViewerLevel
 from bbfit.viewing.originals import MAX_BYTES, Original, find_original
 from bbfit.views.dataset import ViewDataset
+from bbfit.views.view_set import evenly
 
 LEVELS, CLOUD_FILE = "levels", "cloud.safetensors"
 """The folder of levels of detail in a folder of bbfit lod, and the cloud in a run's folder."""
@@ -159,7 +160,7 @@ def seen_colors(folder: Path | None) -> tuple[SeenColor, ...]:
         views = ViewDataset.load(folder).train
         away = -views.cameras.batch().forward
         found = (away[:, 1].abs() <= away[:, 1].abs().min() + _LEVEL).nonzero()[:, 0].tolist()
-        found = found[:: math.ceil(len(found) / _SEEN)]
+        found = evenly(found, _SEEN)
         sums = [views.targets([index], torch.float64).sum((0, 1, 2)) for index in found]
     except InputError:
         return ()

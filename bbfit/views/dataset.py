@@ -174,10 +174,11 @@ class ViewDataset:
 
     @property
     def full_fingerprint(self) -> str:
-        """SHA-256 over the fingerprints of all pictures that scores depend on: also those of ``turned`` and ``lit_test``."""
+        """SHA-256 over the fingerprints of all that scores depend on: also of ``turned``, ``lit_test``, and the light of the views."""
         turned = "" if self.turned is None else self.turned.views.fingerprint + self.turned.turned.fingerprint
         lit = "" if self.lit_test is None else self.lit_test.fingerprint
-        return sha256(" ".join((self.fingerprint, turned, lit)).encode()).hexdigest()
+        light = "" if self.test.light is None else self.test.light.fingerprint
+        return sha256(" ".join((self.fingerprint, turned, lit, light)).encode()).hexdigest()
 
 
 def _is_own(request: ViewsRequest | None) -> bool:

@@ -19,6 +19,15 @@ from bbfit.geometry.light import Light
 from bbfit.images import premultiply, read_rgba, shrunk, to_bytes
 from bbfit.inputs import InputLimits
 
+# Views that suffice for a mean over all of them.
+SAMPLED_VIEWS = 24
+
+
+def evenly(indices: Sequence[int], most: int = SAMPLED_VIEWS) -> list[int]:
+    """At most ``most`` of the indices of views, evenly spaced, from the first on."""
+    count = min(most, len(indices))
+    return [indices[number * len(indices) // count] for number in range(count)]
+
 
 @dataclass(frozen=True)
 class ViewSet:

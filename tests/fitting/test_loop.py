@@ -30,7 +30,7 @@ from bbfit.fitting.loop import (
 )
 from bbfit.fitting.points import placement_points
 from bbfit.fitting.search import find_placement
-from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.alpha import AlphaKind, AlphaMode
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import over_color
 from bbfit.operators.drawing.reference import render_reference
@@ -256,6 +256,12 @@ def test_a_fit_whose_result_is_not_finite_is_refused(views: ViewDataset, tmp_pat
     with pytest.raises(InputError, match=r"^fit: the result cannot be used \(centers: expected finite values\); check"):
         record.run(fit_stage(tmp_path, views, None, quick(billboards=2, steps=2)))
     assert not record.stages and not (tmp_path / "cloud.safetensors").exists() and not Record(tmp_path).stages
+
+
+@pytest.mark.parametrize("alpha", ["blend", "mask", "coverage", "hash"])
+def test_a_fit_that_shows_nothing_is_refused(views: ViewDataset, alpha: AlphaKind) -> None:
+    with pytest.raises(InputError, match=r"^fit: no texel of the result is visible; lower --least-alpha or --alpha-cutoff"):
+        fit(views, FitConfig(preset="thesis", steps=1, learning_rate=1e-6, least_alpha=1.0, alpha=alpha))
 
 
 def test_held_out_views_are_not_opened(views_folder: Path) -> None:
