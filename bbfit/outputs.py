@@ -98,15 +98,17 @@ def wait_until_free(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def single_files(by: str, folder: Path, names: Sequence[str], inputs: Iterable[Path] = ()) -> Iterator[None]:
+def single_files(by: str, folder: Path, names: Sequence[str], inputs: Iterable[Path] = (), stale: Sequence[str] = ()) -> Iterator[None]:
     """Write files with ``names`` (which may contain ``*``) to any folder, such as that of the user, in the context.
 
-    Raises ``InputError`` if there is such a file already that the command ``by`` did not write, or that has changed since.
+    ``stale`` are further names of files beside earlier results. Those that the command ``by`` wrote and nobody has changed are removed in
+    the end. Raises ``InputError`` if there is a file with one of ``names`` already that ``by`` did not write, or that has changed since.
     """
     written = Written(folder)
     written.begin(by, names, inputs, keep_changed=False)
     try:
         yield
+        written.remove(by, stale)
     finally:
         written.finish(by, written.digests([name for name in names if "*" in name or (folder / name).is_file()]))
 
@@ -225,6 +227,12 @@ class Written:
         if all(path in self._files and self._files[path]["sha256"] == digest_file(self._folder / path) for path in left):
             with contextlib.suppress(InputError), self._changing():  # the folder may be gone, which was the reason
                 self._begun.pop(by, None)
+
+    def remove(self, by: str, names: Sequence[str]) -> None:
+        """Remove files with ``names`` (which may contain ``*``) that ``by`` wrote and nobody has changed."""
+        for path in self._existing(names):
+            if self._files.get(self._relative(path)) == {"by": by, "sha256": digest_file(path)}:
+                path.unlink()
 
     def _existing(self, names: Sequence[str]) -> list[Path]:
         paths = [path for name in names for path in (results(self._folder, name) if "*" in name else [self._folder / name])]

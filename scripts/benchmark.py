@@ -5,12 +5,11 @@ about steps occur once for each device. The rows by name:
 
 grow      growing a tree and writing it as GLB in a separate process; seconds include the import of bbfit
 copy      bytes per second of a plain copy in memory (read plus written)
-step      one training step (render, loss, gradient, update) at the default fit's last level, for evenly placed billboards with a texel
-          per pixel, by the reference renderer and by the fused kernels; one view, and at 1024 x 1024 also the two views of the preset;
-          bound_s is the time in which a plain copy moves the bytes that the step must move
-mask      the same for an antialiased mask with a ramp, as in the middle of a default fit
-thesis    the same for the thesis preset, whose billboards fill the viewport
-parts     milliseconds that the operators of a fused step take, at 1024 x 1024 with four billboards
+steps     four rows: step is one training step (render, loss, gradient, update) at the default fit's last level, for evenly placed
+          billboards with a texel per pixel, by the reference renderer and by the fused kernels; one view, and at 1024 x 1024 also the two
+          views of the preset; bound_s is the time in which a plain copy moves the bytes that the step must move; mask is the same for an
+          antialiased mask with a ramp, as in the middle of a default fit, and thesis for the thesis preset, whose billboards fill the
+          viewport; parts is milliseconds that the operators of a fused step take, at 1024 x 1024 with four billboards
 quality   for each folder of views: the 10,000 steps of the thesis preset by the fused kernels, an estimate of their time by the reference
           renderer (the mean of 50 steps, times 10,000), and the default preset with as many billboards and without a mesh; reached_s is
           the time, including the search for a placement, until that fit reaches the thesis preset's PSNR on the held-out views (checked

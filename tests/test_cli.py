@@ -160,6 +160,13 @@ def test_an_export_knows_the_score_of_its_cloud_alone(fitted: Path, tmp_path: Pa
         (["evaluate", "{tmp}/tree.docx", "{views}"], "tree.docx"),
         (["export", "{cloud}", "--out", "{tmp}/model.stl"], ".glb or .obj"),
         (["export", "{cloud}", "--out", "{tmp}/nowhere/model.glb"], "nowhere"),
+        (["export", "{cloud}", "--out", "{tmp}/model.obj", "--textures", "ktx2"], "textures: an OBJ file has a PNG, not ktx2"),
+        (["export", "{cloud}", "--out", "{tmp}/model.obj", "--quantized"], "quantized: an OBJ file has decimal numbers"),
+        (["export", "{cloud}", "--out", "{tmp}/model.glb", "--up", "z"], "up: a GLB is Y up"),
+        (["export", "{cloud}", "--out", "{tmp}/model.glb", "--no-fallback"], "fallback: PNG is the only texture"),
+        (["export", "{cloud}", "--out", "{tmp}/model.glb", "--outline", "hull", "--pieces", "4"], "pieces: a hull is one polygon"),
+        (["export", "{cloud}", "--out", "{tmp}/model.glb", "--outline", "rectangle", "--corners", "5"], "corners: a rectangle has four"),
+        (["export", "{cloud}", "--out", "{tmp}/model.glb", "--padding", "100000"], "padding: expected a value in [1, 64], got 100000"),
         (["export", "{tmp}/empty.glb", "--out", "{tmp}/model.glb"], "empty.glb"),
     ],
 )
@@ -254,6 +261,10 @@ def test_mip_files_of_a_larger_atlas_are_removed(views_folder: Path, tmp_path: P
     large = levels(tmp_path / "run", "--texel-density", "1")
     small = levels(tmp_path / "run", "--texel-density", "0.1", "--padding", "1")
     assert 0 < len(small) < len(large) and (tmp_path / "planes_map.png").read_text() == "mine"
+    (tmp_path / "planes_mip1.png").write_text("mine")
+    assert main(["export", str(tmp_path / "run" / "cloud.safetensors"), "--out", str(tmp_path / "planes.obj")]) == 0
+    assert sorted(path.name for path in tmp_path.glob("planes_m*.png")) == ["planes_map.png", "planes_mip1.png"]
+    assert (tmp_path / "planes_mip1.png").read_text() == (tmp_path / "planes_map.png").read_text() == "mine"
 
 
 def test_run_within_a_budget_is_fit_within_it(views_folder: Path, tmp_path: Path) -> None:

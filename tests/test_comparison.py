@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 import sys
 import time
@@ -16,12 +17,13 @@ import torch
 import trimesh
 from khronos import WARNING, messages
 from PIL import Image
+from trimesh.visual.material import PBRMaterial
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.request import ViewsRequest
 from bbfit.checks import InputError
 from bbfit.comparison.config import LIT, SYSTEMS, CompareConfig
-from bbfit.comparison.many_trees import compare_trees
+from bbfit.comparison.many_trees import _is_complete, compare_trees
 from bbfit.comparison.one_tree import CompareResult, compare
 from bbfit.comparison.subject import baking
 from bbfit.evaluation.afar import score_afar
@@ -37,9 +39,11 @@ from bbfit.layout import REQUEST_FILE
 from bbfit.pipeline import RunConfig
 from bbfit.rendering.cards import CardRenderer
 from bbfit.reporting.comparison_summary import COSTS, front, summaries
+from bbfit.reporting.comparison_tables import CompareCosts
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.config import GrowConfig
 from bbfit.views.dataset import ViewDataset
+from bbfit.workers.tasks import Outcome
 
 TREE = Path(__file__).resolve().parents[1] / "data" / "tree.glb"
 STAGES = RunConfig(
@@ -276,6 +280,36 @@ def test_trees_are_compared_by_means_and_spreads(tmp_path: Path) -> None:
     assert again.failures == done.failures
 
 
+def test_a_package_that_was_missing_is_used_once_it_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of many trees too. Draco is not scored, so the picture is empty."""
+    config = replace(SMALL, systems=("draco",), workers=1)
+
+    def missing(*_: object, **__: object) -> None:
+        raise InputError("draco: the package DracoPy is not installed")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("bbfit.comparison.rival_systems.draco_size", missing)
+        (row,) = compare(TREE, tmp_path / "one", config, STAGES).rows
+        assert row.costs.bytes is None and "not installed" in row.note
+    (row,) = compare(TREE, tmp_path / "one", config, STAGES).rows
+    assert row.costs.bytes is not None and (tmp_path / "one" / "quality.png").is_file()
+    finished = Outcome({"rows": [row.to_json()]}, None, "here")
+    skipped = replace(row, costs=CompareCosts(), note="draco: the package DracoPy is not installed")
+    assert _is_complete(finished) and not _is_complete(replace(finished, facts={"rows": [skipped.to_json()]}))
+
+
+def test_a_tree_whose_textures_alone_are_too_large_gets_a_note(tmp_path: Path) -> None:
+    mesh = trimesh.creation.icosphere(2)
+    picture = Image.fromarray(np.random.default_rng(0).integers(0, 256, (400, 400, 3)).astype(np.uint8))
+    mesh.visual = trimesh.visual.TextureVisuals(
+        uv=mesh.vertices[:, :2] / 2 + 0.5, material=PBRMaterial(name="bark", baseColorTexture=picture)
+    )
+    mesh.export(tmp_path / "tree.glb")
+    bbfit, decimated = compare(tmp_path / "tree.glb", tmp_path / "out", replace(SMALL, systems=("bbfit", "decimated-bytes")), STAGES).rows
+    assert bbfit.measures is not None and decimated.measures is None and decimated.costs.bytes is None
+    assert re.match(r"decimate: materials and textures alone take [\d,]+ bytes, more than ", decimated.note)
+
+
 def test_bad_input(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="systems: expected one of bbfit-default, bbfit-default-blend, bbfit-default-coverage"):
         CompareConfig(systems=("octree",))
@@ -283,6 +317,16 @@ def test_bad_input(tmp_path: Path) -> None:
         CompareConfig(slices=0)
     with pytest.raises(InputError, match="billboards: the comparison sets their numbers"):
         compare(TREE, tmp_path, SMALL, RunConfig(fit=FitConfig(billboards=3)))
+    for name, value, bounds in (
+        ("mesh_vertices", 10, r"\[20, 20000\]"),
+        ("mesh_vertices_many", 10**6, r"\[20"),
+        ("field_steps", 2, "at least 3"),
+    ):
+        with pytest.raises(InputError, match=f"^{name}: expected .*{bounds}"):
+            CompareConfig(**{name: value})
+    for stages in (replace(STAGES, fit=FitConfig(alpha="blend")), replace(STAGES, export=ExportConfig(alpha="mask"))):
+        with pytest.raises(InputError, match="alpha: each system has its own alpha mode; leave out --alpha"):
+            compare(TREE, tmp_path, SMALL, stages)
     with pytest.raises(InputError, match="mip_files: only bbfit run, fit, sweep and export"):
         compare(TREE, tmp_path, SMALL, replace(STAGES, export=ExportConfig(mip_files=True)))
     (tmp_path / "bad.glb").write_bytes(TREE.read_bytes()[:3000])

@@ -8,7 +8,8 @@ from pathlib import Path
 from bbfit.blender.pictures import tree_settings
 from bbfit.blender.processes import BlenderPool, require_bpy
 from bbfit.checks import check_count, check_folder, check_output_file, fail
-from bbfit.files import write_pieces
+from bbfit.files import write_bytes, write_pieces
+from bbfit.tree_files.gltf_materials import transmits, with_transmission
 from bbfit.tree_files.tree_file import TreeFile
 
 _PIECE = 1 << 20
@@ -17,10 +18,11 @@ _PIECE = 1 << 20
 def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int | None = None) -> Path:
     """Write a tree as one self-contained GLB file, Y up in meters, at the place and size of :func:`~bbfit.blender.render_views`.
 
-    The file has everything that Blender's glTF exporter supports: materials, texture coordinates, textures with their alpha, and the
-    vertex colors that a material uses. Modifiers, shape keys and poses are applied. Collections and curves become meshes. Objects that
-    share a mesh still share it. The file contains only what renders, without cameras, lights and animations. Surfaces without a material
-    get the renderer's plain material, gray or in their vertex colors. The same input gives the same bytes.
+    The file has everything that Blender's glTF exporter supports: materials, texture coordinates, textures with their alpha, and the vertex
+    colors that a material uses, and with the diffuse transmission of a glTF's leaves. Modifiers, shape keys and poses are applied.
+    Collections and curves become meshes. Objects that share a mesh still share it. The file contains only what renders, without cameras,
+    lights and animations. Surfaces without a material get the renderer's plain material, gray or in their vertex colors. The same input
+    gives the same bytes.
 
     ``triangles`` collapses edges (Blender's Decimate modifier) over the whole tree at once, in one joined mesh. The remaining leaves are
     enlarged until they have their former area (Cook et al., "Stochastic Simplification of Aggregate Detail", SIGGRAPH 2007). A material
@@ -62,6 +64,10 @@ def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int 
         fail("out", f"{out} is the tree itself", "choose another name")
     require_bpy()
     with BlenderPool(tree_settings(tree)) as pool:
-        with pool.convert(triangles).open("rb") as file:
-            write_pieces(out, iter(partial(file.read, _PIECE), b""))
+        path = pool.convert(triangles)
+        if transmits(tree):
+            write_bytes(out, with_transmission(path.read_bytes(), tree))
+        else:
+            with path.open("rb") as file:
+                write_pieces(out, iter(partial(file.read, _PIECE), b""))
     return out

@@ -251,6 +251,7 @@ def export_command(
         out: The model's file, ending in .glb, or in .obj (its .mtl and .png come beside it).
         export: How the model is written. Default: the outline is that of the cloud's run.
     """
+    from bbfit.exporting.config import check_effect
     from bbfit.exporting.model import shipped_model
     from bbfit.geometry.cloud import BillboardCloud
     from bbfit.model_files import check_model_path, names_beside
@@ -261,9 +262,11 @@ def export_command(
     out = check_model_path("model file", out)
     export.check()
     billboards, export = BillboardCloud.load(cloud), as_in_run(export, cloud)
+    check_effect(export, out)
     names = names_beside(out, texture=True, normals=billboards.surface is not None, mip_files=export.resolve().mip_files)
+    stale = [name for name in names_beside(out, normals=True, mip_files=True) if name not in names]
     check_room("out", out.parent, 16 * len(billboards.texels))  # four bytes a texel for up to three pictures and all levels
-    with single_files("bbfit export", out.parent, names, [cloud]), progress() as on_progress:
+    with single_files("bbfit export", out.parent, names, [cloud], stale), progress() as on_progress:
         shipped = described_by_run(shipped_model(billboards, export, on_progress=on_progress), cloud)
         paths = shipped.save(out)
         remove_results(out.parent, *(name for name in names if "*" in name), but=paths)  # mip levels of an earlier, larger atlas

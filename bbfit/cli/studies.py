@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,7 @@ from bbfit.inputs import InputLimits
 from bbfit.library.config import LibraryConfig
 from bbfit.sweep.config import SweepConfig
 from bbfit.trees.config import GrowConfig
+from bbfit.workers.config import WorkersConfig
 
 
 def sweep_command(
@@ -116,6 +118,9 @@ def compare_command(
         fail("compare", "expected a tree, or trees and species", "for example bbfit compare tree.glb, or bbfit compare --trees a.glb b.glb")
     stages = RunConfig(grow=grow, views=views, fit=fit, export=export, limits=limits)
     if tree is not None:
+        given = replace(compare, **vars(WorkersConfig())) != compare
+        if given or seeds != (0,) or replace(grow, seed=0) != GrowConfig(detail=0.5):
+            fail("compare", "seeds, options of grown trees, and where tasks run are for --trees and --species", "leave them out")
         with progress() as on_progress:
             result = compare_one(tree, out, compare, stages, on_progress=on_progress)
         out_console.print(compare_table(result.rows))

@@ -80,13 +80,13 @@ class CompareConfig(WorkersConfig):
     """Most bytes of the larger tree that is thinned out."""
     thinned_triangles: Count = 10_000
     """Triangles of a tree that is thinned out to a number of them."""
-    mesh_vertices: Count = 500
+    mesh_vertices: Annotated[int, Range(20, 20_000)] = 500
     """Vertices of the smaller learned mesh."""
-    mesh_vertices_many: Count = 2000
+    mesh_vertices_many: Annotated[int, Range(20, 20_000)] = 2000
     """Vertices of the larger learned mesh."""
     mesh_steps: Count = 600
     """Optimizer steps of a learned mesh."""
-    field_steps: Count = 3000
+    field_steps: Annotated[int, Range(3)] = 3000
     """Optimizer steps of a radiance field."""
     tree_height: Count = 100
     """Height of the tree in pixels in the smaller pictures of the score from afar."""

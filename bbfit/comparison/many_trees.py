@@ -8,6 +8,7 @@ from pathlib import Path
 
 from bbfit.comparison.config import CompareConfig
 from bbfit.comparison.one_tree import checked_systems, compare
+from bbfit.comparison.subject import is_missing
 from bbfit.files import write_bytes
 from bbfit.outputs import Written, claimed_folder
 from bbfit.pipeline import RunConfig
@@ -100,7 +101,7 @@ def _compared(
             kind = tree.digest if tree else (load_species(source.species, grow.species_file), grow)
             key = cache_key("compare", source.name, kind, config.compared, stages.views, stages.fit, stages.export.resolve(), VERSIONS)
             earlier = results.get(key)
-            if earlier is not None and earlier.reason is None and (place / "compare.json").is_file():
+            if earlier is not None and earlier.reason is None and _is_complete(earlier) and (place / "compare.json").is_file():
                 outcomes[source.name] = earlier
                 continue
             pending[source.name] = key
@@ -133,6 +134,11 @@ def compare_tree(inputs: Mapping[str, Path], folder: Path, config: CompareConfig
     assert tree is not None
     stages = replace(stages, grow=RunConfig().grow, views=replace(stages.views, hdri=inputs.get("hdri")))
     return {"rows": [row.to_json() for row in compare(tree, folder, config, stages).rows]}
+
+
+def _is_complete(outcome: Outcome) -> bool:
+    """Whether no system was skipped because a package was missing, which may have been installed since."""
+    return not any(is_missing(row.note) for row in _rows(outcome))
 
 
 def _rows(outcome: Outcome) -> tuple[CompareRow, ...]:

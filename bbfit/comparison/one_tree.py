@@ -21,7 +21,7 @@ from bbfit.reporting.comparison_tables import CompareRow, compare_csv, compare_m
 from bbfit.stages.results import original_tree
 from bbfit.stages.stage import OnProgress, Record, Stage, silent
 from bbfit.stages.trees import convert_stage, views_stage
-from bbfit.tree_files.tree_file import Y_UP_MESHES, TreeFile
+from bbfit.tree_files.tree_file import GLTF_SUFFIXES, TreeFile
 from bbfit.views.dataset import ViewDataset
 
 _TABLES = ("compare.csv", "compare.md", "compare.json", "quality.png", "systems.png")
@@ -56,7 +56,7 @@ def compare(
     Parameters
     ----------
     tree
-        A tree in any format. Blender converts formats other than .glb, .gltf and .obj for the systems that read triangles.
+        A tree in any format. Blender converts formats other than .glb and .gltf for the systems that read triangles.
     out
         The folder for the results.
     config
@@ -79,7 +79,7 @@ def compare(
         check_blender(stages.views)
     with claimed_folder("out", out) as folder:
         record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
-        record.check({"tables": _TABLES} | ({} if tree.suffix in Y_UP_MESHES else {"convert": ("tree.glb",)}))
+        record.check({"tables": _TABLES} | ({} if tree.suffix in GLTF_SUFFIXES else {"convert": ("tree.glb",)}))
         if earlier == 0 and requested == 0 and stages.views.suns:
             needing = " and ".join(system for system in systems if system in LIT)
             fail("systems", f"{needing}: {out}/views has no views under other suns", "choose another output folder, or remove that folder")
@@ -93,6 +93,8 @@ def checked_systems(config: CompareConfig, stages: RunConfig, suns: int = 0) -> 
     """
     if stages.fit.billboards is not None or stages.budget.given:
         fail("billboards", "the comparison sets their numbers", "omit billboards and budgets")
+    if stages.fit.alpha is not None or stages.export.alpha is not None:
+        fail("alpha", "each system has its own alpha mode", "leave out --alpha, and choose --systems")
     check_no_mip_files(stages.export)
     chosen = config.systems or (SYSTEMS if stages.views.hdri is None else tuple(system for system in SYSTEMS if system not in LIT))
     systems = [system for system in SYSTEMS if system in chosen]
@@ -120,7 +122,7 @@ def _compared(
     record.run(views_stage(folder, tree, stages.views), on_progress)
     views = ViewDataset.load(folder / "views", limits=stages.limits)
     views.check()
-    if tree.suffix not in Y_UP_MESHES:
+    if tree.suffix not in GLTF_SUFFIXES:
         record.run(convert_stage(folder, tree, "tree.glb"), on_progress)
         tree = TreeFile.open(folder / "tree.glb", stages.limits)
     comparison = Systems(tree, views, record, config, stages, on_progress)

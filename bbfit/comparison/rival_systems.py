@@ -29,7 +29,7 @@ from bbfit.rendering.cards import CardRenderer
 from bbfit.rivals.baking import tree_triangles
 from bbfit.rivals.billboard_clouds import billboard_cloud
 from bbfit.rivals.crossed import crossed_planes
-from bbfit.rivals.decimation import decimate
+from bbfit.rivals.decimation import TooSmallError, decimate
 from bbfit.rivals.draco import draco_size
 from bbfit.rivals.height_fields import height_fields
 from bbfit.rivals.learned_mesh import learn_mesh, mesh_glb
@@ -96,6 +96,7 @@ def _sliced(subject: Subject, folder: Path) -> SystemResult:
     )
     started = time.perf_counter()
     model = shipped_model(BillboardCloud.joined(slices.clouds), _RECTANGLE)
+    # As a file shows them, with mip levels.
     renderers = [CardRenderer(shipped_model(cloud, _RECTANGLE).cards) for cloud in slices.clouds]
 
     def fragments(camera: Camera) -> float:
@@ -108,7 +109,7 @@ def _sliced(subject: Subject, folder: Path) -> SystemResult:
         model.glb,
         model.cards.vertex_count,
         seconds,
-        slices.draw,
+        partial(slices.draw, drawn=[renderer.draw for renderer in renderers]),
         sum(map(len, slices.clouds)),
         note,
         fragments=fragments,
@@ -148,7 +149,10 @@ def _octahedral(options: dict[str, Any], subject: Subject, folder: Path) -> Syst
 
 def _decimated(subject: Subject, folder: Path, *, vertices: int | None = None, size: int | None = None) -> SystemResult:
     started = time.perf_counter()
-    mesh = decimate(subject.tree, vertices=vertices, size=size)
+    try:
+        mesh = decimate(subject.tree, vertices=vertices, size=size)
+    except TooSmallError as error:
+        return SystemResult(None, None, time.perf_counter() - started, None, note=str(error))
     note = "edge collapses, then vertex clustering" if mesh.clustered else "edge collapses"
     return _rendered(mesh.glb, subject, folder, time.perf_counter() - started, note)
 

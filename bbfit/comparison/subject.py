@@ -30,6 +30,11 @@ from bbfit.views.dataset import ViewDataset
 Baked = TypeVar("Baked")
 
 
+def is_missing(note: str) -> bool:
+    """Whether the note of a system says that a package or a library is missing, without which the system is left out."""
+    return "is not installed" in note or "LLVM" in note
+
+
 @dataclass(frozen=True)
 class Subject:
     """A tree with its views, and the options of the comparison."""

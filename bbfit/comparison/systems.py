@@ -13,7 +13,7 @@ from bbfit.checks import InputError, check_record
 from bbfit.comparison.config import CompareConfig
 from bbfit.comparison.own_systems import own_systems
 from bbfit.comparison.rival_systems import rival_systems
-from bbfit.comparison.subject import Subject
+from bbfit.comparison.subject import Subject, is_missing
 from bbfit.evaluation.afar import drawing_cost, score_afar
 from bbfit.evaluation.measures import Measures, mean_measures
 from bbfit.evaluation.scoring import drawn_view, score_views
@@ -82,7 +82,7 @@ class Systems:
                 remove_parts(folder)
                 self._record.run(Stage(system, inputs, outputs, work, algorithm="compare"))
         except InputError as error:
-            if "is not installed" not in str(error) and "LLVM" not in str(error):
+            if not is_missing(str(error)):
                 raise
             return CompareRow(system, chosen.title, CompareCosts(), None, str(error), None, None)
         content = read_json("result", folder / "result.json")

@@ -25,7 +25,9 @@ _LEAST_FREE, _MOST_HIDDEN = 8, 16
 _PLAIN = (128, 128, 255, 255, 0)
 
 
-def pack_atlas(textures: list[NDArray[np.uint8]], padding: int, surfaces: list[NDArray[np.uint8]] | None = None) -> Atlas:
+def pack_atlas(
+    textures: list[NDArray[np.uint8]], padding: int, surfaces: list[NDArray[np.uint8]] | None = None, halvings: int = 0
+) -> Atlas:
     """Pack R >= 1 straight-alpha textures, uint8 [h, w, 4] each, without resampling or rotating them.
 
     Each texture gets a cell that is at least ``padding`` >= 1 texels larger on every side, which the fade to transparent at a billboard's
@@ -35,9 +37,11 @@ def pack_atlas(textures: list[NDArray[np.uint8]], padding: int, surfaces: list[N
     similar colors of transparent texels become one, so that the atlas fits into the palette of a PNG.
 
     ``surfaces`` are further channels of each texture, uint8 [h, w, 4 or 5], packed in the same way; their padding repeats their rims.
+    For an atlas whose sides are halved ``halvings`` times later, padding and blocks are as much larger.
     """
+    padding <<= halvings
     sizes = np.array([texture.shape[1::-1] for texture in textures], dtype=np.int64)
-    unit = max(BLOCK, 1 << (padding.bit_length() - 1))
+    unit = max(BLOCK << halvings, 1 << (padding.bit_length() - 1))
     cells = np.maximum(-(-(sizes + 2 * padding) // unit), 2)
     places = _places(cells.tobytes())
     width, height = ((places + cells).max(0) * unit).tolist()

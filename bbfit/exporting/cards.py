@@ -13,7 +13,7 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.images import to_bytes
 
 
-def cloud_cards(cloud: BillboardCloud, padding: int, *, traced: bool = False, paired: bool = False) -> Cards:
+def cloud_cards(cloud: BillboardCloud, padding: int, halvings: int = 0, *, traced: bool = False, paired: bool = False) -> Cards:
     """Rectangles and an atlas for which bilinear filtering gives the picture of :func:`~bbfit.rendering.dispatch.render`.
 
     A billboard's picture fades to transparent over one texel beyond its outermost texel centers, so half a texel beyond its rectangle. Each
@@ -21,7 +21,8 @@ def cloud_cards(cloud: BillboardCloud, padding: int, *, traced: bool = False, pa
     texture. A two-sided billboard becomes two cards in the same place, front and back, of opposite winding. So does a one-sided billboard
     with maps, with one texture for both: programs that show a quad from behind turn the whole normal, and one that points up would point
     down. ``traced`` is for programs that cull nothing (``Cards.traced``): there such a billboard is one card that shows both sides. With
-    ``paired``, one without maps becomes a pair as well.
+    ``paired``, one without maps becomes a pair as well. After ``halvings`` halvings of the atlas's sides, which may follow, textures still
+    have ``padding`` and are made of whole blocks.
 
     Textures are rounded to 8 bits, which changes a premultiplied color by at most 1/255 per layer. Transparent texels get another color
     (:func:`~bbfit.exporting.atlas.fill_cell`), which changes colors near the silhouette by at most 1/4 per layer, but no alpha. Raises
@@ -32,7 +33,7 @@ def cloud_cards(cloud: BillboardCloud, padding: int, *, traced: bool = False, pa
     for name in ("centers", "rights", "ups", "half_extents", "texels"):
         if not getattr(cloud, name).isfinite().all():
             fail("cloud", f"{name} are not all finite numbers", "fit it again")
-    atlas = pack_atlas([to_bytes(side) for texture in cloud.textures() for side in texture], padding, _surfaces(cloud))
+    atlas = pack_atlas([to_bytes(side) for texture in cloud.textures() for side in texture], padding, _surfaces(cloud), halvings)
 
     centers, rights, ups, half, two_sided = (
         tensor.detach().cpu().double().numpy() for tensor in (cloud.centers, cloud.rights, cloud.ups, cloud.half_extents, cloud.two_sided)

@@ -113,8 +113,8 @@ class ExportConfig:
     """unlit: colors as they are, with the light that the tree was rendered in. pbr: a rough dielectric that the program lights again.
     emissive: a black metal that emits the colors, for programs that do not show unlit right.
     Default: unlit; emissive for VTK. A cloud with maps has a matte material of its own, which takes the program's light."""
-    padding: Count = 8
-    """Free texels around each texture in the atlas, at least 1; with 8 the mip levels 1 to 3 never mix two textures."""
+    padding: Annotated[int, Range(1, 64)] = 8
+    """Free texels around each texture in the atlas, 1 to 64; with 8 the mip levels 1 to 3 never mix two textures."""
     up: Up = "auto"
     """Up axis of an OBJ file. auto: that of the tree's file, if the views name it (.ply, .stl and .blend are Z up), else y.
     A GLB is Y up, as glTF requires."""
@@ -177,6 +177,23 @@ class ExportConfig:
         return ktx2_missing() if self.textures == "auto" else None
 
 
+def check_effect(config: ExportConfig, path: Path) -> None:
+    """Require that the options which are given have an effect on a model file at ``path``. Raises InputError for one that has none."""
+    if path.suffix.lower() == ".obj":
+        if config.textures not in (None, "png"):
+            fail("textures", f"an OBJ file has a PNG, not {config.textures}", "leave out --textures, or write a .glb")
+        if config.quantized:
+            fail("quantized", "an OBJ file has decimal numbers", "leave out --quantized, or write a .glb")
+    elif config.up == "z":
+        fail("up", "a GLB is Y up, as glTF requires", "leave out --up, or write an .obj")
+    if not config.fallback and config.textures in (None, "png"):
+        fail("fallback", "PNG is the only texture", "leave out --no-fallback, or give --textures webp or ktx2")
+    if config.outline in ("hull", "rectangle") and config.pieces is not None:
+        fail("pieces", f"a {config.outline} is one polygon", "leave out --pieces, or give --outline pieces")
+    if config.outline == "rectangle" and config.corners is not None:
+        fail("corners", "a rectangle has four", "leave out --corners, or give --outline hull or pieces")
+
+
 def check_no_mip_files(config: ExportConfig) -> None:
     """Require that an export writes no mip levels as files. Raises InputError."""
     if config.mip_files:
@@ -196,8 +213,8 @@ class ResolvedExport(ExportConfig):
 
     @property
     def has_mips(self) -> bool:
-        """Whether the files include mip levels of their own."""
-        return self.mip_files or (self.textures == "ktx2" and self.mipmaps is not False)
+        """Whether the model's textures include mip levels of their own."""
+        return self.textures == "ktx2" and self.mipmaps is not False
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bbfit.geometry.alpha import AlphaMode
+from bbfit.geometry.cards import Cards
 from bbfit.glb import joined_glb, split_glb
 
 NAMESPACE = "bbfit"
@@ -44,11 +45,11 @@ class Description:
     ``screen_height`` in pixels and ``screen_fov_degrees``."""
 
 
-def described_glb(glb: bytes, description: Description) -> bytes:
-    """The file of :func:`~bbfit.exporting.gltf.glb_bytes` with names and facts; its geometry and pictures stay as they are.
+def described_glb(glb: bytes, description: Description, cards: Cards) -> bytes:
+    """The file of ``cards`` (:func:`~bbfit.exporting.gltf.glb_bytes`) with names and facts; its geometry and pictures stay as they are.
 
     The facts are in ``asset.extras.bbfit`` (glTF 2.0, section 3.2). Programs that ignore the asset's extras may keep those of nodes:
-    each node in the scene has the tree's bounds and the distances there. ``bounds`` are those of the model, from its vertices.
+    each node in the scene has the tree's bounds and the distances there. ``bounds`` are those of the cards.
     """
     tree, contents = split_glb(glb)
     for kind in ("nodes", "meshes", "materials"):
@@ -60,7 +61,9 @@ def described_glb(glb: bytes, description: Description) -> bytes:
     alpha: dict[str, Any] = {"mode": description.alpha.kind}
     alpha |= {"cutoff": description.alpha.cutoff} if description.alpha.tested else {}
     light = {"sun_direction": description.sun_direction, "sun_strength": description.sun_strength, "ambient": description.ambient}
-    places = {"bounds": _bounds(tree), "tree_bounds": description.tree_bounds, "distances": description.distances}
+    corners = np.concatenate([card.corners for card in cards.cards])
+    bounds = [corners.min(0).tolist(), corners.max(0).tolist()]
+    places = {"bounds": bounds, "tree_bounds": description.tree_bounds, "distances": description.distances}
     facts = {
         "tree": description.name,
         "billboards": description.billboards,
@@ -73,17 +76,6 @@ def described_glb(glb: bytes, description: Description) -> bytes:
     for node in tree["scenes"][tree["scene"]]["nodes"]:
         tree["nodes"][node]["extras"] = {NAMESPACE: _rounded(_known({name: places[name] for name in ("tree_bounds", "distances")}))}
     return joined_glb(tree, contents)
-
-
-def _bounds(tree: dict[str, Any]) -> list[list[float]]:
-    """Lowest and highest corner of all vertices in meters."""
-    corners = list[list[float]]()
-    for node in tree["nodes"]:
-        moved = np.array(node["matrix"]).reshape(4, 4)[3, :3] if "matrix" in node else np.array(node.get("translation", (0, 0, 0)))
-        for primitive in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
-            accessor = tree["accessors"][primitive["attributes"]["POSITION"]]
-            corners += [(moved + np.multiply(node.get("scale", 1), accessor[end])).tolist() for end in ("min", "max")]
-    return [np.min(corners, 0).tolist(), np.max(corners, 0).tolist()]
 
 
 def _known(facts: dict[str, Any]) -> dict[str, Any]:

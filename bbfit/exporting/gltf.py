@@ -125,7 +125,7 @@ def texture_files(
         on_picture(number, len(pictures))
         for ending in _endings(config):
             if ending == "png":
-                data = encode_png(levels[0])
+                data = encode_png(cards.averaged if name == "atlas" and cards.averaged is not None else levels[0])
             else:
                 data = encode_webp(levels[0]) if ending == "webp" else encode_ktx2(levels, srgb=is_color)
             contents[f"{name}.{ending}"] = data

@@ -66,14 +66,27 @@ class ShippedModel:
 
         They are those of the files, so they do not depend on whether a program smooths the edges of masks.
         """
+        if not self.config.has_mips:
+            return self._averaged_cards
+        cards = with_mips(self._trimmed_cards, partial(self.on_progress, "mip levels"))
+        averaged = self._averaged_cards.atlas.image
+        return replace(cards, averaged=averaged) if self.config.fallback and averaged is not cards.atlas.image else cards
+
+    @cached_property
+    def _trimmed_cards(self) -> Cards:
+        """The polygons without mip levels."""
         cards = self._whole_cards
         if self.config.outline == "hull":
             cards = with_hulls(cards, self.config.corners, cards.outlined_alpha)
         elif self.config.outline == "pieces":
             cards = with_pieces(cards, self.config.pieces, self.config.corners, cards.outlined_alpha)
-        if self.config.has_mips:
-            return with_mips(cards, partial(self.on_progress, "mip levels"))
-        if not self.config.mipmapped(cards.alpha):
+        return cards
+
+    @cached_property
+    def _averaged_cards(self) -> Cards:
+        """The polygons as programs show them that compute the mip levels of a PNG themselves, if the files ask for levels."""
+        cards = self._trimmed_cards
+        if not (self.config.has_mips or self.config.mipmapped(cards.alpha)):
             return cards
         surface = None if cards.atlas.surface is None else tuple(surface_chain(cards.atlas.surface, None))
         cards = replace(cards, chain=tuple(plain_chain(cards.atlas.image)), surface_chain=surface)
@@ -87,7 +100,7 @@ class ShippedModel:
         splits = self.config.split and cloud.alpha.kind == "blend"
         # Where the nodes of a split model cull back faces, a lit one needs the normals of both sides.
         paired = splits and program.culls and self.config.material != "unlit"
-        cards = cloud_cards(cloud, self.config.padding << self.halvings, traced=program.traced, paired=paired)
+        cards = cloud_cards(cloud, self.config.padding, self.halvings, traced=program.traced, paired=paired)
         if splits:
             cards = split(cards, apart=not program.culls)
         return reduced(cards, self.halvings)
@@ -105,7 +118,7 @@ class ShippedModel:
     def glb(self) -> bytes:
         """The GLB file."""
         glb = self._plain_glb
-        return glb if self.description is None else described_glb(glb, self.description)
+        return glb if self.description is None else described_glb(glb, self.description, self.cards)
 
     @cached_property
     def _plain_glb(self) -> bytes:
@@ -117,7 +130,8 @@ class ShippedModel:
         """The same model with names and facts in its GLB."""
         model = replace(self, description=description)
         # What is known of this model is not computed again.
-        vars(model).update((name, vars(self)[name]) for name in ("cards", "_plain_glb") if name in vars(self))
+        known = ("_trimmed_cards", "_averaged_cards", "cards", "_plain_glb")
+        vars(model).update((name, vars(self)[name]) for name in known if name in vars(self))
         return model
 
     @property
@@ -150,7 +164,7 @@ class ShippedModel:
             contents = {path: self.glb}
         else:
             material, texture = path.with_suffix(".mtl"), path.with_suffix(".png")
-            atlas, normals = self.cards.atlas, normals_path(path)
+            atlas, normals = self._averaged_cards.atlas, normals_path(path)
             has_maps = atlas.surface is not None
             contents = {
                 path: obj_bytes(self.cards, self.config, material_file=material.name),
@@ -160,8 +174,9 @@ class ShippedModel:
             if atlas.surface is not None:
                 contents[normals] = encode_png(np.ascontiguousarray(atlas.surface[..., :3]))
         if self.config.mip_files:
-            levels = enumerate(self.cards.chain or [self.cards.atlas.image])
-            contents |= {path.with_name(f"{path.stem}_mip{level}.png"): encode_png(image) for level, image in levels}
+            own = self.cards if self.config.has_mips else with_mips(self._trimmed_cards, partial(self.on_progress, "mip levels"))
+            assert own.chain is not None
+            contents |= {path.with_name(f"{path.stem}_mip{level}.png"): encode_png(image) for level, image in enumerate(own.chain)}
         for file, data in reversed(contents.items()):  # a file is written after the files that it refers to
             write_bytes(file, data)
         return list(contents)

@@ -16,7 +16,7 @@ from bbfit.geometry.cards import Card, Cards, texture_slopes
 
 EXTENSION = "KHR_mesh_quantization"
 # Component types of glTF, and the largest index of 16 bits (65,535 would restart a primitive; glTF 2.0, section 3.7.2.1).
-_BYTE, _SHORT, _UNSIGNED_SHORT, _UNSIGNED_INT, _LARGEST_INDEX = 5120, 5122, 5123, 5125, 65_534
+_BYTE, _SHORT, _UNSIGNED_SHORT, _UNSIGNED_INT, _FLOAT, _LARGEST_INDEX = 5120, 5122, 5123, 5125, 5126, 65_534
 # The type in numpy, and the largest integer of each.
 _INTEGERS = {_BYTE: ("i1", 127), _SHORT: ("<i2", 32_767), _UNSIGNED_SHORT: ("<u2", 65_535)}
 # Vertices begin at multiples of so many bytes (glTF 2.0, section 3.6.2.4).
@@ -62,11 +62,12 @@ def quantized(tree: dict[str, Any], views: list[bytes], cards: Cards) -> list[by
     along an axis from the origin of a vertex's node. Nodes that have no origin get the center of their common bounds.
     """
     geometry = _Geometry(tree, list(views))
-    for attributes in (primitive["attributes"] for mesh in tree["meshes"] for primitive in mesh["primitives"]):
-        if _is_short(cards):
-            geometry.put(attributes["TEXCOORD_0"], _UNSIGNED_SHORT)
-        for name in {"NORMAL", "TANGENT"} & attributes.keys():
-            geometry.put(attributes[name], _BYTE)
+    kinds = {"NORMAL": _BYTE, "TANGENT": _BYTE} | ({"TEXCOORD_0": _UNSIGNED_SHORT} if _is_short(cards) else {})
+    attributes = [primitive["attributes"] for mesh in tree["meshes"] for primitive in mesh["primitives"]]
+    # Meshes with equal values share an accessor.
+    chosen = {each[name]: kind for each in attributes for name, kind in kinds.items() if name in each}
+    for number, kind in chosen.items():
+        geometry.put(number, kind)
     geometry.quantize_positions()
     for key in ("extensionsUsed", "extensionsRequired"):
         tree[key] = sorted({*tree.get(key, ()), EXTENSION})
@@ -88,6 +89,7 @@ class _Geometry:
     def put(self, number: int, component: int, unit: float | None = None, origin: NDArray[np.float64] | float = 0.0) -> None:
         """Store an accessor of floats as integers: multiples of a ``unit`` from an ``origin``, or else fractions of the largest integer."""
         accessor, (kind, largest) = self._tree["accessors"][number], _INTEGERS[component]
+        assert accessor["componentType"] == _FLOAT, "it is stored already"
         stored = np.rint((self._floats(number) - origin) / (unit or 1 / largest)).astype(kind)
         accessor |= {"componentType": component, "min": stored.min(0).tolist(), "max": stored.max(0).tolist()}
         accessor |= {} if unit else {"normalized": True}
@@ -108,6 +110,7 @@ class _Geometry:
         origins = [center if matrix is None else np.zeros(3) for matrix in moved]
         farthest = max(float(np.abs(own - origin).max()) for own, origin in zip(points, origins, strict=True))
         unit = float(f"{farthest / _INTEGERS[_SHORT][1]:.6g}")  # split models have a node for each card, which all name it
-        for node, number, origin, matrix in zip(nodes, numbers, origins, moved, strict=True):
+        for number, origin in dict(zip(numbers, origins, strict=True)).items():  # nodes with equal positions share an accessor
             self.put(number, _SHORT, unit, origin)
+        for node, origin, matrix in zip(nodes, origins, moved, strict=True):
             node |= {"translation": origin.tolist() if matrix is None else matrix[12:15], "scale": [unit] * 3}

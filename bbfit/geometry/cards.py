@@ -82,6 +82,9 @@ class Cards:
     distance."""
     surface_chain: tuple[NDArray[np.uint8], ...] | None = None
     """The same of ``atlas.surface``."""
+    averaged: NDArray[np.uint8] | None = None
+    """Level 0 for programs that cannot read ``chain`` and average the levels themselves: ``atlas.image`` with filled gaps, [H, W, 4].
+    ``None`` if it is the same."""
     light: Light | None = None
     """The light in which cards with a surface are drawn unless another is given, a batch of one."""
     traced: bool = False

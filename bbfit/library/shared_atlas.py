@@ -118,7 +118,8 @@ def _page(numbers: list[int], models: Sequence[Cards], places: list[NDArray[np.i
         return pictures
 
     chains = [cards.chain or (cards.atlas.image,) for cards in chosen]
-    levels = assembled(chains, np.append(_mean_color(chosen), 0).astype(np.uint8))
+    gap = np.append(_mean_color(chosen), 0).astype(np.uint8)
+    levels = assembled(chains, gap)
     surfaces = list[_Image]()
     if chosen[0].atlas.surface is not None:
         own = [cards.surface_chain or (cards.atlas.surface,) for cards in chosen]
@@ -134,12 +135,15 @@ def _page(numbers: list[int], models: Sequence[Cards], places: list[NDArray[np.i
             levels += plain_chain(levels[last])[1:]
         if surfaces:
             surfaces += surface_chain(surfaces[last], opacity if own_levels else None)[1:]
+    averaged = None
+    if chosen[0].averaged is not None:
+        (averaged,) = assembled([(cards.atlas.image if cards.averaged is None else cards.averaged,) for cards in chosen], gap)
     made = []
     for cards, atlas in zip(chosen, atlases, strict=True):
         shared = replace(atlas, image=levels[0], surface=surfaces[0] if surfaces else None)
         chain = tuple(levels) if cards.chain is not None else None
         surface = tuple(surfaces) if cards.surface_chain is not None else None
-        made.append(replace(_moved(cards, shared), chain=chain, surface_chain=surface))
+        made.append(replace(_moved(cards, shared), chain=chain, surface_chain=surface, averaged=averaged))
     return SharedPage(tuple(numbers), tuple(made))
 
 

@@ -24,6 +24,8 @@ def write_cards(path: Path, cards: Cards, last_level: int) -> None:
     arrays: dict[str, NDArray] = {"image": atlas.image, "corners": atlas.corners, "sizes": atlas.sizes}
     if atlas.surface is not None:
         arrays["surface"] = atlas.surface
+    if cards.averaged is not None:
+        arrays["averaged"] = cards.averaged
     for name, chain in (("level", cards.chain), ("surface", cards.surface_chain)):
         if chain is not None:  # level 0 is the picture itself
             arrays |= {f"{name}.{number}": level for number, level in enumerate(chain[: last_level + 1]) if number > 0}
@@ -62,7 +64,8 @@ def read_cards(path: Path) -> Cards:
         ]
         atlas = Atlas(arrays["image"], arrays["corners"], arrays["sizes"], arrays.get("surface"))
         chain, surface = _levels(arrays, "level", atlas.image), _levels(arrays, "surface", atlas.surface)
-        return Cards(tuple(made), atlas, AlphaMode(**facts["alpha"]), chain, surface, traced=facts["traced"])
+        alpha, averaged = AlphaMode(**facts["alpha"]), arrays.get("averaged")
+        return Cards(tuple(made), atlas, alpha, chain, surface, averaged, traced=facts["traced"])
 
 
 def _levels(arrays: dict[str, NDArray], name: str, first: NDArray[np.uint8] | None) -> tuple[NDArray[np.uint8], ...] | None:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, geometric_mean, stdev
+from typing import Any
 
 from bbfit.budget.choice import pareto_front
 from bbfit.reporting.comparison_tables import FAR, CompareCosts, CompareRow, far_figures, far_markdown
@@ -212,13 +213,14 @@ def _number(spread: Spread | None) -> str:
 def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
     """Write a PNG with PSNR and FLIP against each cost, and their fronts: one point for each system, with its spread over trees.
 
-    Systems that need a shader or a decoder of their own are hollow, and not part of the fronts. Without systems no file is written.
+    Points have numbers, which the legend explains. Systems that need a shader or a decoder of their own are hollow, and not part of the
+    fronts.
     """
-    if not systems:
-        return
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(27, 10), dpi=100, layout="constrained")
+    colors = [color for name in ("tab10", "Dark2", "tab20b") for color in colormaps[name](range(colormaps[name].N))]
+    figure, points = Figure(figsize=(27, 11), dpi=100, layout="constrained"), dict[str, Any]()
     axes = figure.subplots(len(_QUALITIES), len(COSTS), sharex="col", sharey="row")
     for line, quality in enumerate(_QUALITIES):
         for column, cost in enumerate(COSTS):
@@ -227,7 +229,7 @@ def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
             axis.set_xscale("log")
             known = [spread.mean for each in systems if (spread := each.costs[cost]) is not None]
             if known:
-                axis.set_xlim(min(known) / 2, max(known) * 4)  # to the right there are names
+                axis.set_xlim(min(known) / 2, max(known) * 2)
             if len(best) > 1:
                 axis.step(*_corners(best, cost, quality), where="post", color="#9aa3ad", linewidth=1, zorder=1)
             for number, each in enumerate(systems):
@@ -235,17 +237,20 @@ def compare_plot(systems: Sequence[SystemSummary], path: Path) -> None:
                 if point is None:
                     continue
                 spread, value = point
-                color, at = f"C{number % 10}", (spread.mean, value.mean)
+                color, at = colors[number % len(colors)], (spread.mean, value.mean)
                 axis.errorbar(*at, value.deviation, color=color, elinewidth=0.6, alpha=0.5, zorder=2)
                 face = "none" if each.shader else color
-                axis.scatter(*at, s=90 if own else 45, marker="*" if own else "o", edgecolor=color, facecolor=face, zorder=3)
-                axis.annotate(each.system, at, (4, 4), textcoords="offset points", fontsize=7, color="#70767e")
+                label, marker = f"{number + 1}  {each.system}", "*" if own else "o"
+                points[label] = axis.scatter(*at, s=110 if own else 45, marker=marker, edgecolor=color, facecolor=face, zorder=3)
+                axis.annotate(str(number + 1), at, (5, 4), textcoords="offset points", fontsize=8, color="#70767e")
             axis.grid(alpha=0.3)
             if cost == "drawing":
                 axis.set_ylabel(f"from afar: {_QUALITIES[quality]}")
             if line == len(_QUALITIES) - 1:
                 axis.set_xlabel(COSTS[cost])
         axes[line][0].set_ylabel(_QUALITIES[quality])
+    in_order = sorted(points, key=lambda label: int(label.split()[0]))
+    figure.legend([points[label] for label in in_order], in_order, loc="outside lower center", ncols=7, fontsize=9, frameon=False)
     write_figure(figure, path)
 
 

@@ -217,7 +217,8 @@ def frames_plot(rows: Sequence[FrameRow], path: Path) -> None:
         if scored:
             _errors(panels[0][column], of_height, names, pixels)
         _growth(panels[-1][column], of_height, names, pixels)
-    figure.legend(*panels[-1][0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=len(names))
+    handles = {name: handle for panel in panels[-1] for handle, name in zip(*panel.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles, fontsize=8, loc="outside lower center", ncols=min(len(names), 4 * len(heights)))
     write_figure(figure, path)
 
 
@@ -226,10 +227,12 @@ def _errors(axis: Any, rows: Sequence[FrameRow], names: Sequence[str], pixels: i
     count = max(set.intersection(*counts), default=min(row.count for row in rows))
     for row in rows:
         if row.count == count and row.flip is not None:
-            color, own = f"C{names.index(row.model) % 10}", _is_own(row)
-            axis.scatter(row.ms, row.flip, s=120 if own else 50, marker="*" if own else "o", color=color, zorder=3)
-            axis.annotate(row.model, (row.ms, row.flip), (6, 4), textcoords="offset points", fontsize=8, color="#70767e")
+            number, own = names.index(row.model), _is_own(row)
+            marker = ("*", "P") if own else ("o", "s")
+            axis.scatter(row.ms, row.flip, s=120 if own else 50, marker=marker[number // 10 % 2], color=f"C{number % 10}", zorder=3)
+            axis.annotate(str(number + 1), (row.ms, row.flip), (6, 4), textcoords="offset points", fontsize=8, color="#70767e")
     axis.set_xscale("log")
+    axis.xaxis.set_minor_formatter("")
     axis.set_title(f"{count:,} trees, {pixels} pixels high", fontsize=10)
     axis.set_xlabel("milliseconds a frame")
     axis.set_ylabel("FLIP, mean over backgrounds, lower is better")
@@ -248,7 +251,13 @@ def _growth(axis: Any, rows: Sequence[FrameRow], names: Sequence[str], pixels: i
         if of_model:
             own = _is_own(of_model[0])
             line = {"color": f"C{number % 10}", "linestyle": "-" if number < 10 else "--", "marker": "*" if own else "o"}
-            axis.plot([row.count for row in of_model], [row.ms for row in of_model], label=name, markersize=8 if own else 4, **line)
+            axis.plot(
+                [row.count for row in of_model],
+                [row.ms for row in of_model],
+                label=f"{number + 1} {name}",
+                markersize=8 if own else 4,
+                **line,
+            )
     axis.set_xscale("log")
     axis.set_yscale("log")
     axis.set_title(f"trees of {pixels} pixels", fontsize=10)

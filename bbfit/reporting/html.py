@@ -35,6 +35,7 @@ from bbfit.reporting.charts import (
 )
 from bbfit.reporting.plots import magma, spread_views
 from bbfit.reporting.suns import UnderSun, under_suns
+from bbfit.reporting.sweep_tables import percent
 from bbfit.reporting.threejs import drawing_script, library_page, page_light
 from bbfit.views.lit import LitViews
 from bbfit.views.view_set import ViewSet
@@ -224,9 +225,7 @@ def _count(value: int | None) -> str:
 
 def _share(value: float | None) -> str:
     """A share in percent, with two significant digits."""
-    if value is None:
-        return ""
-    return f"{100 * value:.2g} %" if value < 0.1 else f"{100 * value:.0f} %"
+    return "" if value is None else percent(value, 2)
 
 
 def _figure(value: Any, digits: int = 3) -> str:

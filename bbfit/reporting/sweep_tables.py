@@ -154,10 +154,16 @@ def table_markdown(rows: Sequence[SweepRow]) -> str:
     return "\n".join(parts)
 
 
+def count_order(label: str) -> tuple[int, int]:
+    """The key by which labels of numbers of billboards are sorted: other labels, such as that of a number left to the fit, come last."""
+    return (0, int(label)) if label.isdecimal() else (1, 0)
+
+
 def pivot(rows: Sequence[SweepRow], measures: Sequence[Measure]) -> str:
     """A table with a line per configuration and measure, and a column per tree and number of billboards."""
     columns = list(dict.fromkeys((row.tree, row.labels.get(BILLBOARDS, "")) for row in rows))
-    columns = [column for tree in dict.fromkeys(tree for tree, _ in columns) for column in sorted(c for c in columns if c[0] == tree)]
+    trees = list(dict.fromkeys(tree for tree, _ in columns))
+    columns.sort(key=lambda column: (trees.index(column[0]), count_order(column[1])))
     lines = list(dict.fromkeys(_line(row) for row in rows))
     cells = {(_line(row), (row.tree, row.labels.get(BILLBOARDS, ""))): row for row in rows}
     head = ["configuration", "measure", *(f"{tree} {count}".strip() for tree, count in columns), "mean"]
@@ -210,7 +216,7 @@ def effects(rows: Sequence[SweepRow]) -> list[Effect]:
     for name in label_names(rows):
         values = list(dict.fromkeys(row.labels[name] for row in rows if name in row.labels))
         if name == BILLBOARDS:
-            values.sort(key=int)
+            values.sort(key=count_order)
         for old, new in itertools.pairwise(values) if name == BILLBOARDS else [(values[0], value) for value in values[1:]]:
             for tree in dict.fromkeys(row.tree for row in rows):
                 pairs = list(_pairs([row for row in rows if row.tree == tree], name, old, new))
@@ -244,7 +250,7 @@ def vertex_table(rows: Sequence[SweepRow]) -> str:
         line = [str(count)]
         for tree in trees:
             theirs = RATIOS_PERCENT.get(tree, {}).get(count)
-            ours = "" if not originals[tree] else f"{100 * count / originals[tree]:.3g} %"
+            ours = "" if not originals[tree] else percent(count / originals[tree])
             line.append(ours + ("" if theirs is None else f" ({theirs:g} %)"))
         table.append(line)
     return markdown(["vertices", *trees], table)
@@ -253,6 +259,14 @@ def vertex_table(rows: Sequence[SweepRow]) -> str:
 def label_names(rows: Sequence[SweepRow]) -> list[str]:
     """Names of all labels, in the order of the grid."""
     return list(dict.fromkeys(name for row in rows for name in row.labels))
+
+
+def percent(ratio: float, digits: int = 3) -> str:
+    """A ratio of at least 0 in percent, with so many significant digits, or more in front of the point."""
+    value = 100 * ratio
+    if 0 < value < 0.001:
+        return "< 0.001 %"
+    return f"{value:,.0f} %" if value >= 10 ** (digits - 1) else f"{value:.{digits}g} %"
 
 
 def markdown(head: Sequence[str], table: Sequence[Sequence[str]]) -> str:

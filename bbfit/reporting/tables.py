@@ -10,7 +10,7 @@ from bbfit.exporting.lod import LodLevel
 from bbfit.reporting.comparison_summary import summaries
 from bbfit.reporting.comparison_tables import CompareRow
 from bbfit.reporting.frame_tables import FrameRow
-from bbfit.reporting.sweep_tables import MEASURES, SweepRow, label_names
+from bbfit.reporting.sweep_tables import MEASURES, SweepRow, label_names, percent
 from bbfit.trees.species import Species
 
 if TYPE_CHECKING:
@@ -237,4 +237,4 @@ def _count(value: int | None) -> str:
 
 
 def _percent(cost: Cost) -> str:
-    return "-" if cost.ratio is None else f"{100 * cost.ratio:.3g} %"
+    return "-" if cost.ratio is None else percent(cost.ratio)

@@ -10,18 +10,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bbfit.checks import check_count, fail
+from bbfit.checks import InputError, check_count, fail
 from bbfit.rivals.mesh_parts import Part, parts_glb, tree_parts, used_vertices
+from bbfit.tree_files.gltf_materials import with_transmission
 from bbfit.tree_files.tree_file import TreeFile
 
 # Rounds of edge collapse, each with the excess of the previous one as its target; steps of the search for a grid.
 _ROUNDS, _STEPS = 4, 24
+
+
+class TooSmallError(InputError):
+    """No triangles of a tree are left within a limit."""
 
 
 @dataclass(frozen=True)
@@ -41,22 +47,31 @@ class DecimatedTree:
 def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: int | None = None) -> DecimatedTree:
     """Reduce a .glb, .gltf or .obj to at least 4 ``vertices``, or to a GLB of ``size`` bytes, textures and materials included.
 
+    JPEG textures are encoded again.
+
     Parts of different materials stay separate and share the budget by their triangles. Vertices that lie in the same place with the same
     texture coordinates are welded first. Normals are left out: surfaces are flat. Raises ``MissingFileError`` or ``InputError`` if the file
-    cannot be used, the package fast-simplification is missing, both limits or neither are given, or the limit cannot be reached.
+    cannot be used, the package fast-simplification is missing, both limits or neither are given; ``TooSmallError`` if nothing is
+    left within the limit.
     """
     if (vertices is None) == (size is None):
         fail("decimate", "expected either vertices or a size", "give one of them")
     limit = vertices if size is None else size
     assert limit is not None
     check_count("vertices" if size is None else "size", limit, 4)
-    collapse = _collapser()
-    parts = tree_parts(TreeFile.open(tree))
+    collapse, tree = _collapser(), TreeFile.open(tree)
+    parts = tree_parts(tree)
+    names = {part.material.name for part in parts if part.material is not None}
+    written = partial(with_transmission, tree=tree, colors=names)
+    # What trimesh does not write, of which fewer parts have no more.
+    further = len(written(parts_glb(parts))) - len(parts_glb(parts)) if size is not None else 0
 
     def cost(parts: list[Part]) -> int:
-        return sum(len(part.points) for part in parts) if size is None else len(parts_glb(parts))
+        return sum(len(part.points) for part in parts) if size is None else len(parts_glb(parts)) + further
 
     whole, now, clustered = parts, cost(parts), False
+    if size is not None and (least := _overhead(parts) + further) > limit:
+        raise TooSmallError(f"decimate: materials and textures alone take {least:,} bytes, more than {limit:,}")
     for _ in range(_ROUNDS):
         if now <= limit:
             break
@@ -68,7 +83,9 @@ def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: 
     if now > limit:
         # Start again from the whole tree: edge collapse has removed the trunk in favor of leaves that cannot collapse.
         parts, clustered = _clustered(whole, lambda parts: cost(parts) <= limit), True
-    return DecimatedTree(parts_glb(parts), sum(len(part.points) for part in parts), sum(len(part.faces) for part in parts), clustered)
+    return DecimatedTree(
+        written(parts_glb(parts)), sum(len(part.points) for part in parts), sum(len(part.faces) for part in parts), clustered
+    )
 
 
 def _collapser() -> Callable[[Part, int], Part]:
@@ -90,7 +107,7 @@ def _collapser() -> Callable[[Part, int], Part]:
         source = np.zeros(len(moved), np.int64)
         far_first = kept[np.argsort(-away, kind="stable")]
         source[became[far_first]] = far_first  # the last one written is the nearest of those that became a vertex
-        return used_vertices(replace(part, points=moved.astype(np.float64), faces=left.astype(np.int64), uv=_taken(part.uv, source)))
+        return used_vertices(part.taken(moved.astype(np.float64), left.astype(np.int64), source))
 
     return collapse
 
@@ -111,7 +128,7 @@ def _clustered(parts: list[Part], fits: Callable[[list[Part]], bool]) -> list[Pa
         else:
             coarse = middle
     if best is None:
-        fail("decimate", "no triangles are left within the limit", "allow more")
+        raise TooSmallError("decimate: no triangles are left within the limit")
     return best
 
 
@@ -125,11 +142,7 @@ def _merged(part: Part, low: NDArray[np.float64], cell: float) -> Part:
     faces = became[part.faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
     _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return used_vertices(replace(part, points=means, faces=faces[np.sort(kept)], uv=_taken(part.uv, first)))
-
-
-def _taken(uv: NDArray[np.float64] | None, source: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    return None if uv is None else uv[source]
+    return used_vertices(part.taken(means, faces[np.sort(kept)], first))
 
 
 def _overhead(parts: list[Part]) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bbfit.checks import check_range, fail
+from bbfit.tree_files.gltf_materials import pictures_size
 from bbfit.tree_files.tree_file import TreeFile
 
 # Estimated bytes of a glTF's JSON for the scene, and for a mesh with its material.
@@ -40,8 +40,8 @@ def draco_size(tree: str | Path | TreeFile, *, position_bits: int = 14, error: f
     except ImportError:
         fail("draco", "the package DracoPy is not installed", 'pip install "bbfit[rivals]"')
     total, vertices = _FRAME, 0
-    textures: dict[int, int] = {}
-    scene = TreeFile.open(tree).scene()
+    tree = TreeFile.open(tree)
+    scene = tree.scene()
     if error is not None:
         position_bits = min(max(1, math.ceil(math.log2(scene.extents.max() / (2 * error)))), 30)
     for mesh in scene.geometry.values():
@@ -61,9 +61,4 @@ def draco_size(tree: str | Path | TreeFile, *, position_bits: int = 14, error: f
         )
         total += len(data) + _FRAME_A_MESH
         vertices += len(DracoPy.decode(data).points)
-        picture = getattr(getattr(mesh.visual, "material", None), "baseColorTexture", None)
-        if picture is not None:
-            packed = io.BytesIO()
-            picture.save(packed, "PNG")
-            textures[id(picture)] = len(packed.getvalue())
-    return DracoSize(total + sum(textures.values()), vertices)
+    return DracoSize(total + pictures_size(tree), vertices)

@@ -20,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.checks import check_range
+from bbfit.images import srgb_to_linear
 from bbfit.rivals.mesh_parts import Part, parts_glb, tree_parts, used_vertices
 from bbfit.rivals.patch_grid import LEVELS, Floats, Integers, PatchGrid
 from bbfit.rivals.shape_wavelets import band_of, restored, transformed
 from bbfit.rivals.surface_patches import halved, linked, surface_patches
+from bbfit.tree_files.gltf_materials import with_transmission
 from bbfit.tree_files.tree_file import TreeFile
 
 STEPS = 4
@@ -57,7 +59,8 @@ def height_fields(tree: str | Path | TreeFile, spacing: float) -> HeightFields:
     spacing is not positive.
     """
     check_range("spacing", spacing, 0, float("inf"), open_low=True, open_high=True)
-    parts = tree_parts(TreeFile.open(tree))
+    tree = TreeFile.open(tree)
+    parts = tree_parts(tree)
     triangles = np.concatenate([part.points[part.faces] for part in parts])
     materials = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
     counts = np.cumsum([0] + [len(part.points) for part in parts])
@@ -77,7 +80,10 @@ def height_fields(tree: str | Path | TreeFile, spacing: float) -> HeightFields:
     owners[patches] = materials
     data = _code(grid, owners, filled, levels)
     error = _error(triangles, patches, grid, filled, levels * spacing / STEPS)
-    return HeightFields(data, len(grid.sizes), int(filled.sum()), error, parts_glb(decoded(data, [part.material for part in parts])))
+    plain = [_plain(part) for part in parts]
+    same = {part.material.name for part, material in zip(parts, plain, strict=True) if material is not None and material is part.material}
+    glb = with_transmission(parts_glb(decoded(data, plain)), tree, colors=same, textures=False)
+    return HeightFields(data, len(grid.sizes), int(filled.sum()), error, glb)
 
 
 def decoded(data: bytes, materials: list[Any]) -> list[Part]:
@@ -98,9 +104,8 @@ def decoded(data: bytes, materials: list[Any]) -> list[Part]:
     mask[rows, columns] = True
     heights = restored(coefficients, mask, LEVELS)[rows, columns] * spacing / STEPS
     points, faces, cells = _surface(grid, filled, heights)
-    plain = [_without_textures(material) for material in materials]
     of_face = np.repeat(owners[cells], 2)
-    parts = [Part(points, faces[of_face == index], None, material) for index, material in enumerate(plain)]
+    parts = [Part(points, faces[of_face == index], None, material) for index, material in enumerate(materials)]
     return [used_vertices(part) for part in parts if len(part.faces)]
 
 
@@ -186,11 +191,22 @@ def _surface(grid: PatchGrid, filled: NDArray[np.bool_], heights: Floats) -> tup
     return points, vertices[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), owners
 
 
-def _without_textures(material: Any) -> Any:
-    """A material of trimesh with the mean color of its texture in the texture's place."""
+def _plain(part: Part) -> Any:
+    """The material of a part with the mean linear color of its texture or of its vertices in their place."""
+    from trimesh.visual.material import PBRMaterial
+
+    if part.colors is not None:
+        return PBRMaterial(baseColorFactor=np.rint(part.colors.mean(0)).astype(np.uint8), metallicFactor=0.0, doubleSided=True)
+    material = part.material
     picture = getattr(material, "baseColorTexture", None)
     if picture is None:
         return material
-    from trimesh.visual.material import PBRMaterial
-
-    return PBRMaterial(baseColorFactor=np.asarray(picture.convert("RGB")).reshape(-1, 3).mean(0).astype(np.uint8), metallicFactor=0.0)
+    texels = np.asarray(picture.convert("RGBA")).reshape(-1, 4) / 255
+    seen = np.ones(len(texels)) if material.alphaMode in (None, "OPAQUE") else texels[:, 3] + 1e-9
+    mean = seen @ srgb_to_linear(texels[:, :3]) / seen.sum()
+    factor = np.ones(3) if material.baseColorFactor is None else np.asarray(material.baseColorFactor)[:3] / 255
+    plain = material.copy()
+    for name in ("baseColorTexture", "metallicRoughnessTexture", "normalTexture", "occlusionTexture", "emissiveTexture"):
+        setattr(plain, name, None)
+    plain.alphaMode, plain.baseColorFactor = None, np.append(np.rint(255 * mean * factor), 255).astype(np.uint8)
+    return plain

@@ -12,8 +12,9 @@ this module slices the whole tree, so a stem that a slab cuts shows its inside.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ class Slicings:
             fail("azimuths", f"expected {even.tolist()} for {len(self.clouds)} slicings, got {list(self.azimuths_degrees)}")
 
     def weights(self, camera: Camera) -> list[tuple[int, float]]:
-        """The two slicings nearest to a camera's azimuth and their weights, which sum to 1.
+        """The two slicings nearest to a camera's azimuth, or the only one, and their weights, which sum to 1.
 
         A parallel camera's direction is its own, a pinhole's that of its center. A camera straight above has azimuth 0.
         """
@@ -57,14 +58,19 @@ class Slicings:
         count = len(self.clouds)
         place = (azimuth % 180) * count / 180
         first = int(place)
+        if count == 1:
+            return [(0, 1.0)]
         return [(first % count, 1 - (place - first)), ((first + 1) % count, place - first)]
 
-    def draw(self, camera: Camera) -> Tensor:
-        """Draw the tree as premultiplied RGBA, [V, H, W, 4] ([H, W, 4] for a single camera)."""
+    def draw(self, camera: Camera, drawn: Sequence[Callable[[Camera], Tensor]] | None = None) -> Tensor:
+        """Draw the tree as premultiplied RGBA, [V, H, W, 4] ([H, W, 4] for a single camera).
+
+        ``drawn`` are functions that draw each direction's slices for one camera. Default: those that draw the textures bilinearly.
+        """
         if camera.batched:
-            return torch.stack([self.draw(camera[index]) for index in range(len(camera))])
-        drawn = [weight * render(self.clouds[index], camera) for index, weight in self.weights(camera) if weight > 0]
-        return torch.stack(drawn).sum(0)
+            return torch.stack([self.draw(camera[index], drawn) for index in range(len(camera))])
+        drawn = drawn or [partial(render, cloud) for cloud in self.clouds]
+        return torch.stack([weight * drawn[index](camera) for index, weight in self.weights(camera) if weight > 0]).sum(0)
 
 
 def slicing(

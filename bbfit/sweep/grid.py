@@ -107,7 +107,9 @@ class Grid:
             for variant, settings in (self.variants or {"": {}}).items():
                 for values in product(*self.axes.values()):
                     chosen = dict(zip(self.axes, values, strict=True))
-                    labels = ({VARIANT: variant} if variant else {}) | {name: str(value) for name, value in chosen.items()}
+                    labels = ({VARIANT: variant} if variant else {}) | {
+                        name: "default" if value is None else str(value) for name, value in chosen.items()
+                    }
                     try:
                         config = FitConfig(**{**self.fit, **shared, **settings, **chosen}).resolve()
                     except InputError as error:

@@ -38,7 +38,7 @@ def read_gltf(path: Path, limits: InputLimits) -> list[Path]:
                     files[file] = file.read_bytes()
                 buffers.append(files[file])
             else:
-                buffers.append(binary if uri is None else _decoded(uri))
+                buffers.append(binary if uri is None else decoded_uri(uri))
         views = entries_of(content, "bufferViews")
         for entry in entries_of(content, "images"):
             uri = entry.get("uri")
@@ -47,7 +47,7 @@ def read_gltf(path: Path, limits: InputLimits) -> list[Path]:
             elif isinstance(uri, str) and not uri.startswith("data:"):
                 pictures.append(_referenced(path, uri, limits))
             elif uri is not None:
-                pictures.append(_decoded(uri))
+                pictures.append(decoded_uri(uri))
         check_gltf(path, content, buffers, limits)
         check_pictures(path, pictures, limits)
         return list(dict.fromkeys((*files, *(picture for picture in pictures if isinstance(picture, Path)))))
@@ -64,7 +64,7 @@ def _referenced(path: Path, uri: str, limits: InputLimits) -> Path:
     return target
 
 
-def _decoded(uri: Any) -> bytes:
+def decoded_uri(uri: Any) -> bytes:
     """The bytes in a data URI."""
     if not isinstance(uri, str):
         raise ValueError("a URI is no text")

@@ -40,6 +40,7 @@ _REFERENCES |= dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), usd_files)
 _CHECKS = {".obj": check_obj, ".ply": check_ply, ".stl": check_stl}
 # Files that trees refer to and that are not pictures.
 _NO_PICTURES = (*UP_AXES, ".mtl", ".bin")
+GLTF_SUFFIXES = (".glb", ".gltf")
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 """The formats whose triangles can be read without Blender."""
 Y_UP_MESHES = (".glb", ".gltf", ".obj")

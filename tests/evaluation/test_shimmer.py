@@ -135,7 +135,7 @@ def test_unusable_renders_and_pairs_are_refused(pairs: TurnedViews) -> None:
 
 
 def test_mip_levels_are_those_of_the_file_however_the_mask_is_drawn(pairs: TurnedViews) -> None:
-    model = shipped_model(replace(crossing_billboards(), alpha=AlphaMode("mask")), ExportConfig(mip_files=True))
+    model = shipped_model(replace(crossing_billboards(), alpha=AlphaMode("mask")), ExportConfig(textures="ktx2"))
     smoothed = shipped_model(replace(model.cloud, alpha=AlphaMode("mask", antialiased=True)), model.config)
     assert model.antialiased().cards is model.cards and model.cards.chain and smoothed.cards.chain
     assert all(np.array_equal(*levels) for levels in zip(model.cards.chain, smoothed.cards.chain, strict=True))

@@ -133,3 +133,12 @@ def test_nothing_visible() -> None:
     np.testing.assert_array_equal(atlas.image[rectangles(atlas)[1]], other)
     mean = np.rint(np.average(other.reshape(-1, 4)[:, :3], 0, other[..., 3].ravel()))
     assert (atlas.image[rectangles(atlas)[0]] == [*mean, 0]).all()
+
+
+@pytest.mark.parametrize("padding", [1, 2, 3, 5])
+@pytest.mark.parametrize("halvings", [1, 2, 3])
+def test_an_atlas_that_will_be_halved_is_made_of_whole_blocks(padding: int, halvings: int) -> None:
+    textures = [np.full((5, 9, 4), 255, np.uint8), np.full((17, 3, 4), 255, np.uint8)]
+    atlas, unit = pack_atlas(textures, padding, halvings=halvings), 1 << halvings
+    assert all(side % (4 * unit) == 0 for side in atlas.image.shape[:2])
+    assert (atlas.corners % unit == 0).all() and (atlas.corners >= padding * unit).all()

@@ -47,7 +47,8 @@ def test_names_and_facts_are_there_and_nothing_else_changes(crossed: BillboardCl
     assert facts["score"] == {"psnr": 24.509, "flip": 0.04265, "views": 23} and facts["tree_bounds"][1] == [1, 2.1235, 1]
     scene = trimesh.load(io.BytesIO(glb), file_type="glb", process=False)
     placed = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
-    points = np.concatenate([trimesh.transform_points(scene.geometry[mesh].vertices, matrix) for matrix, mesh in placed])
+    meshes = [(scene.geometry[name], matrix) for matrix, name in placed]
+    points = np.concatenate([trimesh.transform_points(mesh.vertices[np.unique(mesh.faces)], matrix) for mesh, matrix in meshes])
     np.testing.assert_allclose(facts["bounds"], [points.min(0), points.max(0)], rtol=1e-4, atol=1e-6)
     root = after["nodes"][after["scenes"][0]["nodes"][0]]["extras"]["bbfit"]
     assert root == {"tree_bounds": facts["tree_bounds"], "distances": facts["distances"]}
@@ -57,7 +58,8 @@ def test_names_and_facts_are_there_and_nothing_else_changes(crossed: BillboardCl
 
 def test_what_is_not_known_is_left_out(crossed: BillboardCloud) -> None:
     bare = Description("x", 2, AlphaMode("blend", 0.5), "maps")
-    tree, _ = split_glb(described_glb(shipped_model(crossed).glb, bare))
+    model = shipped_model(crossed)
+    tree, _ = split_glb(described_glb(model.glb, bare, model.cards))
     facts = tree["asset"]["extras"]["bbfit"]
     assert set(facts) == {"tree", "billboards", "alpha", "light", "bounds"}
     assert facts["light"] == {"kind": "maps"} and facts["alpha"] == {"mode": "blend"}

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.gaps import with_filled_gaps
+from bbfit.exporting.gltf import texture_files
 from bbfit.exporting.mip_matching import densities
 from bbfit.exporting.mips import plain_chain
 from bbfit.exporting.model import shipped_model
@@ -134,5 +138,22 @@ def test_only_pictures_that_programs_average_have_filled_gaps() -> None:
     assert png.chain is not None
     assert all(np.array_equal(*pair) for pair in zip(png.chain, plain_chain(png.atlas.image), strict=True))
     assert steps[-1] == ("mip levels", len(steps), len(steps))
-    own = shipped_model(cloud, ExportConfig(mip_files=True)).cards
-    assert np.array_equal(own.atlas.image, empty)
+    own = shipped_model(cloud, ExportConfig(textures="ktx2", fallback=False))
+    assert np.array_equal(own.cards.atlas.image, empty) and own.cards.averaged is None
+
+
+def test_a_png_beside_ktx2_has_filled_gaps(tmp_path: Path) -> None:
+    """In a GLB and in an OBJ: programs that cannot read KTX2 average the levels of the PNG. The levels of KTX2 are of empty gaps."""
+    cloud = crown("mask")
+    png, both = (shipped_model(cloud, ExportConfig(textures=textures)) for textures in ("png", "ktx2"))  # type: ignore[arg-type]
+    alone = shipped_model(cloud, ExportConfig(textures="ktx2", fallback=False))
+    filled = png.cards.atlas.image
+    assert both.cards.chain is not None and alone.cards.chain is not None
+    assert all(np.array_equal(*levels) for levels in zip(both.cards.chain, alone.cards.chain, strict=True))
+    files = texture_files(both.cards, both.config)
+    assert files["atlas.ktx2"] == texture_files(alone.cards, alone.config)["atlas.ktx2"]
+    pictures = [files["atlas.png"]]
+    for model, name in ((both, "both"), (alone, "alone")):
+        model.save(tmp_path / f"{name}.obj")
+        pictures.append((tmp_path / f"{name}.png").read_bytes())
+    assert all(np.array_equal(np.array(Image.open(io.BytesIO(data)).convert("RGBA")), filled) for data in pictures)

@@ -8,6 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+import torch
 from glb_viewer import view_glb
 from gltf_arrays import array, matrix
 from khronos import messages
@@ -87,6 +88,19 @@ def test_normals_and_tangents_keep_their_directions(clouds: dict[str, BillboardC
         np.testing.assert_array_equal(rows[:, 3:], exact[:, 3:])  # the sign of the bitangent
     saved = len(floats.read_bytes()) - len(integers.read_bytes())
     assert saved > 27 * len(rows)  # 4 bytes each of positions and coordinates, 8 of normals, 12 of tangents, less some JSON
+
+
+@pytest.mark.parametrize("profile", ["three", "cesium"])
+def test_nodes_with_equal_normals_keep_them(profile: Profile, crossed: BillboardCloud, tmp_path: Path) -> None:
+    """trimesh lets meshes share the accessor of equal values."""
+    shifted = replace(crossed.take([0, 0, 0]), centers=crossed.centers[[0, 0, 0]] + torch.tensor([[0.0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]]))
+    config = ExportConfig(alpha="blend", profile=profile, material="pbr")
+    (path,) = export(shifted, tmp_path / "tree.glb", config)
+    tree, contents, found = _attributes(path)
+    shared = [each[name] for each in found for name in each]
+    assert len(found) > 1 and len(set(shared)) < len(shared) and messages(path) == []
+    for each in found:
+        np.testing.assert_allclose(np.linalg.norm(array(tree, contents, each["NORMAL"]), axis=-1), 1, atol=0.02)
 
 
 def test_split_nodes_stay_at_their_origins(crossed: BillboardCloud, tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from bbfit.rendering.cards import CardRenderer
 SUN = Light(*(torch.tensor(values).double() for values in ([[0.0, 0.6, 0.8]], [5.0], [[1.0, 1.0, 1.0]], [0.4])))
 CONFIGS = {
     "mask": ExportConfig(alpha="mask", alpha_cutoff=0.5),
-    "mask with mip levels": ExportConfig(alpha="mask", alpha_cutoff=0.5, mip_files=True),
+    "mask with mip levels": ExportConfig(alpha="mask", alpha_cutoff=0.5, textures="ktx2"),
     "mask with the program's mip levels": ExportConfig(alpha="mask", alpha_cutoff=0.2),
     "blend in nodes": ExportConfig(alpha="blend", profile="three"),
     "hash": ExportConfig(alpha="hash"),
@@ -128,7 +128,7 @@ def test_what_does_not_fit_into_one_picture_goes_to_several() -> None:
 
 
 def test_maps_share_the_atlas_too(tmp_path: Path) -> None:
-    config = ExportConfig(mip_files=True)
+    config = ExportConfig()
     models = [column(SUN, color) for color in ((0.6, 0.5, 0.3), (0.2, 0.5, 0.9))]
     own = cards_of(models, config)
     page = page_of(own, config)

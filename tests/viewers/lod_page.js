@@ -6,6 +6,8 @@ const center = [0, 1, 0];
 const canvas = document.getElementById("canvas");
 const query = new URLSearchParams(location.search);
 const program = query.get("program");
+// Of the tree, about its center. With another than 1, three.js shows a clone.
+const scale = Number(query.get("scale") ?? 1);
 
 const programs = {
   async three() {
@@ -14,7 +16,11 @@ const programs = {
     const renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
     const scene = new THREE.Scene();
     const camera = new THREE.PerspectiveCamera(FOV, 1, 1, 10000);
-    scene.add(await loadLod("/levels/lod.json", { height: SIZE, fov: FOV }));
+    const lod = await loadLod("/levels/lod.json", { height: SIZE, fov: FOV });
+    const shown = scale === 1 ? lod : lod.clone();
+    shown.scale.setScalar(scale);
+    shown.position.y = center[1] * (1 - scale);
+    scene.add(shown);
     return (distance) => {
       camera.position.set(center[0], center[1], center[2] + distance);
       renderer.render(scene, camera);
@@ -80,7 +86,10 @@ const programs = {
     const camera = new Entity();
     camera.addComponent("camera", { fov: FOV, nearClip: 1, farClip: 10000, clearColor: new Color(0, 0, 0), toneMapping: TONEMAP_NONE });
     app.root.addChild(camera);
-    app.root.addChild(await loadLod("/levels/lod.json", app, camera, { height: SIZE }));
+    const tree = await loadLod("/levels/lod.json", app, camera, { height: SIZE });
+    tree.setLocalScale(scale, scale, scale);
+    tree.setLocalPosition(0, center[1] * (1 - scale), 0);
+    app.root.addChild(tree);
     return (distance) => {
       camera.setPosition(center[0], center[1], center[2] + distance);
       return new Promise((resolve) => {

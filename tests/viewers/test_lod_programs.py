@@ -113,6 +113,15 @@ def test_programs_show_the_level_of_the_distance_alone(program: str, chromium: t
             assert found.sum() == found[level]
 
 
+@pytest.mark.parametrize("program", ["three", "playcanvas"])
+def test_a_larger_copy_has_its_levels_from_farther_away(program: str, chromium: tuple[Browser, ThreadPoolExecutor], tmp_path: Path) -> None:
+    """Also one that three.js cloned."""
+    with closing(Levels(*chromium, levels_folder(tmp_path / "levels", program), f"program={program}&scale=2")) as page:
+        for level, distance in enumerate(SHOWN):
+            found = page.shares(2 * distance)
+            assert found[level] == found.sum() == pytest.approx(share(distance, SIDES[level]), rel=0.15)
+
+
 @pytest.mark.parametrize("program", ["three", "field"])
 def test_levels_fade_into_each_other_in_three(program: str, chromium: tuple[Browser, ThreadPoolExecutor], tmp_path: Path) -> None:
     """Half of the way through the fade, which is a tenth of the distance, each shows about half of the pixels and none is left out."""

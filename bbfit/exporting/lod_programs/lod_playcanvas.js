@@ -11,7 +11,9 @@ export async function loadLod(url, app, camera, { height } = {}) {
   for (const { file } of levels) tree.addChild(await load(app, new URL(encodeURIComponent(file), new URL(url, location)).href));
   const center = new Vec3().lerp(new Vec3(extent.low), new Vec3(extent.high), 0.5);
   const choose = () => {
-    const distance = tree.getWorldTransform().transformPoint(center).distance(camera.getPosition());
+    const world = tree.getWorldTransform();
+    const { x, y, z } = world.getScale();
+    const distance = world.transformPoint(center).distance(camera.getPosition()) / Math.max(x, y, z);
     const chosen = levels.findLastIndex((level, index) => index === 0 || distance >= factor * level.distance_meters);
     tree.children.forEach((entity, index) => (entity.enabled = index === chosen));
   };

@@ -104,8 +104,9 @@ window.forest.ready = new Promise((resolve, reject) => Object.assign(window.fore
 
   function readPose() {
     const pose = location.hash.slice(1).split(",").map(Number);
-    if (pose.length === 5 && pose.every(Number.isFinite)) walker.setPose(...pose);
-    return pose.length === 5;
+    const whole = pose.length === 5 && pose.every(Number.isFinite);
+    if (whole) walker.setPose(...pose);
+    return whole;
   }
 
   function setDistance(meters) {

@@ -3,6 +3,8 @@
 // upright tree.
 window.bbfit = (() => {
   const STEEPEST = Math.PI / 2 - 0.05;
+  // What an arrow key turns by.
+  const STEP = Math.PI / 36;
   const TURNED_NORMAL = "transformedNormal = m * transformedNormal;";
 
   // The namespace of three.js, which the page in a hidden frame defines.
@@ -137,6 +139,16 @@ window.bbfit = (() => {
         orbit.azimuth -= (Math.PI * right) / canvas.clientHeight;
         orbit.elevation += (Math.PI * down) / canvas.clientHeight;
       }
+      update();
+    });
+    canvas.addEventListener("keydown", (event) => {
+      const turns = { ArrowLeft: [-STEP, 0], ArrowRight: [STEP, 0], ArrowUp: [0, STEP], ArrowDown: [0, -STEP] }, turn = turns[event.key];
+      const zoom = { "+": 0.9, "=": 0.9, "-": 1 / 0.9 }[event.key];
+      if (event.ctrlKey || event.metaKey || event.altKey || !(turn || zoom)) return;
+      event.preventDefault();
+      orbit.azimuth += turn?.[0] ?? 0;
+      orbit.elevation += turn?.[1] ?? 0;
+      orbit.distance *= zoom ?? 1;
       update();
     });
     canvas.addEventListener("wheel", (event) => {

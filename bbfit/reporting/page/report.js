@@ -115,10 +115,12 @@
     dark.addEventListener("change", draw);
     bbfit.model = { canvas, camera: orbit.camera, draw, orbit };
   }
-  drawModel();
-
   // The wheel and a finger scroll the page until the reader clicks the model, and again once it is out of sight.
   const turn = document.getElementById("turn");
+  drawModel().catch((failure) => {
+    turn.disabled = true;
+    turn.textContent = `The model cannot be shown: ${failure.message}. It needs WebGL.`;
+  });
   turn.addEventListener("click", () => { turn.hidden = true; });
   new IntersectionObserver((seen) => { if (!seen[0].isIntersecting) turn.hidden = false; }).observe(turn.parentElement);
 }

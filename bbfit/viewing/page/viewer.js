@@ -12,6 +12,7 @@
   const renderer = bbfit.createRenderer(THREE, document.querySelector("canvas")), canvas = renderer.domElement;
   const scene = new THREE.Scene(), groups = { original: new THREE.Group(), billboards: new THREE.Group(), field: new THREE.Group() };
   const light = bbfit.createLight(THREE, scene), ground = new THREE.LineSegments(undefined, new THREE.LineBasicMaterial());
+  const outlines = new THREE.LineSegments(undefined, new THREE.LineBasicMaterial({ vertexColors: true }));
   scene.add(...Object.values(groups), ground);
   const models = new Map(); // by address: null while it loads, false if that failed
   const intervals = [], durations = [];
@@ -183,6 +184,7 @@
 
   async function plant(moveCamera) {
     const [trees, seed] = [controls.trees, controls.seed].map((input) => Math.round(Math.min(Math.max(input.value, input.min), input.max)));
+    [controls.trees.value, controls.seed.value] = [trees, seed];
     const address = `/${tree.generation}/field/${trees}/${seed}`;
     if (field?.address !== address) {
       loading += 1;
@@ -244,13 +246,29 @@
     if (model === null) return;
     groups.billboards.clear();
     groups.billboards.add(model.root);
-    if (controls.outlines.checked) {
-      tree.outlines[level.cloud].forEach((corners, index) => {
-        const points = new THREE.BufferGeometry().setFromPoints(corners.map((corner) => new THREE.Vector3(...corner)));
-        groups.billboards.add(new THREE.LineLoop(points, new THREE.LineBasicMaterial({ color: tree.colors[index] })));
-      });
-    }
+    if (controls.outlines.checked) groups.billboards.add(outlinesOf(level));
     forget();
+  }
+
+  // The outlines of a level's billboards, which are kept until others are shown.
+  function outlinesOf(level) {
+    const shown = `${tree.generation} ${level.cloud}`;
+    if (outlines.name !== shown) {
+      const points = [], colors = [];
+      tree.outlines[level.cloud].forEach((corners, index) => {
+        const color = new THREE.Color(tree.colors[index]).toArray();
+        corners.forEach((corner, number) => {
+          points.push(...corner, ...corners[(number + 1) % corners.length]);
+          colors.push(...color, ...color);
+        });
+      });
+      outlines.geometry.dispose();
+      outlines.geometry = new THREE.BufferGeometry();
+      outlines.geometry.setAttribute("position", new THREE.Float32BufferAttribute(points, 3));
+      outlines.geometry.setAttribute("color", new THREE.Float32BufferAttribute(colors, 3));
+      outlines.name = shown;
+    }
+    return outlines;
   }
 
   function label(pane, name, details) {
@@ -410,4 +428,6 @@
   };
   poll();
   requestAnimationFrame(tick);
-})();
+})().catch((failure) => {
+  document.getElementById("status").textContent = `The page cannot show anything: ${failure.message}. It needs WebGL.`;
+});
