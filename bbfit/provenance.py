@@ -19,17 +19,17 @@ from bbfit.checks import check_file
 
 VERSIONS: Mapping[str, int] = {
     "grow": 2,
-    "convert": 1,
+    "convert": 2,
     "views": 8,
     "budget": 17,
     "fit": 27,
-    "export": 19,
+    "export": 20,
     "evaluate": 20,
-    "report": 13,
-    "lod": 11,
-    "compare": 9,
+    "report": 14,
+    "lod": 12,
+    "compare": 10,
     "frames": 2,
-    "library": 4,
+    "library": 5,
     "forest": 3,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""

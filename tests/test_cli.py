@@ -432,6 +432,8 @@ def test_bad_sweeps_are_one_line(options: list[str], complaint: str, tmp_path: P
 
 def test_bad_comparisons_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "does not exist" in refused(["compare", str(tmp_path / "none.glb"), "--out", str(tmp_path)], capsys)
+    for options in (["--seeds", "1", "2"], ["--detail", "0.3"], ["--workers", "2"], ["--ray", "local"]):
+        assert "are for --trees and --species" in refused(["compare", "tree.glb", *options], capsys)
     assert "systems: expected one of" in refused(["compare", "tree.glb", "--systems", "octree"], capsys)
 
 

@@ -30,7 +30,7 @@ from bbfit.rivals.baking import tree_triangles
 from bbfit.rivals.billboard_clouds import billboard_cloud
 from bbfit.rivals.crossed import crossed_planes
 from bbfit.rivals.decimation import TooSmallError, decimate
-from bbfit.rivals.draco import draco_size
+from bbfit.rivals.draco import draco_geometry_bytes, draco_size
 from bbfit.rivals.height_fields import height_fields
 from bbfit.rivals.learned_mesh import learn_mesh, mesh_glb
 from bbfit.rivals.octahedral import octahedral_impostor
@@ -199,8 +199,8 @@ def _height_fields(subject: Subject, folder: Path) -> SystemResult:
     started = time.perf_counter()
     coded = height_fields(subject.tree, 1 / subject.bake.texels_per_meter)
     seconds = time.perf_counter() - started
-    compressed = draco_size(subject.tree, error=coded.error)
-    note = f"{coded.patches:,} patches; wrong by {1000 * coded.error:.1f} mm (RMS), at which Draco takes {compressed.bytes:,} bytes"
+    draco = draco_geometry_bytes(subject.tree, coded.error)
+    note = f"{coded.patches:,} patches; wrong by {1000 * coded.error:.1f} mm (RMS), at which Draco takes {draco:,} bytes for the triangles"
     result = _rendered(coded.glb, subject, folder, seconds, note)
     return replace(result, model=None, vertices=None, size=len(coded.data), fragments=None, shader=True)
 

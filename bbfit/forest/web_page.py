@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from string import Template
 from typing import Annotated, Any
 from urllib.parse import unquote
 
@@ -108,10 +109,9 @@ def write_page(
         write_bytes(page / name, (own / name).read_bytes())
     write_bytes(page / "drawing.js", drawing_script().encode())
     counts = f"{_number(root.count, 'tree')} of {_number(len(library.trees), 'kind')}"
-    filled = (own / "index.html").read_text(encoding="utf-8")
-    for name, text in {"generator": generator(), "title": config.title, "counts": counts, "library": _library_frame()}.items():
-        filled = filled.replace(f"${name}", html.escape(text))
-    write_bytes(page / "index.html", filled.encode())
+    texts = {"generator": generator(), "title": config.title, "counts": counts, "library": _library_frame()}
+    filled = Template((own / "index.html").read_text(encoding="utf-8"))
+    write_bytes(page / "index.html", filled.substitute({name: html.escape(text) for name, text in texts.items()}).encode())
     return page / "index.html"
 
 

@@ -71,7 +71,7 @@ def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: 
 
     whole, now, clustered = parts, cost(parts), False
     if size is not None and (least := _overhead(parts) + further) > limit:
-        raise TooSmallError(f"decimate: materials and textures alone take {least:,} bytes, more than {limit:,}")
+        raise TooSmallError(f"decimate: no triangles are left within the limit: of {limit:,} bytes, materials and textures take {least:,}")
     for _ in range(_ROUNDS):
         if now <= limit:
             break

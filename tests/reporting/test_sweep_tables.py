@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from bbfit.evaluation.published import Experiment, published_figures
 from bbfit.images import read_rgba
 from bbfit.reporting.sweep_plots import sweep_plot
-from bbfit.reporting.sweep_tables import THESIS_SCALE, SweepRow, effects, pivot, table_csv, table_markdown
+from bbfit.reporting.sweep_tables import THESIS_SCALE, SweepRow, effects, percent, pivot, table_csv, table_markdown
 from bbfit.reporting.tables import sweep_table
 
 
@@ -136,3 +137,31 @@ def test_the_screen_shows_names_and_reasons_as_they_are() -> None:
     out = io.StringIO()
     Console(file=out, width=150, emoji=False).print(sweep_table([failed]))
     assert "c/[/b] " in out.getvalue() and "[red]" in out.getvalue() and "failed: tree: c/[/b].glb is empty" in out.getvalue()
+
+
+def test_numbers_of_billboards_are_in_order_and_one_may_be_left_to_the_fit(tmp_path: Path) -> None:
+    """Tables and the picture, also where a configuration or a number failed for the first tree."""
+    labels = ("default", "16", "2", "12")
+    rows = [replace(row("acer", 20.0, loss="l2"), labels={"loss": "l2", "billboards": label}) for label in labels if label != "2"]
+    rows += [replace(row("oak", 20.0, loss=loss), labels={"loss": loss, "billboards": label}) for loss in ("l2", "l1") for label in labels]
+    head, *_ = cells(pivot(rows, THESIS_SCALE[2:3]))
+    numbers = ["2", "12", "16", "default"]
+    assert head[2:-1] == [f"acer {label}" for label in numbers[1:]] + [f"oak {label}" for label in numbers]
+    changes = [one.change for one in effects(rows) if one.tree == "oak" and one.change.startswith("billboards")]
+    assert changes == ["billboards 2 → 12", "billboards 12 → 16", "billboards 16 → default"]
+    figures: list[Figure] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bbfit.reporting.sweep_plots.write_figure", lambda figure, path: figures.append(figure))
+        sweep_plot(rows, tmp_path / "table.png")
+    (figure,) = figures
+    assert [text.get_text() for text in figure.axes[-1].get_xticklabels()] == numbers
+    assert all((np.diff(line.get_xdata()) > 0).all() for axis in figure.axes for line in axis.get_lines())
+    assert sorted(text.get_text() for text in figure.legends[0].get_texts()) == ["l1", "l2"]
+
+
+@pytest.mark.parametrize(
+    ("ratio", "shown"),
+    [(51.24, "5,124 %"), (0.0411872, "4.12 %"), (1, "100 %"), (9.37e-7, "< 0.001 %"), (0, "0 %"), (1.2e-5, "0.0012 %"), (0.5, "50 %")],
+)
+def test_a_ratio_is_in_percent_without_powers_of_ten(ratio: float, shown: str) -> None:
+    assert percent(ratio) == shown

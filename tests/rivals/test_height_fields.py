@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import DracoPy
 import numpy as np
 import pytest
 import trimesh
 
 from bbfit.checks import InputError
-from bbfit.rivals.draco import draco_size
+from bbfit.rivals.draco import draco_geometry_bytes, draco_size
 from bbfit.rivals.height_fields import decoded, height_fields
 from bbfit.rivals.mesh_parts import tree_parts
 from bbfit.rivals.shape_wavelets import band_of, restored, transformed
@@ -95,8 +96,13 @@ def test_the_code_contains_all_that_a_decoder_needs() -> None:
 
 
 def test_draco_takes_as_many_bits_as_an_error_allows(ball: Path) -> None:
-    """A ball of diameter 2 with an error of 1 / 2 ** 8 takes 8 bits a coordinate."""
-    assert draco_size(ball, error=2.0**-8) == draco_size(ball, position_bits=8)
+    """A ball of diameter 2 with an error of 1 / 2 ** 8 takes 8 bits a coordinate. Another bit halves the error."""
+    sizes = [draco_geometry_bytes(ball, 2.0**-bits) for bits in (8, 9)]
+    mesh = tree_parts(TreeFile.open(ball))[0]
+    assert sizes == [
+        len(DracoPy.encode(mesh.points.astype(np.float32), mesh.faces, quantization_bits=bits, compression_level=10)) for bits in (8, 9)
+    ]
+    assert sizes[0] < sizes[1] < draco_size(ball).bytes
 
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, float("inf"), float("nan")])
