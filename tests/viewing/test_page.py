@@ -141,6 +141,36 @@ def test_outlines_are_drawn_around_the_billboards_alone(opened: Opened) -> None:
     assert changed.sum() > 300
 
 
+def test_outlines_take_no_more_memory_while_the_camera_turns(opened: Opened) -> None:
+    _, tab = opened
+    tab.do(lambda page: page.get_by_label("plane outlines").click())
+    before = tab.picture("right")
+
+    def turned() -> dict[str, int]:
+        tab.do(lambda page: page.evaluate("bbfit.viewer.orbit.azimuth += 0.1; bbfit.viewer.orbit.update()"))
+        assert not np.array_equal(before, tab.picture("right"))
+        return tab.do(lambda page: page.evaluate("bbfit.viewer.memory"))
+
+    first, *others = (turned() for _ in range(4))
+    assert others == [first] * 3
+
+
+def test_keys_turn_and_zoom(opened: Opened) -> None:
+    _, tab = opened
+    tab.picture("left")
+
+    def pose() -> list[float]:
+        return tab.do(lambda page: page.evaluate("(({ azimuth, elevation, distance }) => [azimuth, elevation, distance])(bbfit.viewer.orbit)"))
+
+    before = pose()
+    for key in ("ArrowRight", "ArrowUp", "+", "-", "-"):
+        tab.do(lambda page, key=key: page.locator("canvas").press(key))
+    turned = [after - value for after, value in zip(pose(), before, strict=True)]
+    assert turned == pytest.approx([np.pi / 36, np.pi / 36, before[2] * (1 / 0.9 - 1)])
+    tab.do(lambda page: page.locator("canvas").press("Control+ArrowLeft"))  # belongs to the browser
+    assert pose()[0] == pytest.approx(before[0] + np.pi / 36)
+
+
 @pytest.mark.parametrize("alpha", ["blend", "hash", "coverage"])
 def test_alpha_modes_change_the_billboards_alone(opened: Opened, alpha: str) -> None:
     _, tab = opened

@@ -424,6 +424,7 @@
     get idle() { return tree !== null && loading === 0 && !dirty && toMeasure === 0; },
     get frame() { return { intervals: [...intervals], durations: [...durations], ...renderer.info.render }; },
     get field() { return field; },
+    get memory() { return { ...renderer.info.memory }; },
     get shares() { return models.get(originalAddress())?.shares; },
   };
   poll();
