@@ -47,12 +47,10 @@ class DecimatedTree:
 def decimate(tree: str | Path | TreeFile, *, vertices: int | None = None, size: int | None = None) -> DecimatedTree:
     """Reduce a .glb, .gltf or .obj to at least 4 ``vertices``, or to a GLB of ``size`` bytes, textures and materials included.
 
-    JPEG textures are encoded again.
-
     Parts of different materials stay separate and share the budget by their triangles. Vertices that lie in the same place with the same
-    texture coordinates are welded first. Normals are left out: surfaces are flat. Raises ``MissingFileError`` or ``InputError`` if the file
-    cannot be used, the package fast-simplification is missing, both limits or neither are given; ``TooSmallError`` if nothing is
-    left within the limit.
+    texture coordinates are welded first. Normals are left out: surfaces are flat. JPEG textures are encoded again. Raises
+    ``MissingFileError`` or ``InputError`` if the file cannot be used, the package fast-simplification is missing, both limits or neither
+    are given; ``TooSmallError`` if nothing is left within the limit.
     """
     if (vertices is None) == (size is None):
         fail("decimate", "expected either vertices or a size", "give one of them")

@@ -71,7 +71,7 @@ def draco_geometry_bytes(tree: str | Path | TreeFile, error: float) -> int:
     check_range("error", error, 0, math.inf, open_low=True, open_high=True)
     draco, total = _draco(), 0
     for part in tree_parts(TreeFile.open(tree)):
-        bits = min(max(1, math.ceil(math.log2(np.ptp(part.points, axis=0).max() / (2 * error)))), 30)
+        bits = min(max(1, math.ceil(math.log2((np.ptp(part.points, axis=0).max() + 1e-30) / (2 * error)))), 30)
         points, faces = part.points.astype(np.float32), part.faces.astype(np.uint32)
         total += len(draco.encode(points, faces, quantization_bits=bits, compression_level=_LEVEL))
     return total
