@@ -160,7 +160,7 @@ def test_keys_turn_and_zoom(opened: Opened) -> None:
     tab.picture("left")
 
     def pose() -> list[float]:
-        return tab.do(lambda page: page.evaluate("(({ azimuth, elevation, distance }) => [azimuth, elevation, distance])(bbfit.viewer.orbit)"))
+        return tab.do(lambda page: page.evaluate("['azimuth', 'elevation', 'distance'].map((name) => bbfit.viewer.orbit[name])"))
 
     before = pose()
     for key in ("ArrowRight", "ArrowUp", "+", "-", "-"):
