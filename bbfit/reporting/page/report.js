@@ -119,7 +119,7 @@
   const turn = document.getElementById("turn");
   drawModel().catch((failure) => {
     turn.disabled = true;
-    turn.textContent = `The model cannot be shown: ${failure.message}. It needs WebGL.`;
+    turn.textContent = `The model needs WebGL: ${failure.message}`;
   });
   turn.addEventListener("click", () => { turn.hidden = true; });
   new IntersectionObserver((seen) => { if (!seen[0].isIntersecting) turn.hidden = false; }).observe(turn.parentElement);

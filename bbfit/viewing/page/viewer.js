@@ -430,5 +430,5 @@
   poll();
   requestAnimationFrame(tick);
 })().catch((failure) => {
-  document.getElementById("status").textContent = `The page cannot show anything: ${failure.message}. It needs WebGL.`;
+  document.getElementById("status").textContent = `The page needs WebGL: ${failure.message}`;
 });
