@@ -136,7 +136,7 @@ def _page(numbers: list[int], models: Sequence[Cards], places: list[NDArray[np.i
         if surfaces:
             surfaces += surface_chain(surfaces[last], opacity if own_levels else None)[1:]
     averaged = None
-    if chosen[0].averaged is not None:
+    if any(cards.averaged is not None for cards in chosen):
         (averaged,) = assembled([(cards.atlas.image if cards.averaged is None else cards.averaged,) for cards in chosen], gap)
     made = []
     for cards, atlas in zip(chosen, atlases, strict=True):

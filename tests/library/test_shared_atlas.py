@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from two_models import cards_of, clouds, page_of, plain, write_models
 from bbfit.checks import InputError
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.encoders import encode_webp
-from bbfit.exporting.gltf import texture_names
+from bbfit.exporting.gltf import texture_files, texture_names
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import Cards
 from bbfit.geometry.light import Light
@@ -96,6 +97,25 @@ def test_mip_levels_of_neighbors_do_not_mix(name: str) -> None:
         # One pixel for eight texels or so: what shows has no other color.
         picture = CardRenderer(cards).draw(around(3)).reshape(-1, 4)
         assert picture[:, 3].max() > 0.2 and np.delete(picture[:, :3].numpy(), channel, -1).max() < 0.01
+
+
+def test_pictures_for_programs_that_average_keep_their_filled_gaps(tmp_path: Path) -> None:
+    """Of those models that have them; they survive the disk too."""
+    config = CONFIGS["mask with mip levels"]
+    first, second = (replace(cards, averaged=None) for cards in cards_of(clouds(), config)[:2])
+    filled = second.atlas.image.copy()
+    filled[filled[..., 3] == 0, 3] = 70
+    write_cards(tmp_path / "second.safetensors", replace(second, averaged=filled), 3)
+    page = page_of([first, read_cards(tmp_path / "second.safetensors")], config)
+    for before, own, after in zip((first.atlas.image, filled), (first, second), page.cards, strict=True):
+        assert after.averaged is not None
+        for old, new, (width, height) in zip(own.atlas.corners, after.atlas.corners, own.atlas.sizes, strict=True):
+            expected, found = (
+                picture[y - 8 : y + height + 8, x - 8 : x + width + 8] for picture, (x, y) in ((before, old), (after.averaged, new))
+            )
+            np.testing.assert_array_equal(found, expected)
+    picture = np.array(Image.open(io.BytesIO(texture_files(page.cards[0], config.resolve())["atlas.png"])).convert("RGBA"))
+    np.testing.assert_array_equal(picture, page.cards[0].averaged)
 
 
 def test_cells_are_apart_and_inside() -> None:
