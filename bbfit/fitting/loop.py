@@ -29,7 +29,7 @@ from bbfit.fitting.points import placement_points
 from bbfit.fitting.requirements import check_cameras, check_device, check_lights
 from bbfit.fitting.search import find_placement
 from bbfit.fitting.steps import BLEND, HARDEST, Stepper
-from bbfit.geometry.alpha import VISIBLE, AlphaMode
+from bbfit.geometry.alpha import AlphaMode
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cloud import TENSORS, BillboardCloud
 from bbfit.images import bleed_color
@@ -195,7 +195,10 @@ def fit(
             start = bounded(fitted, bounds, density, config.max_texels).to(torch.float32)
     assert fitted is not None
     shipped = AlphaMode(config.alpha, config.alpha_cutoff)
-    fitted.texels[:, 3] *= fitted.texels[:, 3] >= config.least_alpha
+    kept = fitted.texels[:, 3] >= config.least_alpha
+    if not bool(kept.any()):
+        fail("least_alpha", f"no texel of the fit reaches {config.least_alpha:g}", "lower it, or raise --steps")
+    fitted.texels[:, 3] *= kept
     if config.alpha == "mask":
         fitted = matched_coverage(replace(fitted, alpha=config.drawn_alpha), views.train, config.backend)
     fitted = replace(fitted, alpha=shipped)
@@ -210,8 +213,6 @@ def fit(
     if config.colors != "joint":
         fitted = matched_colors(smoothed_colors(fitted), views.train, config.backend)
     fitted = palettized(fitted, config.palette)
-    if not bool((fitted.texels[:, 3] >= max(VISIBLE, fitted.alpha.cutoff if config.alpha == "mask" else 0)).any()):
-        fail("fit", "no texel of the result is visible", "lower --least-alpha or --alpha-cutoff, or raise --steps")
     if config.placement != "even" or config.placement_learning_rate:
         fitted = trimmed(fitted)
     try:

@@ -259,8 +259,8 @@ def test_a_fit_whose_result_is_not_finite_is_refused(views: ViewDataset, tmp_pat
 
 
 @pytest.mark.parametrize("alpha", ["blend", "mask", "coverage", "hash"])
-def test_a_fit_that_shows_nothing_is_refused(views: ViewDataset, alpha: AlphaKind) -> None:
-    with pytest.raises(InputError, match=r"^fit: no texel of the result is visible; lower --least-alpha or --alpha-cutoff"):
+def test_a_least_alpha_that_leaves_nothing_is_refused(views: ViewDataset, alpha: AlphaKind) -> None:
+    with pytest.raises(InputError, match=r"^least_alpha: no texel of the fit reaches 1; lower it, or raise --steps$"):
         fit(views, FitConfig(preset="thesis", steps=1, learning_rate=1e-6, least_alpha=1.0, alpha=alpha))
 
 
