@@ -264,8 +264,8 @@ def label_names(rows: Sequence[SweepRow]) -> list[str]:
 def percent(ratio: float, digits: int = 3) -> str:
     """A ratio of at least 0 in percent, with so many significant digits, or more in front of the point."""
     value = 100 * ratio
-    if 0 < value < 0.001:
-        return "< 0.001 %"
+    if 0 < value < 1e-4:  # where the format below turns to powers of ten
+        return "< 0.0001 %"
     return f"{value:,.0f} %" if value >= 10 ** (digits - 1) else f"{value:.{digits}g} %"
 
 

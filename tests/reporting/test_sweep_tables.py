@@ -161,7 +161,16 @@ def test_numbers_of_billboards_are_in_order_and_one_may_be_left_to_the_fit(tmp_p
 
 @pytest.mark.parametrize(
     ("ratio", "shown"),
-    [(51.24, "5,124 %"), (0.0411872, "4.12 %"), (1, "100 %"), (9.37e-7, "< 0.001 %"), (0, "0 %"), (1.2e-5, "0.0012 %"), (0.5, "50 %")],
+    [
+        (51.24, "5,124 %"),
+        (0.0411872, "4.12 %"),
+        (1, "100 %"),
+        (9.37e-7, "< 0.0001 %"),
+        (3.04e-6, "0.000304 %"),
+        (0, "0 %"),
+        (1.2e-5, "0.0012 %"),
+        (0.5, "50 %"),
+    ],
 )
 def test_a_ratio_is_in_percent_without_powers_of_ten(ratio: float, shown: str) -> None:
     assert percent(ratio) == shown
