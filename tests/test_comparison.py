@@ -317,12 +317,12 @@ def test_bad_input(tmp_path: Path) -> None:
         CompareConfig(slices=0)
     with pytest.raises(InputError, match="billboards: the comparison sets their numbers"):
         compare(TREE, tmp_path, SMALL, RunConfig(fit=FitConfig(billboards=3)))
-    for name, value, bounds in (
-        ("mesh_vertices", 10, r"\[20, 20000\]"),
-        ("mesh_vertices_many", 10**6, r"\[20"),
+    for name, value, bound in (
+        ("mesh_vertices", 10, "at least 20"),
+        ("mesh_vertices_many", 10**6, "a value in"),
         ("field_steps", 2, "at least 3"),
     ):
-        with pytest.raises(InputError, match=f"^{name}: expected .*{bounds}"):
+        with pytest.raises(InputError, match=f"^{name}: expected {bound}"):
             CompareConfig(**{name: value})
     for stages in (replace(STAGES, fit=FitConfig(alpha="blend")), replace(STAGES, export=ExportConfig(alpha="mask"))):
         with pytest.raises(InputError, match="alpha: each system has its own alpha mode; leave out --alpha"):
