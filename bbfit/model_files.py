@@ -43,7 +43,7 @@ def names_beside(path: Path, *, texture: bool = False, normals: bool = False, mi
     else:
         maps = [normals_path(path).name] if normals else []
         others = [path.with_suffix(suffix).name for suffix in (".mtl", *([".png"] if texture else []))] + maps
-    levels = [f"{glob.escape(path.stem)}_mip*.png"] if mip_files else []
+    levels = [f"{glob.escape(path.stem)}_mip[0-9]*.png"] if mip_files else []
     return [path.name, *others, *levels]
 
 

@@ -237,6 +237,10 @@ def test_an_export_has_the_outline_of_its_run(views_folder: Path, tmp_path: Path
     assert main(["evaluate", str(cloud), str(views_folder), "--out", str(tmp_path / "again.json")]) == 0
     assert bbfit.Report.load(tmp_path / "again.json").vertices.model == bbfit.Report.load(run / "metrics.json").vertices.model <= 4
     record = (run / "run.json").read_text()
+    recorded = record.replace('"up": "auto"', '"up": "z"').replace('"pieces": null', '"pieces": 4')
+    assert recorded.count('"z"') == recorded.count('"pieces": 4') == 1
+    (run / "run.json").write_text(recorded)
+    assert exported(cloud) == original  # what the run asked for is no request of the export, although it has no effect
     (run / "run.json").unlink()
     assert exported(cloud) == default  # no record
     (run / "run.json").write_text(record.replace(digest_file(cloud), "0" * 64))
@@ -254,16 +258,18 @@ def test_mip_files_of_a_larger_atlas_are_removed(views_folder: Path, tmp_path: P
         stored = json.loads((folder / "run.json").read_text())["stages"]["export"]["outputs"]
         found = sorted(path.name for path in folder.glob("model_mip*.png"))
         assert found == sorted(name for name in stored if "mip" in name)
-        assert len(list(tmp_path.glob("planes_mip*.png"))) == len(found)
+        assert len(list(tmp_path.glob("planes_mip[0-9]*.png"))) == len(found)
         return found
 
     (tmp_path / "planes_map.png").write_text("mine")
+    assert main(["fit", str(views_folder), "--out", str(tmp_path / "run"), *QUICK]) == 0
+    assert main(["export", str(tmp_path / "run" / "cloud.safetensors"), "--out", str(tmp_path / "planes_mipmapped.obj")]) == 0
     large = levels(tmp_path / "run", "--texel-density", "1")
     small = levels(tmp_path / "run", "--texel-density", "0.1", "--padding", "1")
     assert 0 < len(small) < len(large) and (tmp_path / "planes_map.png").read_text() == "mine"
     (tmp_path / "planes_mip1.png").write_text("mine")
     assert main(["export", str(tmp_path / "run" / "cloud.safetensors"), "--out", str(tmp_path / "planes.obj")]) == 0
-    assert sorted(path.name for path in tmp_path.glob("planes_m*.png")) == ["planes_map.png", "planes_mip1.png"]
+    assert sorted(path.name for path in tmp_path.glob("planes_m*.png")) == ["planes_map.png", "planes_mip1.png", "planes_mipmapped.png"]
     assert (tmp_path / "planes_mip1.png").read_text() == (tmp_path / "planes_map.png").read_text() == "mine"
 
 

@@ -19,7 +19,7 @@ def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int 
     """Write a tree as one self-contained GLB file, Y up in meters, at the place and size of :func:`~bbfit.blender.render_views`.
 
     The file has everything that Blender's glTF exporter supports: materials, texture coordinates, textures with their alpha, and the vertex
-    colors that a material uses, and with the diffuse transmission of a glTF's leaves. Modifiers, shape keys and poses are applied.
+    colors that a material uses. Leaves of a glTF also keep their diffuse transmission. Modifiers, shape keys and poses are applied.
     Collections and curves become meshes. Objects that share a mesh still share it. The file contains only what renders, without cameras,
     lights and animations. Surfaces without a material get the renderer's plain material, gray or in their vertex colors. The same input
     gives the same bytes.

@@ -14,7 +14,7 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.checks import fail
 from bbfit.cli.console import out_console, progress, show, show_missing_encoder
 from bbfit.cli.viewing import WatchConfig, watched
-from bbfit.exporting.config import ExportConfig, LodConfig
+from bbfit.exporting.config import ExportConfig, LodConfig, check_effect
 from bbfit.fitting.config import FitConfig
 from bbfit.inputs import InputLimits
 from bbfit.trees.config import GrowConfig
@@ -251,7 +251,6 @@ def export_command(
         out: The model's file, ending in .glb, or in .obj (its .mtl and .png come beside it).
         export: How the model is written. Default: the outline is that of the cloud's run.
     """
-    from bbfit.exporting.config import check_effect
     from bbfit.exporting.model import shipped_model
     from bbfit.geometry.cloud import BillboardCloud
     from bbfit.model_files import check_model_path, names_beside
@@ -261,8 +260,8 @@ def export_command(
 
     out = check_model_path("model file", out)
     export.check()
-    billboards, export = BillboardCloud.load(cloud), as_in_run(export, cloud)
-    check_effect(export, out)
+    billboards, given, export = BillboardCloud.load(cloud), export, as_in_run(export, cloud)
+    check_effect(replace(given, outline=export.outline), out)
     names = names_beside(out, texture=True, normals=billboards.surface is not None, mip_files=export.resolve().mip_files)
     stale = [name for name in names_beside(out, normals=True, mip_files=True) if name not in names]
     check_room("out", out.parent, 16 * len(billboards.texels))  # four bytes a texel for up to three pictures and all levels

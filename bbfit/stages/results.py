@@ -32,7 +32,7 @@ REPORT_OUTPUTS = ("report.html",)
 
 def export_outputs(config: ExportConfig, *, normals: bool = False) -> tuple[str, ...]:
     """The files that :func:`export_stage` writes, with ``normals`` for a cloud with maps."""
-    optional = [*(["model_normals.png"] if normals else []), *(["model_mip*.png"] if config.mip_files else [])]
+    optional = [*(["model_normals.png"] if normals else []), *(["model_mip[0-9]*.png"] if config.mip_files else [])]
     return ("model.glb", "model.obj", "model.mtl", "model.png", *optional)
 
 

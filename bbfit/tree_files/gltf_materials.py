@@ -14,7 +14,7 @@ from bbfit.tree_files.gltf_checks import entries_of, slice_of
 from bbfit.tree_files.tree_file import GLTF_SUFFIXES, TreeFile
 
 TRANSMISSION = "KHR_materials_diffuse_transmission"
-_TEXTURES = ("diffuseTransmissionTexture", "diffuseTransmissionColorTexture")
+_TEXTURES = {"diffuseTransmissionTexture", "diffuseTransmissionColorTexture"}
 _TRANSFORM = "KHR_texture_transform"
 _PNG = b"\x89PNG"
 
@@ -23,7 +23,8 @@ def with_transmission(glb: bytes, tree: TreeFile, *, colors: Collection[str] = (
     """The GLB of a model of a tree with the diffuse transmission of the tree's materials, which go by their names.
 
     Materials named in ``colors`` also get the tree's exact factors of base color, which trimesh rounds to 8 bits. Without ``textures``, for
-    a model without texture coordinates, the transmission has its factors alone. A tree that is no .glb or .gltf has no such material.
+    a model without texture coordinates, the transmission has its factors alone, as where a texture has neither PNG nor JPEG. A tree that is
+    no .glb or .gltf has no such material.
     """
     if tree.suffix not in GLTF_SUFFIXES:
         return glb
@@ -35,16 +36,18 @@ def with_transmission(glb: bytes, tree: TreeFile, *, colors: Collection[str] = (
         source = known.get(material.get("name"), {})
         factor = (source.get("pbrMetallicRoughness") or {}).get("baseColorFactor")
         if factor is not None and material["name"] in colors:
-            material["pbrMetallicRoughness"]["baseColorFactor"] = factor
+            material.setdefault("pbrMetallicRoughness", {})["baseColorFactor"] = factor
         values = copy.deepcopy((source.get("extensions") or {}).get(TRANSMISSION))
         if values is None:
             continue
-        for name in _TEXTURES:
-            if name in values and not textures:
+        for name in sorted(_TEXTURES & values.keys()):
+            with reading("tree", tree.path, "export the tree again"):
+                texture = content["textures"][values[name]["index"]]
+            if not textures or "source" not in texture:
                 del values[name]
-            elif name in values:
-                values[name]["index"] = _added(target, contents, content, values[name]["index"], picture)
-                extensions |= {_TRANSFORM} & (values[name].get("extensions") or {}).keys()
+                continue
+            values[name]["index"] = _added(target, contents, content, texture, picture)
+            extensions |= {_TRANSFORM} & (values[name].get("extensions") or {}).keys()
         material["extensions"] = (material.get("extensions") or {}) | {TRANSMISSION: values}
         extensions.add(TRANSMISSION)
     if extensions:
@@ -88,9 +91,10 @@ def _read(tree: TreeFile) -> tuple[dict[str, Any], Callable[[int], bytes]]:
     return content, picture
 
 
-def _added(target: dict[str, Any], contents: list[bytes], source: dict[str, Any], number: int, picture: Callable[[int], bytes]) -> int:
+def _added(
+    target: dict[str, Any], contents: list[bytes], source: dict[str, Any], texture: dict[str, Any], picture: Callable[[int], bytes]
+) -> int:
     """Add a texture of another glTF with its picture and its sampler, and return its number."""
-    texture = source["textures"][number]
     data = picture(texture["source"])
     added: dict[str, Any] = {"source": len(target.setdefault("images", []))}
     target["images"].append({"bufferView": len(contents), "mimeType": "image/png" if data.startswith(_PNG) else "image/jpeg"})

@@ -5,13 +5,18 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from bbfit.evaluation.afar import FarScore
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.scoring import OriginalTree
+from bbfit.reporting.comparison_summary import compare_plot, summaries
 from bbfit.reporting.comparison_tables import CompareCosts, CompareRow, compare_csv, compare_markdown
+from bbfit.reporting.frame_tables import FrameRow, frames_plot
 
 OVER = Over(*(OverBackground(20.0 + step, 0.7 + step / 100, 0.1 + step / 100) for step in range(4)))
 COLOUR = Colour((40, 50, 20, 100), (20, 25, 10, 50), (40, 50, 20, 100), (16, 20, 8, 50))
@@ -50,6 +55,24 @@ def test_csv_has_means_over_backgrounds_scores_over_white_and_colors() -> None:
     afar = ["far_tree_pixels", "far_psnr", "far_flip", "far_fragments", "triangles", "drawing"]
     assert [drawn[name] for name in afar] == ["99.75", "24.5", "0.0625", "1180.0", "16", "1234.4"]
     assert {other[name] for name in afar} == {""}
+
+
+def test_points_of_charts_have_numbers_that_the_legend_explains(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Also those of systems that occur in a panel alone, and without any system."""
+    figures: list[Figure] = []
+    monkeypatch.setattr("bbfit.reporting.comparison_summary.write_figure", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr("bbfit.reporting.frame_tables.write_figure", lambda figure, path: figures.append(figure))
+    names = [f"system {number}" for number in range(12)]
+    costs = [CompareCosts(8, None if number == 3 else 32 + number, 1000 + number, 2.5, 4.25) for number in range(12)]
+    compare_plot(summaries({"oak": [replace(ROWS[0], system=name, costs=cost) for name, cost in zip(names, costs, strict=True)]}), tmp_path)
+    frame = FrameRow("three.js", "", "", "billboards", 100, 1, 2.0, 0.0, 3, 1, 2, None, None, 1000, 0.1, None, None)
+    frames_plot([replace(frame, model=name, tree_pixels=100 if name == names[5] else 30) for name in names], tmp_path)
+    for figure in figures:
+        shown = [text.get_text().split(maxsplit=1) for text in figure.legends[0].get_texts()]
+        assert sorted(shown, key=lambda pair: int(pair[0])) == [[str(number), name] for number, name in enumerate(names, 1)]
+        assert {text.get_text() for axis in figure.axes for text in axis.texts} == {number for number, _ in shown}
+    compare_plot([], tmp_path)
+    assert len(figures) == 3 and not figures[2].legends[0].get_texts()
 
 
 def test_markdown_shows_them_too() -> None:

@@ -143,10 +143,12 @@ def test_the_two_nearest_slicings_are_blended_linearly_in_the_angle(azimuth: flo
     mixed = sum(weight * render(slicings.clouds[index], camera) for index, weight in expected.items())
     torch.testing.assert_close(slicings.draw(camera), mixed, atol=1e-6, rtol=0)
     torch.testing.assert_close(slicings.draw(camera.batch()), mixed[None], atol=1e-6, rtol=0)
+    numbers = [lambda camera, number=number: torch.full((1, 1, 4), float(number)) for number in range(6)]
+    assert float(slicings.draw(camera, numbers).mean()) == pytest.approx(sum(weight * index for index, weight in expected.items()))
 
 
 def test_one_slicing_and_a_view_from_above() -> None:
-    assert sum(weight for _, weight in stacks(1).weights(looking(50.0))) == pytest.approx(1.0)
+    assert stacks(1).weights(looking(50.0)) == [(0, 1.0)]
     assert stacks(6).weights(looking(0.0, 90.0, orthographic=False))[0] == (0, 1.0)
 
 
