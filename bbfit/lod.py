@@ -162,11 +162,11 @@ def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: R
     output_folder("work", folder / LEVELS)
     record.run(views_stage(folder, tree, stages.views), on_progress)
     views = ViewDataset.load(folder / "views", limits=stages.limits)
-    original = _original(record, tree, config, on_progress) if config.original else None
-    meshes = [_thinned(record, tree, count, views, stages, on_progress) for count in config.thinned]
+    export = with_textures(export_config(views, stages.outlined))
+    original = _original(record, tree, config, export, on_progress) if config.original else None
+    meshes = [_thinned(record, tree, count, views, stages, export, on_progress) for count in config.thinned]
     stages = replace(stages, tree=tree.path if tree.is_mesh else None)
     runs = [_fitted(folder, stages, planes, on_progress) for planes in config.planes]
-    export = with_textures(export_config(views, stages.outlined))
     record.run(_join_stage(folder, out, original, [*meshes, *runs], views, config, export, stages.limits), on_progress)
     return LodResult(out, folder, read_levels(folder / LEVELS).levels)
 
@@ -281,18 +281,21 @@ def _fitted(folder: Path, stages: RunConfig, planes: int, on_progress: OnProgres
     return run(folder / "views", folder / str(planes), stages, on_progress=report)
 
 
-def _original(record: Record, tree: TreeFile, config: LodConfig, on_progress: OnProgress) -> Path:
+def _original(record: Record, tree: TreeFile, config: LodConfig, export: ExportConfig, on_progress: OnProgress) -> Path:
     """The tree as a GLB that others can be joined to."""
     if not _converts(tree, config):
         return tree.path
-    record.run(convert_stage(record.folder, tree, ORIGINAL, triangles=config.triangles), on_progress)
+    quantized = export.resolve().quantized
+    record.run(convert_stage(record.folder, tree, ORIGINAL, triangles=config.triangles, quantized=quantized), on_progress)
     return record.folder / ORIGINAL
 
 
-def _thinned(record: Record, tree: TreeFile, count: int, views: ViewDataset, stages: RunConfig, on_progress: OnProgress) -> _Thinned:
+def _thinned(
+    record: Record, tree: TreeFile, count: int, views: ViewDataset, stages: RunConfig, export: ExportConfig, on_progress: OnProgress
+) -> _Thinned:
     """The tree with at most ``count`` triangles, and its pictures."""
-    file = record.folder / thinned_file(count)
-    record.run(convert_stage(record.folder, tree, file.name, triangles=count, stage=f"thin {count}"), on_progress)
+    file, quantized = record.folder / thinned_file(count), export.resolve().quantized
+    record.run(convert_stage(record.folder, tree, file.name, triangles=count, quantized=quantized, stage=f"thin {count}"), on_progress)
     stage, train, test = pictures_stage(record.folder, file, views, stages.views, stage=f"render {count}")
     record.run(stage, on_progress)
     return _Thinned(file, train, test)

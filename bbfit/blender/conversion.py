@@ -1,4 +1,4 @@
-"""Convert a tree of any format to one GLB file with Blender, decimated on request."""
+"""Convert a tree of any format to one GLB file with Blender, thinned out on request."""
 
 from __future__ import annotations
 
@@ -24,10 +24,12 @@ def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int 
     lights and animations. Surfaces without a material get the renderer's plain material, gray or in their vertex colors. The same input
     gives the same bytes.
 
-    ``triangles`` collapses edges (Blender's Decimate modifier) over the whole tree at once, in one joined mesh. The remaining leaves are
-    enlarged until they have their former area (Cook et al., "Stochastic Simplification of Aggregate Detail", SIGGRAPH 2007). A material
-    counts as foliage if none of its connected components is longer than a quarter of the tree. If leaves and bark share a material, the
-    tree loses leaves and its crown gets sparser. Enlarged leaves can extend slightly beyond the bounds of the tree.
+    ``triangles`` thins the tree out, as one joined mesh. Bark and foliage share the triangles by the areas that one sees. If they are many
+    parts for few triangles, evenly spread leaves and twigs stay as a whole and the others go; large parts of the bark, such as the trunk,
+    are likelier to stay. The edges of what remains collapse (Blender's Decimate modifier). Then leaves are enlarged until they have their
+    former area (Cook et al., "Stochastic Simplification of Aggregate Detail", SIGGRAPH 2007). A material counts as foliage if none of its
+    connected components is longer than a quarter of the tree. If leaves and bark share a material, the tree loses leaves and its crown gets
+    sparser. Enlarged leaves can extend slightly beyond the bounds of the tree.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Write the loaded tree as one GLB file, decimated on request. This module runs in the worker's process.
+"""Write the loaded tree as one GLB file, thinned out on request. This module runs in the worker's process.
 
 ``worker.py`` imports it by path, so it does not import bbfit. The file contains what the worker renders and measures: every instance of
 every surface of the evaluated scene, and nothing else.
@@ -6,6 +6,7 @@ every surface of the evaluated scene, and nothing else.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,13 @@ import numpy as np
 FOLIAGE_LENGTH = 0.25
 # Leaves are enlarged by at most this factor to compensate for removed leaves.
 MAX_GROWTH = 4.0
+# What is seen of the area of a stem, whose far side is hidden, relative to that of a leaf. Less or more is no better.
+BARK_SEEN = 0.5
+# Triangles that each leaf or each part of the bark keeps in the mean; parts that cannot have them go. Fewer leaves of more triangles are
+# worse: what counts is how evenly they fill the crown.
+LEAF_TRIANGLES, BARK_TRIANGLES = 1, 16
+# Leaves with texture coordinates keep two, because their textures may fill a rectangle.
+TEXTURED_LEAF_TRIANGLES = 2
 JOIN_BATCH = 64
 
 
@@ -44,6 +52,8 @@ class Islands:
     """Area of each triangle, [T]."""
     lengths: np.ndarray
     """Diagonal of the bounding box of each triangle's island, [T]."""
+    centers: np.ndarray
+    """The mean of each island's vertices, [I, 3]."""
 
 
 def write(path: str, triangles: int | None) -> int:
@@ -58,7 +68,7 @@ def write(path: str, triangles: int | None) -> int:
         share_normals(mesh)
     total = count_triangles(placed)
     if triangles is not None and total > triangles:
-        placed = decimated(placed, triangles / total)
+        placed = thinned(placed, triangles)
     for item in placed:
         link(item)
     # Every setting that decides what is written. All other settings keep their defaults.
@@ -165,13 +175,13 @@ def link(item: PlacedMesh) -> Any:
     return linked
 
 
-def decimated(placed: list[PlacedMesh], ratio: float) -> list[PlacedMesh]:
-    """Reduce the number of triangles by ``ratio`` with edge collapses, then enlarge the leaves until they have their former area.
+def thinned(placed: list[PlacedMesh], triangles: int) -> list[PlacedMesh]:
+    """Thin a tree out to about ``triangles``: take whole leaves and twigs away, collapse edges of what remains, and enlarge the leaves.
 
-    All meshes are joined first, so that edges collapse wherever this changes the tree's shape least. With the same ratio for each mesh,
-    leaves of a few triangles would lose as large a share as finely tessellated bark. Foliage still loses area, because a card of two
-    triangles turns into one triangle and then disappears. So the remaining islands of each foliage material are enlarged about their
-    centers until the material has its former area (Cook et al., "Stochastic Simplification of Aggregate Detail", SIGGRAPH 2007).
+    All meshes are joined first. Bark and foliage share the triangles by the areas that one sees of them. Both keep as many parts as can
+    have a few triangles each (``BARK_TRIANGLES``, ``LEAF_TRIANGLES``): leaves evenly, and large parts of the bark more likely than small
+    ones, so that the trunk stays. The edges of each kind collapse where this changes its shape least. Then leaves are enlarged about their centers
+    until each material of foliage has its former area (Cook et al., "Stochastic Simplification of Aggregate Detail", SIGGRAPH 2007).
     """
     import bpy
 
@@ -181,19 +191,102 @@ def decimated(placed: list[PlacedMesh], ratio: float) -> list[PlacedMesh]:
     corners = np.concatenate([np.array(item.bound_box) for item in joined])
     length = FOLIAGE_LENGTH * float(np.linalg.norm(np.ptp(corners, axis=0)))
     originals = [islands(item.data) for item in joined]
-    for item in joined:
-        modifier = item.modifiers.new("bbfit", "DECIMATE")
-        modifier.ratio, modifier.use_collapse_triangulate = ratio, True
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    meshes = [bpy.data.meshes.new_from_object(item.evaluated_get(depsgraph), depsgraph=depsgraph) for item in joined]
+    leaves = [foliage(original, length) for original in originals]
+    bark = [~each for each in leaves]
+    leaf_area, bark_area = (
+        sum(float(original.areas[each].sum(dtype=np.float64)) for original, each in zip(originals, kind, strict=True))
+        for kind in (leaves, bark)
+    )
+    share = leaf_area / max(leaf_area + BARK_SEEN * bark_area, 1e-30)
+    of_leaves = min(sum(int(each.sum()) for each in leaves), round(share * triangles))
+    textured = any(item.data.uv_layers and each.any() for item, each in zip(joined, leaves, strict=True))
+    stems = reduced(joined, originals, bark, triangles - of_leaves, BARK_TRIANGLES, by_area=True)
+    rest = triangles - sum(len(mesh.loop_triangles) for mesh in stems if mesh)
+    crowns = reduced(joined, originals, leaves, rest, TEXTURED_LEAF_TRIANGLES if textured else LEAF_TRIANGLES, by_area=False)
     remaining = list[PlacedMesh]()
-    for item, mesh, original in zip(joined, meshes, originals, strict=True):
-        restore_area(mesh, original, length)
-        mesh.calc_loop_triangles()
-        if len(mesh.polygons):
-            remaining.append(PlacedMesh(item.name, mesh, item.matrix_world.copy()))
+    for item, original, stem, crown in zip(joined, originals, stems, crowns, strict=True):
+        if crown:
+            restore_area(crown, original)
+        if meshes := [mesh for mesh in (stem, crown) if mesh]:
+            whole = merge([link(PlacedMesh(item.name, mesh, item.matrix_world.copy())) for mesh in meshes])
+            whole.data.calc_loop_triangles()
+            remaining.append(PlacedMesh(item.name, whole.data, whole.matrix_world.copy()))
+            bpy.data.objects.remove(whole)
     bpy.data.batch_remove(joined)
     return remaining
+
+
+def foliage(original: Islands, length: float) -> np.ndarray:
+    """Which triangles are foliage, [T]: those of materials all of whose islands are shorter than ``length``."""
+    return ~np.isin(original.materials, original.materials[original.lengths >= length])
+
+
+def reduced(
+    items: list[Any], originals: list[Islands], chosen: list[np.ndarray], triangles: int, least: float, *, by_area: bool
+) -> list[Any]:
+    """The ``chosen`` triangles of each object, reduced to about ``triangles`` of all objects, as meshes; ``None`` where nothing remains.
+
+    As many islands remain as can have ``least`` triangles in the mean, or the mean of all if that is less. ``by_area``: the larger an
+    island, the likelier it remains.
+    """
+    import bpy
+
+    own = [original.labels[original.triangles[:, 0]] for original in originals]
+    found = [np.unique(labels[each]) for labels, each in zip(own, chosen, strict=True)]
+    total, count = sum(int(each.sum()) for each in chosen), sum(map(len, found))
+    if triangles < 1 or not count:
+        return [None for _ in items]
+    share = triangles / count / min(least, total / count)
+    kept = list[np.ndarray]()
+    for original, labels, each, numbers in zip(originals, own, chosen, found, strict=True):
+        areas = np.bincount(labels[each], original.areas[each], len(original.centers))[numbers] if by_area else 1.0
+        # Weighted sampling without replacement (Efraimidis and Spirakis 2006), with evenly spread numbers in place of random ones.
+        order = np.argsort(-np.log1p(-spread(original.centers[numbers])) / np.maximum(areas, 1e-30), kind="stable")
+        kept.append(each & np.isin(labels, numbers[order[: math.ceil(share * len(numbers))]]))
+    ratio = triangles / max(sum(int(each.sum()) for each in kept), 1)
+    meshes = list[Any]()
+    for item, original, each in zip(items, originals, kept, strict=True):
+        part = link(PlacedMesh(item.name, only(item.data, original, each), item.matrix_world.copy()))
+        if ratio < 1:
+            modifier = part.modifiers.new("bbfit", "DECIMATE")
+            modifier.ratio, modifier.use_collapse_triangulate = ratio, True
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        mesh = bpy.data.meshes.new_from_object(part.evaluated_get(depsgraph), depsgraph=depsgraph)
+        bpy.data.batch_remove([part.data])  # and the object with it
+        mesh.calc_loop_triangles()
+        meshes.append(mesh if len(mesh.polygons) else None)
+    return meshes
+
+
+def spread(points: np.ndarray) -> np.ndarray:
+    """Different numbers in [0, 1) for points, [P, 3], so that the points with numbers below any bound are spread evenly among all.
+
+    They are those of van der Corput's sequence, along Morton's curve through the points.
+    """
+    scale = 1023 / max(float(np.ptp(points, axis=0).max(initial=0)), 1e-30)
+    cells = ((points - points.min(0, initial=np.inf)) * scale).astype(np.int64)
+    code = sum(((cells >> bit & 1) << [3 * bit, 3 * bit + 1, 3 * bit + 2]).sum(-1) for bit in range(10))
+    rank, values = np.empty(len(points), np.int64), np.zeros(len(points))
+    rank[np.argsort(code, kind="stable")] = np.arange(len(points))
+    for bit in range(max(len(points) - 1, 1).bit_length()):
+        values += (rank >> bit & 1) / 2 ** (bit + 1)
+    return values
+
+
+def only(mesh: Any, original: Islands, kept: np.ndarray) -> Any:
+    """A copy of a mesh with the polygons of the ``kept`` triangles alone; an island is kept as a whole or not at all."""
+    import bmesh
+
+    polygons = np.empty(len(original.triangles), np.int32)
+    mesh.loop_triangles.foreach_get("polygon_index", polygons)
+    stays = np.zeros(len(mesh.polygons), bool)
+    stays[polygons[kept]] = True
+    copy, edited = mesh.copy(), bmesh.new()
+    edited.from_mesh(mesh)
+    bmesh.ops.delete(edited, geom=[face for face in edited.faces if not stays[face.index]], context="FACES")
+    edited.to_mesh(copy)
+    edited.free()
+    return copy
 
 
 def joinable_groups(placed: list[PlacedMesh]) -> list[list[PlacedMesh]]:
@@ -253,7 +346,10 @@ def islands(mesh: Any) -> Islands:
     low, high = np.full((number, 3), np.inf), np.full((number, 3), -np.inf)
     np.minimum.at(low, labels, points)
     np.maximum.at(high, labels, points)
-    return Islands(labels, triangles, materials[polygons], areas, np.linalg.norm(high - low, axis=-1)[labels[triangles[:, 0]]])
+    lengths = np.linalg.norm(high - low, axis=-1)[labels[triangles[:, 0]]]
+    counts = np.maximum(np.bincount(labels, minlength=number), 1)
+    centers = np.stack([np.bincount(labels, points[:, axis], number) / counts for axis in range(3)], -1)
+    return Islands(labels, triangles, materials[polygons], areas, lengths, centers)
 
 
 def coordinates(mesh: Any) -> np.ndarray:
@@ -263,18 +359,17 @@ def coordinates(mesh: Any) -> np.ndarray:
     return values
 
 
-def restore_area(mesh: Any, original: Islands, length: float) -> None:
-    """Enlarge the foliage of a decimated mesh to its area in ``original``. Foliage is a material with all islands below ``length``."""
+def restore_area(mesh: Any, original: Islands) -> None:
+    """Enlarge the islands of a mesh of foliage until each material has its area in ``original``."""
     current = islands(mesh)
     points = coordinates(mesh)
     growth = np.ones(int(current.labels.max(initial=0)) + 1)
     for material in np.unique(current.materials):
         before, after = original.materials == material, current.materials == material
         area = current.areas[after].sum(dtype=np.float64)
-        if original.lengths[before].max() < length and area > 0:
+        if area > 0:
             factor = np.sqrt(original.areas[before].sum(dtype=np.float64) / area)
             growth[current.labels[current.triangles[after]].ravel()] = np.clip(factor, 1.0, MAX_GROWTH)
-    counts = np.bincount(current.labels)
-    centers = np.stack([np.bincount(current.labels, points[:, axis]) / counts for axis in range(3)], -1)[current.labels]
+    centers = current.centers[current.labels]
     mesh.vertices.foreach_set("co", (centers + growth[current.labels, None] * (points - centers)).astype(np.float32).ravel())
     mesh.update()

@@ -20,6 +20,7 @@ from bbfit.evaluation.shading import triangle_fragments
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
 from bbfit.exporting.model import shipped_model
+from bbfit.exporting.vertex_formats import quantized_tree
 from bbfit.files import write_bytes
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.camera import Camera
@@ -42,8 +43,10 @@ from bbfit.views.view_set import ViewSet
 _RECTANGLE = ExportConfig(outline="rectangle")
 # The triangles of a quad.
 _QUAD = torch.tensor([[0, 1, 2], [0, 2, 3]])
-# Blender decimates a tree to a number of triangles. It takes a few attempts to find the number that fits a size in bytes.
-_DECIMATION_ATTEMPTS = 5
+# Blender thins a tree out to a number of triangles. It takes a few attempts to find the number that fills a size in bytes: at least this
+# share of it. Each attempt aims a little below it.
+_THINNING_ATTEMPTS, _CLOSE, _AIM = 5, 0.95, 0.98
+_THINNED = "Blender; fewer, larger leaves; vertices of integers"
 
 
 def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]:
@@ -162,29 +165,37 @@ def _decimated_to_size(subject: Subject, folder: Path) -> SystemResult:
 
 
 def _thinned(subject: Subject, folder: Path, limit: int | None = None) -> SystemResult:
-    """Decimate the tree with enlarged leaves (Cook et al. 2007) to at most ``limit`` bytes, or to the size of ``bbfit``'s model."""
-    started, path = time.perf_counter(), folder / "thinned.glb"
+    """Thin the tree out (Cook et al. 2007) to at most ``limit`` bytes, or to the size of ``bbfit``'s model."""
+    started = time.perf_counter()
     limit = limit or subject.most_bytes
     request = subject.views.request
     assert request and request.tree.faces
-    triangles = max(1, min(request.tree.faces, request.tree.faces * limit // subject.tree.bytes))
-    for _ in range(_DECIMATION_ATTEMPTS):
-        tree_as_glb(subject.tree, path, triangles=triangles)
-        if path.stat().st_size <= limit:
+    faces, models = request.tree.faces, list[bytes]()
+    triangles = max(1, min(faces, faces * limit // subject.tree.bytes))
+    for _ in range(_THINNING_ATTEMPTS):
+        models.append(_thinned_glb(subject, folder, triangles))
+        size, earlier = len(models[-1]), triangles
+        triangles = max(1, min(faces, int(_AIM * triangles * limit / size)))
+        if _CLOSE * limit <= size <= limit or triangles == earlier:
             break
-        triangles = max(1, int(0.97 * triangles * limit / path.stat().st_size))
-    model = path.read_bytes()
-    path.unlink()
-    note = "Blender; enlarged leaves" if len(model) <= limit else "Blender; enlarged leaves; no smaller size is possible"
+    fitting = [model for model in models if len(model) <= limit]
+    model = max(fitting, key=len) if fitting else min(models, key=len)
+    note = _THINNED if fitting else f"{_THINNED}; no smaller size is possible"
     return _rendered(model, subject, folder, time.perf_counter() - started, note)
 
 
 def _thinned_to_triangles(subject: Subject, folder: Path) -> SystemResult:
-    started, path = time.perf_counter(), folder / "thinned.glb"
-    tree_as_glb(subject.tree, path, triangles=subject.config.thinned_triangles)
-    model = path.read_bytes()
+    started = time.perf_counter()
+    model = _thinned_glb(subject, folder, subject.config.thinned_triangles)
+    return _rendered(model, subject, folder, time.perf_counter() - started, _THINNED)
+
+
+def _thinned_glb(subject: Subject, folder: Path, triangles: int) -> bytes:
+    """The tree thinned out as ``bbfit lod --thinned`` does it, with vertices of integers."""
+    path = tree_as_glb(subject.tree, folder / "thinned.glb", triangles=triangles)
+    model = quantized_tree(path.read_bytes())
     path.unlink()
-    return _rendered(model, subject, folder, time.perf_counter() - started, "Blender; enlarged leaves")
+    return model
 
 
 def _draco(subject: Subject, folder: Path) -> SystemResult:

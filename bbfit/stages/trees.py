@@ -9,6 +9,8 @@ from bbfit.blender.conversion import tree_as_glb
 from bbfit.blender.pictures import PICTURES_FILE, render_pictures
 from bbfit.blender.request import ViewsRequest
 from bbfit.blender.views_folder import render_views
+from bbfit.exporting.vertex_formats import quantized_tree
+from bbfit.files import write_bytes
 from bbfit.layout import REQUEST_FILE
 from bbfit.outputs import output_folder
 from bbfit.provenance import digest_file
@@ -48,15 +50,19 @@ def views_stage(folder: Path, tree: TreeFile, config: ViewsConfig) -> Stage:
     return Stage("views", (tree.digest, ViewsRequest.of(tree, config).config), files, work, claims=False)
 
 
-def convert_stage(folder: Path, tree: TreeFile, name: str, *, triangles: int | None = None, stage: str = "convert") -> Stage:
-    """Convert a tree to the GLB file ``name``, decimated to at most ``triangles`` triangles unless that is ``None``."""
+def convert_stage(
+    folder: Path, tree: TreeFile, name: str, *, triangles: int | None = None, quantized: bool = False, stage: str = "convert"
+) -> Stage:
+    """Convert a tree to the GLB file ``name``: thinned out to at most ``triangles``, and with ``quantized`` vertices, on request."""
 
     def work(on_progress: OnProgress) -> None:
         on_progress("convert", 0, 1)
-        tree_as_glb(tree, folder / name, triangles=triangles)
+        path = tree_as_glb(tree, folder / name, triangles=triangles)
+        if quantized:
+            write_bytes(path, quantized_tree(path.read_bytes()))
         on_progress("convert", 1, 1)
 
-    return Stage(stage, (tree.digest, triangles), (name,), work, algorithm="convert")
+    return Stage(stage, (tree.digest, triangles, quantized), (name,), work, algorithm="convert")
 
 
 def pictures_stage(folder: Path, model: Path, views: ViewDataset, config: ViewsConfig, *, stage: str) -> tuple[Stage, ViewSet, ViewSet]:

@@ -10,17 +10,18 @@ import numpy as np
 import pytest
 import torch
 from glb_viewer import view_glb
-from gltf_arrays import array, matrix
-from khronos import messages
+from gltf_arrays import KINDS, array, matrix
+from khronos import WARNING, messages
 from test_lit import with_maps
+from trimesh.transformations import quaternion_matrix
 
 from bbfit.exporting.config import ExportConfig, Profile
 from bbfit.exporting.model import export, shipped_model
-from bbfit.exporting.vertex_formats import EXTENSION, on_grid
+from bbfit.exporting.vertex_formats import EXTENSION, on_grid, quantized_tree
 from bbfit.geometry.camera import Camera
 from bbfit.geometry.cards import texture_slopes
 from bbfit.geometry.cloud import BillboardCloud
-from bbfit.glb import split_glb
+from bbfit.glb import joined_glb, split_glb
 
 # Components of 16 bits and of 8 bits.
 _SHORT, _UNSIGNED_SHORT, _BYTE = 5122, 5123, 5120
@@ -126,3 +127,71 @@ def test_programs_that_read_integers_get_them(crossed: BillboardCloud) -> None:
         assert ExportConfig(profile=profile).resolve().quantized == (profile in readers)
         assert ExportConfig(profile=profile, quantized=False).resolve().quantized is False
         assert ExportConfig(profile=profile, quantized=True).resolve().quantized is True
+
+
+def _tree_of_floats() -> bytes:
+    """Two meshes as Blender writes them, at three nodes, of which one is turned and mirrored; the second mesh repeats its texture."""
+    random, contents = np.random.default_rng(3), list[bytes]()
+    tree: dict[str, Any] = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 1, 2]}], "accessors": [], "bufferViews": []}
+
+    def put(values: np.ndarray, kind: int, shape: str, **more: Any) -> int:
+        contents.append(values.astype(KINDS[kind]).tobytes())
+        tree["bufferViews"].append({"target": 34963 if shape == "SCALAR" else 34962})
+        accessor = {"bufferView": len(contents) - 1, "componentType": kind, "count": len(values), "type": shape}
+        tree["accessors"].append(accessor | more)
+        return len(contents) - 1
+
+    def primitive(count: int, repeats: float) -> dict[str, Any]:
+        points = random.normal(size=(count, 3)).astype("f4") * [1, 5, 2] + [3, 4, 5]
+        bounds = {"min": points.min(0).astype("f4").tolist(), "max": points.max(0).astype("f4").tolist()}
+        normals = random.normal(size=(count, 3))
+        attributes = {
+            "POSITION": put(points, 5126, "VEC3", **bounds),
+            "NORMAL": put(normals / np.linalg.norm(normals, axis=1, keepdims=True), 5126, "VEC3"),
+            "TEXCOORD_0": put(repeats * random.random((count, 2)), 5126, "VEC2"),
+        }
+        return {"attributes": attributes, "indices": put(random.permutation(count), 5125, "SCALAR"), "material": 0}
+
+    tree["materials"] = [{"doubleSided": True}]
+    tree["meshes"] = [{"primitives": [primitive(90, 1), primitive(30, 1)]}, {"primitives": [primitive(60, 7)]}]
+    turn = np.array([0.1, -0.5, 0.3, 0.8]) / np.linalg.norm([0.1, -0.5, 0.3, 0.8])
+    placed = {"rotation": turn.tolist(), "scale": [-2.0, 3.0, 0.5], "translation": [1.0, 2.0, 3.0]}
+    tree["nodes"] = [{"mesh": 0}, {"mesh": 0} | placed, {"mesh": 1, "translation": [0.0, -9.0, 0.0]}]
+    return joined_glb(tree, contents)
+
+
+def _world(glb: bytes) -> list[np.ndarray]:
+    """The points of each primitive of each node of a GLB, in the world."""
+    tree, contents = split_glb(glb)
+    points = list[np.ndarray]()
+    for node in tree["nodes"]:
+        turned = quaternion_matrix(np.roll(node.get("rotation", (0, 0, 0, 1)), 1))[:3, :3] * node.get("scale", (1, 1, 1))
+        for primitive in tree["meshes"][node["mesh"]]["primitives"]:
+            own = array(tree, contents, primitive["attributes"]["POSITION"])
+            points.append(own @ turned.T + node.get("translation", (0, 0, 0)))
+    return points
+
+
+def test_a_tree_stays_where_it_is_in_half_of_the_bytes(tmp_path: Path) -> None:
+    floats = _tree_of_floats()
+    integers = quantized_tree(floats)
+    for name, glb in (("floats", floats), ("integers", integers)):
+        (tmp_path / f"{name}.glb").write_bytes(glb)
+        assert [each for each in messages(tmp_path / f"{name}.glb") if each["severity"] <= WARNING] == []
+    for got, expected in zip(_world(integers), _world(floats), strict=True):
+        # Half of the longest side of a mesh is at most 15 m here, which one node stretches by 3.
+        np.testing.assert_allclose(got, expected, rtol=0, atol=0.5 * 3 * np.sqrt(3) * 15 / 32_767)
+    tree, contents = split_glb(integers)
+    before, stored = split_glb(floats)
+    for mesh, kind in zip(tree["meshes"], (_UNSIGNED_SHORT, 5126), strict=True):
+        for primitive in mesh["primitives"]:
+            attributes = primitive["attributes"]
+            assert tree["accessors"][attributes["TEXCOORD_0"]]["componentType"] == kind
+            for name, error in (("NORMAL", 0.5 / 127), ("TEXCOORD_0", 0.5 / 65_535)):
+                got, expected = array(tree, contents, attributes[name]), array(before, stored, attributes[name])
+                np.testing.assert_allclose(got, expected, rtol=0, atol=1.001 * error)
+            np.testing.assert_array_equal(array(tree, contents, primitive["indices"]), array(before, stored, primitive["indices"]))
+    assert tree["extensionsRequired"] == tree["extensionsUsed"] == [EXTENSION]
+    # A vertex and its index: 3 + 3 + 2 floats and 4 bytes, then 8 + 4 + 4 (or 8) and 2 bytes.
+    assert sum(map(len, stored)) == 180 * 36
+    assert sum(map(len, contents)) == 120 * 18 + 60 * 22
