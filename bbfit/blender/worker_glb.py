@@ -180,8 +180,9 @@ def thinned(placed: list[PlacedMesh], triangles: int) -> list[PlacedMesh]:
 
     All meshes are joined first. Bark and foliage share the triangles by the areas that one sees of them. Both keep as many parts as can
     have a few triangles each (``BARK_TRIANGLES``, ``LEAF_TRIANGLES``): leaves evenly, and large parts of the bark more likely than small
-    ones, so that the trunk stays. The edges of each kind collapse where this changes its shape least. Then leaves are enlarged about their centers
-    until each material of foliage has its former area (Cook et al., "Stochastic Simplification of Aggregate Detail", SIGGRAPH 2007).
+    ones, so that the trunk stays. The edges of each kind collapse where this changes its shape least. Then leaves are enlarged about
+    their centers until each material of foliage has its former area (Cook et al., "Stochastic Simplification of Aggregate Detail",
+    SIGGRAPH 2007).
     """
     import bpy
 

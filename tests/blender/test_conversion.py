@@ -168,6 +168,52 @@ def test_the_number_of_triangles_is_kept_and_the_leaves_keep_their_area(leafy: P
             assert len(found["leaf"].faces) == 2 * CARDS
 
 
+def twiggy(path: Path) -> Path:
+    """A trunk, 2,000 separate twigs and 3,000 leaves of two triangles in eight clusters along a line, without textures."""
+    random, meshes = np.random.default_rng(4), dict[str, trimesh.Trimesh]()
+    trunk = trimesh.creation.cylinder(0.2, segment=[[0, 0, 0], [8, 0, 0]], sections=32)
+    starts = random.uniform([0, 0.2, -1], [8, 2, 1], (2000, 3))
+    twigs = [trimesh.creation.cylinder(0.005, segment=[start, start + np.array([0, 0.2, 0])], sections=8) for start in starts]
+    middles = np.stack([np.repeat(np.arange(8), 375), *random.uniform(-1, 1, (2, 3000))], -1)
+    across, down = (0.05 * np.linalg.qr(random.normal(size=(3000, 3, 3)))[0][:, :2]).transpose(1, 0, 2)
+    corners_ = np.stack([middles - across, middles + down, middles + across, middles - down], 1).reshape(-1, 3)
+    faces = (4 * np.arange(3000)[:, None, None] + [[0, 1, 2], [0, 2, 3]]).reshape(-1, 3)
+    meshes["leaf"] = trimesh.Trimesh(corners_, faces, process=False)
+    meshes["bark"] = trimesh.util.concatenate([trunk, *twigs])
+    for name, mesh in meshes.items():
+        mesh.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(name=name, baseColorFactor=[90, 90, 50, 255]))
+    trimesh.Scene(meshes).export(str(path))
+    return path
+
+
+def test_a_tree_of_many_twigs_keeps_its_leaves_its_trunk_and_whole_twigs(tmp_path: Path) -> None:
+    """64,000 triangles of twigs could only collapse to far more than the 2,000 that are requested of all."""
+    tree = twiggy(tmp_path / "twiggy.glb")
+    before = parts(tree)[1]
+    _, after = parts(tree_as_glb(tree, tmp_path / "few.glb", triangles=2000))
+    assert 1900 <= sum(len(mesh.faces) for mesh in after.values()) <= 2000
+    assert after["leaf"].area == pytest.approx(before["leaf"].area, rel=1e-4)
+    np.testing.assert_allclose(after["bark"].bounds[:, 0], [0, 8], atol=0.01)  # the trunk is whole
+    assert len(after["bark"].split(only_watertight=False)) > 20
+    lengths = [np.ptp(part.vertices, axis=0).max() for part in after["bark"].split(only_watertight=False)]
+    assert np.median(lengths) == pytest.approx(0.2, abs=0.02)
+    # Each cluster keeps an eighth of the leaves. Chance would vary by 8 % of that or more.
+    shares = np.bincount(after["leaf"].triangles_center[:, 0].round().astype(int), minlength=8) / len(after["leaf"].faces)
+    np.testing.assert_allclose(shares, 1 / 8, rtol=0.03)
+
+
+def test_few_triangles_of_many_are_evenly_spread_leaves_of_the_finer_tree(tmp_path: Path) -> None:
+    """A coarser tree has no leaf at a place where a finer one has none, so that levels of detail change as little as possible."""
+    tree = twiggy(tmp_path / "twiggy.glb")
+    places = list[np.ndarray]()
+    for count in (9000, 7000):
+        leaf = parts(tree_as_glb(tree, tmp_path / f"{count}.glb", triangles=count))[1]["leaf"]
+        places.append(np.array([part.vertices.mean(0) for part in leaf.split(only_watertight=False)]))
+    assert 1000 < len(places[1]) < len(places[0])
+    distances = np.linalg.norm(places[1][:, None] - places[0][None], axis=-1).min(1)
+    assert np.median(distances) < 0.01
+
+
 def test_normals_stay_and_split_no_vertices(tmp_path: Path) -> None:
     """Flat leaves of three triangles: Blender keeps their normals face by face, each rounded in its own way."""
     random = np.random.default_rng(2)

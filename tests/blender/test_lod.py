@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from gltf_arrays import array
+from khronos import WARNING, messages
 from PIL import Image
 
 import bbfit.lod
@@ -207,6 +208,24 @@ def test_thinned_trees_are_levels_between_the_tree_and_the_billboards(built: Lod
     before = {path: path.stat().st_mtime_ns for path in built.folder.rglob("*.png")}
     assert build_lod(TREE, out, replace(LEVELS, thinned=counts), SMALL, work=built.folder) == result
     assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_thinned_levels_have_integers_where_the_program_reads_them(built: LodResult) -> None:
+    count = built.levels[0].triangles // 4
+    stages = replace(SMALL, export=ExportConfig(profile="three"))
+    (floats, expected), (integers, got) = (
+        (result.folder / "levels" / result.levels[1].file, result.levels[1])
+        for result in (
+            build_lod(TREE, built.path.with_name("thinned.glb"), replace(LEVELS, thinned=(count,)), own, work=built.folder)
+            for own in (SMALL, stages)
+        )
+    )
+    assert floats == integers and (got.vertices, got.triangles) == (expected.vertices, expected.triangles)
+    assert got.bytes < 0.7 * expected.bytes and got.psnr == pytest.approx(expected.psnr, abs=0.1)
+    tree, _ = split_glb(integers.read_bytes())
+    assert tree["extensionsRequired"] == ["KHR_mesh_quantization"]
+    found = messages(integers)
+    assert [message for message in found if message["severity"] <= WARNING] == []
 
 
 def _pixels_of_views(built: LodResult) -> float:
