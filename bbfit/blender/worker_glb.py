@@ -21,7 +21,7 @@ BARK_SEEN = 0.5
 # Triangles that each leaf or each part of the bark keeps in the mean; parts that cannot have them go. Fewer leaves of more triangles are
 # worse: what counts is how evenly they fill the crown.
 LEAF_TRIANGLES, BARK_TRIANGLES = 1, 16
-# Leaves with texture coordinates keep two, because their textures may fill a rectangle.
+# Leaves with pictures keep two, the triangles of a rectangle.
 TEXTURED_LEAF_TRIANGLES = 2
 JOIN_BATCH = 64
 
@@ -200,7 +200,9 @@ def thinned(placed: list[PlacedMesh], triangles: int) -> list[PlacedMesh]:
     )
     share = leaf_area / max(leaf_area + BARK_SEEN * bark_area, 1e-30)
     of_leaves = min(sum(int(each.sum()) for each in leaves), round(share * triangles))
-    textured = any(item.data.uv_layers and each.any() for item, each in zip(joined, leaves, strict=True))
+    textured = any(
+        shows_picture(item.data, original.materials[each]) for item, original, each in zip(joined, originals, leaves, strict=True)
+    )
     stems = reduced(joined, originals, bark, triangles - of_leaves, BARK_TRIANGLES, by_area=True)
     rest = triangles - sum(len(mesh.loop_triangles) for mesh in stems if mesh)
     crowns = reduced(joined, originals, leaves, rest, TEXTURED_LEAF_TRIANGLES if textured else LEAF_TRIANGLES, by_area=False)
@@ -215,6 +217,12 @@ def thinned(placed: list[PlacedMesh], triangles: int) -> list[PlacedMesh]:
             bpy.data.objects.remove(whole)
     bpy.data.batch_remove(joined)
     return remaining
+
+
+def shows_picture(mesh: Any, slots: np.ndarray) -> bool:
+    """Whether a material in any of these slots of a mesh has a picture."""
+    materials = [mesh.materials[slot] for slot in np.unique(slots) if slot < len(mesh.materials)]
+    return any(node.type == "TEX_IMAGE" for material in materials if material and material.node_tree for node in material.node_tree.nodes)
 
 
 def foliage(original: Islands, length: float) -> np.ndarray:
