@@ -170,14 +170,17 @@ def _thinned(subject: Subject, folder: Path, limit: int | None = None) -> System
     limit = limit or subject.most_bytes
     request = subject.views.request
     assert request and request.tree.faces
-    faces, models = request.tree.faces, list[bytes]()
-    triangles = max(1, min(faces, faces * limit // subject.tree.bytes))
-    for _ in range(_THINNING_ATTEMPTS):
+    faces, models, counts = request.tree.faces, list[bytes](), list[int]()
+    triangles = faces * limit // subject.tree.bytes
+    while len(models) < _THINNING_ATTEMPTS and (triangles := max(1, min(faces, triangles))) not in counts:
         models.append(_thinned_glb(subject, folder, triangles))
-        size, earlier = len(models[-1]), triangles
-        triangles = max(1, min(faces, int(_AIM * triangles * limit / size)))
-        if _CLOSE * limit <= size <= limit or triangles == earlier:
+        counts.append(triangles)
+        size = len(models[-1])
+        if _CLOSE * limit <= size <= limit:
             break
+        # The bytes of a triangle: those of the first file with its materials, later those by which files differ.
+        each = size / triangles if len(counts) < 2 else (size - len(models[-2])) / (triangles - counts[-2])
+        triangles = int(triangles + (_AIM * limit - size) / each) if each > 0 else triangles // 2
     fitting = [model for model in models if len(model) <= limit]
     model = max(fitting, key=len) if fitting else min(models, key=len)
     note = _THINNED if fitting else f"{_THINNED}; no smaller size is possible"
