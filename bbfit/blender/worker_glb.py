@@ -21,8 +21,11 @@ BARK_SEEN = 0.5
 # Triangles that each leaf or each part of the bark keeps in the mean; parts that cannot have them go. Fewer leaves of more triangles are
 # worse: what counts is how evenly they fill the crown.
 LEAF_TRIANGLES, BARK_TRIANGLES = 1, 16
-# Leaves with pictures keep two, the triangles of a rectangle.
-TEXTURED_LEAF_TRIANGLES = 2
+# Leaves with pictures keep the triangles of a rectangle.
+RECTANGLE = 2
+# Bark and foliage may exceed their numbers of triangles by this factor. If more remain, further parts go, at least a tenth of them at a
+# time, in at most so many attempts.
+OVERSHOOT, ATTEMPTS, FEWER = 1.01, 8, 0.9
 JOIN_BATCH = 64
 
 
@@ -205,7 +208,7 @@ def thinned(placed: list[PlacedMesh], triangles: int) -> list[PlacedMesh]:
     )
     stems = reduced(joined, originals, bark, triangles - of_leaves, BARK_TRIANGLES, by_area=True)
     rest = triangles - sum(len(mesh.loop_triangles) for mesh in stems if mesh)
-    crowns = reduced(joined, originals, leaves, rest, TEXTURED_LEAF_TRIANGLES if textured else LEAF_TRIANGLES, by_area=False)
+    crowns = reduced(joined, originals, leaves, rest, RECTANGLE if textured else LEAF_TRIANGLES, by_area=False)
     remaining = list[PlacedMesh]()
     for item, original, stem, crown in zip(joined, originals, stems, crowns, strict=True):
         if crown:
@@ -235,23 +238,46 @@ def reduced(
 ) -> list[Any]:
     """The ``chosen`` triangles of each object, reduced to about ``triangles`` of all objects, as meshes; ``None`` where nothing remains.
 
-    As many islands remain as can have ``least`` triangles in the mean, or the mean of all if that is less. ``by_area``: the larger an
-    island, the likelier it remains.
+    As many islands remain as can have ``least`` triangles in the mean. Islands stay whole if they have fewer in the mean, or no more than a
+    rectangle, which would vanish as a whole. ``by_area``: the larger an island, the likelier it remains.
     """
     import bpy
 
-    own = [original.labels[original.triangles[:, 0]] for original in originals]
-    found = [np.unique(labels[each]) for labels, each in zip(own, chosen, strict=True)]
-    total, count = sum(int(each.sum()) for each in chosen), sum(map(len, found))
+    total = sum(int(each.sum()) for each in chosen)
+    count = sum(len(np.unique(original.labels[original.triangles[each, 0]])) for original, each in zip(originals, chosen, strict=True))
     if triangles < 1 or not count:
         return [None for _ in items]
-    share = triangles / count / min(least, total / count)
+    mean = total / count
+    share = triangles / count / (mean if mean <= RECTANGLE else min(least, mean))
+    meshes = list[Any]()
+    for _ in range(ATTEMPTS):
+        bpy.data.batch_remove([mesh for mesh in meshes if mesh])
+        meshes = collapsed(items, originals, sampled(originals, chosen, share, by_area=by_area), triangles)
+        got = sum(len(mesh.loop_triangles) for mesh in meshes if mesh)
+        if got <= OVERSHOOT * triangles or share * count <= 1:
+            break
+        # The edges of small closed surfaces and of some leaves cannot collapse so far.
+        share = min(share, 1.0) * min(triangles / got, FEWER)
+    return meshes
+
+
+def sampled(originals: list[Islands], chosen: list[np.ndarray], share: float, *, by_area: bool) -> list[np.ndarray]:
+    """Which of the ``chosen`` triangles of each object remain, if a ``share`` of their islands does, at least one of each object."""
     kept = list[np.ndarray]()
-    for original, labels, each, numbers in zip(originals, own, chosen, found, strict=True):
+    for original, each in zip(originals, chosen, strict=True):
+        labels = original.labels[original.triangles[:, 0]]
+        numbers = np.unique(labels[each])
         areas = np.bincount(labels[each], original.areas[each], len(original.centers))[numbers] if by_area else 1.0
         # Weighted sampling without replacement (Efraimidis and Spirakis 2006), with evenly spread numbers in place of random ones.
         order = np.argsort(-np.log1p(-spread(original.centers[numbers])) / np.maximum(areas, 1e-30), kind="stable")
         kept.append(each & np.isin(labels, numbers[order[: math.ceil(share * len(numbers))]]))
+    return kept
+
+
+def collapsed(items: list[Any], originals: list[Islands], kept: list[np.ndarray], triangles: int) -> list[Any]:
+    """The ``kept`` triangles of each object as meshes, whose edges collapse until about ``triangles`` of all objects are left."""
+    import bpy
+
     ratio = triangles / max(sum(int(each.sum()) for each in kept), 1)
     meshes = list[Any]()
     for item, original, each in zip(items, originals, kept, strict=True):
