@@ -234,7 +234,7 @@ class LodConfig:
     original: bool = True
     """Keep the tree itself as the finest level."""
     triangles: Count | None = None
-    """Triangles to which Blender decimates the tree itself. Default: all of them stay."""
+    """Triangles to which Blender thins the tree itself out. Default: all of them stay."""
     fragments_per_triangle: Annotated[float, Range(0, 1e6)] | None = None
     """How many pixels of triangles (fragments) are shaded in the time that a triangle takes; bbfit frames measures it.
     A level then takes over only where it also draws faster, with the outline that draws fastest there.

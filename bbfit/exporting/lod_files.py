@@ -64,7 +64,7 @@ class StoredLevels:
     focal: float
     """Focal length in pixels of the screen that their distances are for. Distances over it hold for any screen."""
     triangles: int | None
-    """Triangles to which the tree itself was decimated; ``None`` if all of them stayed."""
+    """Triangles to which the tree itself was thinned out; ``None`` if all of them stayed."""
 
 
 def read_levels(folder: Path) -> StoredLevels:
