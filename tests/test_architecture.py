@@ -58,7 +58,16 @@ def relative(path: Path) -> str:
 ONLY_IN = {
     "bpy": {
         f"blender/{name}.py"
-        for name in ("worker", "worker_scene", "worker_glb", "worker_lights", "worker_thin", "worker_depth", "worker_field")
+        for name in (
+            "worker",
+            "worker_scene",
+            "worker_glb",
+            "worker_lights",
+            "worker_thin",
+            "worker_thinning",
+            "worker_depth",
+            "worker_field",
+        )
     },
     "cv2": {"images.py", "fitting/bounds.py"},
     "xatlas": {"exporting/packing.py"},

@@ -110,7 +110,7 @@ def convert(settings: dict[str, Any], answer: Any) -> None:
     tree, path, triangles = settings["tree"], settings["convert"]["path"], settings["convert"]["triangles"]
     _, facts = SCENE.open_tree(tree, settings["files"])
     try:
-        count = import_beside("worker_glb").write(path, triangles)
+        count = import_beside("worker_glb").write(path, triangles, import_beside("worker_thinning").thinned)
     except RuntimeError as error:  # any failure of the exporter
         reason = " ".join(str(error).split())[-200:]
         raise SCENE.InputRefused("tree", f"{tree} cannot be written as .glb ({reason})", CONVERT_HINT) from error

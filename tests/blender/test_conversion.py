@@ -202,6 +202,17 @@ def test_a_tree_of_many_twigs_keeps_its_leaves_its_trunk_and_whole_twigs(tmp_pat
     np.testing.assert_allclose(shares, 1 / 8, rtol=0.05)  # measured 0.042
 
 
+def test_leaves_and_bark_of_different_layers_are_thinned_out_together(tmp_path: Path) -> None:
+    """Blender cannot join meshes with colors of vertices to others without losing a material's colors."""
+    scene = trimesh.load(twiggy(tmp_path / "twiggy.glb"), process=False)
+    leaves = next(mesh for mesh in scene.geometry.values() if mesh.visual.material.name == "leaf")
+    leaves.visual = trimesh.visual.ColorVisuals(leaves, vertex_colors=np.tile([[40, 90, 30, 255]], (len(leaves.vertices), 1)))
+    scene.export(str(tmp_path / "colored.glb"))
+    few = load(tree_as_glb(tmp_path / "colored.glb", tmp_path / "few.glb", triangles=2000))
+    assert 1900 <= len(few.faces) <= 2000
+    np.testing.assert_allclose(few.bounds, load(tmp_path / "colored.glb").bounds, atol=0.2)
+
+
 def test_leaves_that_cannot_collapse_to_a_triangle_are_fewer(tmp_path: Path) -> None:
     """Blender leaves a few triangles of each closed surface, such as a needle."""
     places = np.random.default_rng(5).uniform(-1, 1, (1500, 3))

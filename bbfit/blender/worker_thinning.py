@@ -1,0 +1,232 @@
+"""Thin the meshes of a tree out. This module runs in the worker's process.
+
+``worker.py`` imports it by path, so it does not import bbfit.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+# A material is foliage if none of its islands is longer than this share of the tree's diagonal. Leaves and cards are shorter, stems longer.
+FOLIAGE_LENGTH = 0.25
+# Leaves are enlarged by at most this factor to compensate for removed leaves.
+MAX_GROWTH = 4.0
+# What is seen of the area of a stem, whose far side is hidden, relative to that of a leaf. Less or more is no better.
+BARK_SEEN = 0.5
+# Triangles that each leaf or each part of the bark keeps in the mean; parts that cannot have them go. Fewer leaves of more triangles are
+# worse: what counts is how evenly they fill the crown.
+LEAF_TRIANGLES, BARK_TRIANGLES = 1, 16
+# Leaves with pictures keep the triangles of a rectangle.
+RECTANGLE = 2
+# Bark and foliage may exceed their numbers of triangles by this factor. If more remain, further parts go, at least a tenth of them at a
+# time, in at most so many attempts.
+OVERSHOOT, ATTEMPTS, FEWER = 1.01, 8, 0.9
+
+
+@dataclass(frozen=True)
+class Islands:
+    """The connected components ("islands") of a mesh of P vertices and T triangles."""
+
+    labels: np.ndarray
+    """Island of each vertex, [P]."""
+    triangles: np.ndarray
+    """Vertices of each triangle, [T, 3]."""
+    materials: np.ndarray
+    """Material slot of each triangle, [T]."""
+    areas: np.ndarray
+    """Area of each triangle, [T]."""
+    lengths: np.ndarray
+    """Diagonal of the bounding box of each triangle's island, [T]."""
+    centers: np.ndarray
+    """The mean of each island's vertices, [I, 3]."""
+
+
+def thinned(meshes: list[Any], triangles: int) -> list[list[Any]]:
+    """Thin a tree out to about ``triangles``: take whole leaves and twigs away, collapse edges of what remains, and enlarge the leaves.
+
+    What remains of each mesh are up to two meshes, in the same frame. Bark and foliage share the triangles by the areas that one sees of
+    them. Both keep as many parts as can have a few triangles each (``BARK_TRIANGLES``, ``LEAF_TRIANGLES``): leaves evenly, and large parts
+    of the bark more likely than small ones, so that the trunk stays. The edges of each kind collapse where this changes its shape least.
+    Then leaves are enlarged about their centers until each material of foliage has its former area (Cook et al., "Stochastic
+    Simplification of Aggregate Detail", SIGGRAPH 2007).
+    """
+    points = np.concatenate([coordinates(mesh) for mesh in meshes])
+    length = FOLIAGE_LENGTH * float(np.linalg.norm(np.ptp(points, axis=0)))
+    originals = [islands(mesh) for mesh in meshes]
+    leaves = [foliage(original, length) for original in originals]
+    bark = [~each for each in leaves]
+    leaf_area, bark_area = (
+        sum(float(original.areas[each].sum(dtype=np.float64)) for original, each in zip(originals, kind, strict=True))
+        for kind in (leaves, bark)
+    )
+    share = leaf_area / max(leaf_area + BARK_SEEN * bark_area, 1e-30)
+    of_leaves = min(sum(int(each.sum()) for each in leaves), round(share * triangles))
+    textured = any(shows_picture(mesh, original.materials[each]) for mesh, original, each in zip(meshes, originals, leaves, strict=True))
+    stems = reduced(meshes, originals, bark, triangles - of_leaves, BARK_TRIANGLES, by_area=True)
+    rest = triangles - sum(len(mesh.loop_triangles) for mesh in stems if mesh)
+    crowns = reduced(meshes, originals, leaves, rest, RECTANGLE if textured else LEAF_TRIANGLES, by_area=False)
+    for original, crown in zip(originals, crowns, strict=True):
+        if crown:
+            restore_area(crown, original)
+    return [[mesh for mesh in both if mesh] for both in zip(stems, crowns, strict=True)]
+
+
+def shows_picture(mesh: Any, slots: np.ndarray) -> bool:
+    """Whether a material in any of these slots of a mesh has a picture."""
+    materials = [mesh.materials[slot] for slot in np.unique(slots) if slot < len(mesh.materials)]
+    return any(node.type == "TEX_IMAGE" for material in materials if material and material.node_tree for node in material.node_tree.nodes)
+
+
+def foliage(original: Islands, length: float) -> np.ndarray:
+    """Which triangles are foliage, [T]: those of materials all of whose islands are shorter than ``length``."""
+    return ~np.isin(original.materials, original.materials[original.lengths >= length])
+
+
+def reduced(
+    meshes: list[Any], originals: list[Islands], chosen: list[np.ndarray], triangles: int, least: float, *, by_area: bool
+) -> list[Any]:
+    """The ``chosen`` triangles of each mesh, reduced to about ``triangles`` of all; ``None`` where nothing remains.
+
+    As many islands remain as can have ``least`` triangles in the mean. Islands stay whole if they have fewer in the mean, or no more than a
+    rectangle, which would vanish as a whole. ``by_area``: the larger an island, the likelier it remains.
+    """
+    import bpy
+
+    total = sum(int(each.sum()) for each in chosen)
+    count = sum(len(np.unique(original.labels[original.triangles[each, 0]])) for original, each in zip(originals, chosen, strict=True))
+    if triangles < 1 or not count:
+        return [None for _ in meshes]
+    mean = total / count
+    share = triangles / count / (mean if mean <= RECTANGLE else min(least, mean))
+    made = list[Any]()
+    for _ in range(ATTEMPTS):
+        bpy.data.batch_remove([mesh for mesh in made if mesh])
+        made = collapsed(meshes, originals, sampled(originals, chosen, share, by_area=by_area), triangles)
+        got = sum(len(mesh.loop_triangles) for mesh in made if mesh)
+        if got <= OVERSHOOT * triangles or share * count <= 1:
+            break
+        # The edges of small closed surfaces and of some leaves cannot collapse so far.
+        share = min(share, 1.0) * min(triangles / got, FEWER)
+    return made
+
+
+def sampled(originals: list[Islands], chosen: list[np.ndarray], share: float, *, by_area: bool) -> list[np.ndarray]:
+    """Which of the ``chosen`` triangles of each mesh remain, if a ``share`` of their islands does, at least one of each mesh."""
+    kept = list[np.ndarray]()
+    for original, each in zip(originals, chosen, strict=True):
+        labels = original.labels[original.triangles[:, 0]]
+        numbers = np.unique(labels[each])
+        areas = np.bincount(labels[each], original.areas[each], len(original.centers))[numbers] if by_area else 1.0
+        # Weighted sampling without replacement (Efraimidis and Spirakis 2006), with evenly spread numbers in place of random ones.
+        order = np.argsort(-np.log1p(-spread(original.centers[numbers])) / np.maximum(areas, 1e-30), kind="stable")
+        kept.append(each & np.isin(labels, numbers[order[: math.ceil(share * len(numbers))]]))
+    return kept
+
+
+def collapsed(meshes: list[Any], originals: list[Islands], kept: list[np.ndarray], triangles: int) -> list[Any]:
+    """The ``kept`` triangles of each mesh, whose edges collapse until about ``triangles`` of all are left."""
+    import bpy
+
+    ratio = triangles / max(sum(int(each.sum()) for each in kept), 1)
+    made = list[Any]()
+    for mesh, original, each in zip(meshes, originals, kept, strict=True):
+        if not each.any():
+            made.append(None)
+            continue
+        part = bpy.data.objects.new("part", only(mesh, original, each))
+        bpy.context.scene.collection.objects.link(part)
+        if ratio < 1:
+            modifier = part.modifiers.new("bbfit", "DECIMATE")
+            modifier.ratio, modifier.use_collapse_triangulate = ratio, True
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        reduced_mesh = bpy.data.meshes.new_from_object(part.evaluated_get(depsgraph), depsgraph=depsgraph)
+        bpy.data.batch_remove([part.data])  # and the object with it
+        reduced_mesh.calc_loop_triangles()
+        made.append(reduced_mesh if len(reduced_mesh.polygons) else None)
+    return made
+
+
+def spread(points: np.ndarray) -> np.ndarray:
+    """Different numbers in [0, 1) for points, [P, 3], so that the points with numbers below any bound are spread evenly among all.
+
+    They are those of van der Corput's sequence, along Morton's curve through the points.
+    """
+    low = points.min(0, initial=np.inf)
+    scale = 1023 / max(float((points - low).max(initial=0)), 1e-30)
+    cells = ((points - low) * scale).astype(np.int64)
+    code = sum(((cells >> bit & 1) << [3 * bit, 3 * bit + 1, 3 * bit + 2]).sum(-1) for bit in range(10))
+    rank, values = np.empty(len(points), np.int64), np.zeros(len(points))
+    rank[np.argsort(code, kind="stable")] = np.arange(len(points))
+    for bit in range(max(len(points) - 1, 1).bit_length()):
+        values += (rank >> bit & 1) / 2 ** (bit + 1)
+    return values
+
+
+def only(mesh: Any, original: Islands, kept: np.ndarray) -> Any:
+    """A copy of a mesh with the polygons of the ``kept`` triangles alone; an island is kept as a whole or not at all."""
+    import bmesh
+
+    polygons = np.empty(len(original.triangles), np.int32)
+    mesh.loop_triangles.foreach_get("polygon_index", polygons)
+    stays = np.zeros(len(mesh.polygons), bool)
+    stays[polygons[kept]] = True
+    copy, edited = mesh.copy(), bmesh.new()
+    edited.from_mesh(mesh)
+    bmesh.ops.delete(edited, geom=[face for face in edited.faces if not stays[face.index]], context="FACES")
+    edited.to_mesh(copy)
+    edited.free()
+    return copy
+
+
+def islands(mesh: Any) -> Islands:
+    """Compute the connected components of a mesh."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    mesh.calc_loop_triangles()
+    triangles = np.empty((len(mesh.loop_triangles), 3), np.int32)
+    mesh.loop_triangles.foreach_get("vertices", triangles.ravel())
+    areas = np.empty(len(triangles), np.float32)
+    mesh.loop_triangles.foreach_get("area", areas)
+    polygons = np.empty(len(triangles), np.int32)
+    mesh.loop_triangles.foreach_get("polygon_index", polygons)
+    materials = np.empty(len(mesh.polygons), np.int32)
+    mesh.polygons.foreach_get("material_index", materials)
+    edges = triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
+    points = coordinates(mesh)
+    graph = coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), (len(points), len(points)))
+    number, labels = connected_components(graph, directed=False)
+    low, high = np.full((number, 3), np.inf), np.full((number, 3), -np.inf)
+    np.minimum.at(low, labels, points)
+    np.maximum.at(high, labels, points)
+    lengths = np.linalg.norm(high - low, axis=-1)[labels[triangles[:, 0]]]
+    counts = np.maximum(np.bincount(labels, minlength=number), 1)
+    centers = np.stack([np.bincount(labels, points[:, axis], number) / counts for axis in range(3)], -1)
+    return Islands(labels, triangles, materials[polygons], areas, lengths, centers)
+
+
+def coordinates(mesh: Any) -> np.ndarray:
+    """Vertex positions of a mesh, [P, 3] float32."""
+    values = np.empty((len(mesh.vertices), 3), np.float32)
+    mesh.vertices.foreach_get("co", values.ravel())
+    return values
+
+
+def restore_area(mesh: Any, original: Islands) -> None:
+    """Enlarge the islands of a mesh of foliage until each material has its area in ``original``."""
+    current = islands(mesh)
+    points = coordinates(mesh)
+    growth = np.ones(int(current.labels.max(initial=0)) + 1)
+    for material in np.unique(current.materials):
+        before, after = original.materials == material, current.materials == material
+        area = current.areas[after].sum(dtype=np.float64)
+        if area > 0:
+            factor = np.sqrt(original.areas[before].sum(dtype=np.float64) / area)
+            growth[current.labels[current.triangles[after]].ravel()] = np.clip(factor, 1.0, MAX_GROWTH)
+    centers = current.centers[current.labels]
+    mesh.vertices.foreach_set("co", (centers + growth[current.labels, None] * (points - centers)).astype(np.float32).ravel())
+    mesh.update()
