@@ -24,12 +24,12 @@ def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int 
     lights and animations. Surfaces without a material get the renderer's plain material, gray or in their vertex colors. The same input
     gives the same bytes.
 
-    ``triangles`` thins the tree out, as one joined mesh. Bark and foliage share the triangles by the areas that one sees. Where they have too
-    many parts, whole leaves and twigs go. The leaves that stay are evenly spread, and large parts of the bark, such as the trunk, are more
-    likely to stay than small ones. Then edges collapse (Blender's Decimate modifier), and leaves are enlarged until they have their former
-    area (Cook et al., "Stochastic Simplification of Aggregate Detail", SIGGRAPH 2007). A material counts as foliage if none of its connected
-    components is longer than a quarter of the tree. If leaves and bark share a material, the tree loses leaves and its crown gets sparser.
-    Enlarged leaves can extend slightly beyond the bounds of the tree.
+    ``triangles`` thins the tree out, as one joined mesh. Bark and foliage share the triangles by the areas that one sees. Where they have
+    too many parts, whole leaves and twigs go. The leaves that stay are evenly spread, and large parts of the bark, such as the trunk, are
+    more likely to stay than small ones. Then edges collapse (Blender's Decimate modifier), and leaves are enlarged until they have their
+    former area (Cook et al., "Stochastic Simplification of Aggregate Detail", SIGGRAPH 2007). A material counts as foliage if none of its
+    connected components is longer than a quarter of the tree. If leaves and bark share a material, the tree loses leaves and its crown
+    gets sparser. Enlarged leaves can extend slightly beyond the bounds of the tree.
 
     Parameters
     ----------

@@ -17,8 +17,9 @@ FOLIAGE_LENGTH = 0.25
 MAX_GROWTH = 4.0
 # What is seen of the area of a stem, whose far side is hidden, relative to that of a leaf. A quarter is no better.
 BARK_SEEN = 0.5
-# Triangles that a leaf or a part of the bark keeps in the mean. Parts that cannot have them go. Fewer leaves of more triangles each are worse,
-# and so are more twigs of fewer triangles: their tubes collapse, and that of the trunk too. Measured on training views of four trees.
+# Triangles that a leaf or a part of the bark keeps in the mean. Parts that cannot have them go. Fewer leaves of more triangles each are
+# worse, and so are more twigs of fewer triangles: their tubes collapse, and that of the trunk too. Measured on training views of four
+# trees.
 LEAF_TRIANGLES, BARK_TRIANGLES = 1, 16
 # Leaves with pictures keep the triangles of a rectangle.
 RECTANGLE = 2
