@@ -26,7 +26,7 @@ ATLAS = "atlas.png"
 
 
 def square_glb(color: Sequence[float], side: float = 2.0, *, aside: float = 0.0, holes: int = 0, alpha: AlphaKind = "mask") -> bytes:
-    """Two upright squares that cross, one meter above the ground and ``aside`` meters to the east of the trunk, in one color.
+    """Two upright squares that cross, one meter above the ground and ``aside`` meters east of the trunk, in one color. Vertices are integers.
 
     With ``holes``, the seed of random numbers, some texels are cut out, and the others are darker or brighter.
     """
@@ -37,7 +37,7 @@ def square_glb(color: Sequence[float], side: float = 2.0, *, aside: float = 0.0,
         random = np.random.default_rng(holes)
         texels[torch.from_numpy(random.random(len(texels)) < 0.3), 3] = 0
         texels[:, :3] *= torch.from_numpy(random.uniform(0.6, 1, (len(texels), 1))).float()
-    return shipped_model(cloud.with_texels(texels), ExportConfig(alpha=alpha, outline="rectangle")).glb
+    return shipped_model(cloud.with_texels(texels), ExportConfig(alpha=alpha, outline="rectangle", quantized=True)).glb
 
 
 def write_library(folder: Path, trees: dict[str, Sequence[bytes]], distances: Sequence[float], *, shared: bool = False) -> Library:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bbfit.exporting.lod import LodLevel
+from bbfit.exporting.vertex_formats import quantized_tree
 from bbfit.files import write_bytes, write_json
 from bbfit.glb import glb_pieces
 from bbfit.images import encode_png
@@ -23,11 +24,15 @@ DISTANCES = (0.0, 120.0, 400.0)
 
 
 def small_library(
-    folder: Path, names: Sequence[str] = ("oak", "birch", "fir"), planes: Sequence[int] = (4, 3, 2), brightness: Sequence[float] = (1, 1, 1)
+    folder: Path,
+    names: Sequence[str] = ("oak", "birch", "fir"),
+    planes: Sequence[int] = (4, 3, 2),
+    brightness: Sequence[float] = (1, 1, 1),
+    integers: Sequence[str] = (),
 ) -> Library:
     """Write a library. Each tree is an upright ellipse of one color, 0.4 times as wide as high, on planes that cross in its axis.
 
-    The materials of its levels have a ``brightness``.
+    The materials of its levels have a ``brightness``. Vertices of the trees ``integers`` are integers, as web viewers read them.
     """
     (folder / "trees").mkdir(parents=True)
     write_bytes(folder / "atlas.png", encode_png(_atlas(names)))
@@ -38,6 +43,7 @@ def small_library(
         for level, count in enumerate(planes):
             file = f"trees/{name}_LOD{level}.glb"
             data = _glb(height, count, (number / len(names), 1 / len(names)), brightness[level])
+            data = quantized_tree(data) if name in integers else data
             write_bytes(folder / file, data)
             distance = DISTANCES[level] * height / 10
             levels.append(_level(f"LOD{level}", count, len(data), distance, file))

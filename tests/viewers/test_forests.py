@@ -39,7 +39,7 @@ Chromium = tuple[Browser, ThreadPoolExecutor]
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("library")
-    small_library(folder, planes=(3, 3, 3), brightness=BRIGHTNESS)
+    small_library(folder, planes=(3, 3, 3), brightness=BRIGHTNESS, integers=("birch",))
     return folder
 
 

@@ -14,7 +14,7 @@ from browser_viewer import HERE, NODE, ORIGIN, TYPES
 from numpy.typing import NDArray
 from playwright.sync_api import Browser, Error, Page, Route
 
-from bbfit.exporting.config import ExportConfig, LodConfig
+from bbfit.exporting.config import ExportConfig, LodConfig, Profile
 from bbfit.exporting.lod import LodLevel, lod_glb
 from bbfit.exporting.lod_files import LOD_FILE, level_file, lod_document, program_files
 from bbfit.exporting.model import shipped_model
@@ -38,10 +38,12 @@ def colored(channel: int, side: float) -> BillboardCloud:
     return cloud.with_texels(torch.eye(4)[[channel, 3]].sum(0).expand_as(cloud.texels))
 
 
-def levels_folder(folder: Path, profile: str, sides: tuple[float, float, float] = SIDES) -> Path:
-    """A red, a green and a blue level."""
+def levels_folder(folder: Path, profile: Profile, sides: tuple[float, float, float] = SIDES) -> Path:
+    """A red, a green and a blue level, with vertices of integers."""
     folder.mkdir()
-    models = [shipped_model(colored(channel, side), ExportConfig(alpha="mask")).glb for channel, side in enumerate(sides)]
+    export = ExportConfig(alpha="mask", profile=profile)
+    assert export.resolve().quantized
+    models = [shipped_model(colored(channel, side), export).glb for channel, side in enumerate(sides)]
     levels = [
         LodLevel(f"oak_LOD{n}", 2, 0, 0, 0, 0.0, 0.0, 0.0, None, None, distance, 0.5**n, level_file("oak", n), distance, 0.0, 0.0, 0.0)
         for n, distance in enumerate(DISTANCES)

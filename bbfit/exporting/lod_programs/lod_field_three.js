@@ -5,7 +5,9 @@
 // matrices are 16 numbers for each copy, column after column: where it stands, its turn, and its size. Levels fade into each other by
 // dithering: each pixel shows one of the two, so masks stay masks. Copies outside the picture are left out.
 // Copies may come and go in patches, such as the tiles of a map: field.addPatch(matrices) returns a patch for field.removePatch(patch).
-import { Box3, DynamicDrawUsage, Frustum, Group, InstancedBufferAttribute, InstancedMesh, MathUtils, Matrix4, Sphere, Vector3 } from "three";
+import {
+  Box3, BufferAttribute, DynamicDrawUsage, Frustum, Group, InstancedBufferAttribute, InstancedMesh, MathUtils, Matrix4, Sphere, Vector3,
+} from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 
 const BUCKETS = 256; // of distances, by which copies are sorted
@@ -243,10 +245,25 @@ function partsOf(object) {
   object.traverse((mesh) => {
     if (!mesh.isMesh) return;
     const moved = !mesh.matrixWorld.equals(new Matrix4());
-    const geometry = moved ? mesh.geometry.clone().applyMatrix4(mesh.matrixWorld) : mesh.geometry;
+    const geometry = moved ? withFloats(mesh.geometry.clone()).applyMatrix4(mesh.matrixWorld) : mesh.geometry;
     parts.push({ geometry, material: dithered(mesh.material) });
   });
   return parts;
+}
+
+// Floats in place of integers that a matrix changes: a moved position is no integer.
+function withFloats(geometry) {
+  for (const name of ["position", "normal", "tangent"]) {
+    const values = geometry.attributes[name];
+    if (!values || values.array instanceof Float32Array) continue;
+    const { itemSize, count, normalized, array, data = { stride: itemSize }, offset = 0 } = values;
+    const signed = array instanceof Int8Array || array instanceof Int16Array;
+    const most = normalized ? 2 ** (8 * array.BYTES_PER_ELEMENT - signed) - 1 : 1;
+    const floats = Float32Array.from({ length: itemSize * count }, (_, index) =>
+      array[Math.floor(index / itemSize) * data.stride + offset + (index % itemSize)] / most);
+    geometry.setAttribute(name, new BufferAttribute(floats, itemSize));
+  }
+  return geometry;
 }
 
 // Interleaved gradient noise (Jimenez 2014, "Next generation post processing in Call of Duty: Advanced Warfare").
