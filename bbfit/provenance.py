@@ -19,17 +19,17 @@ from bbfit.checks import check_file
 
 VERSIONS: Mapping[str, int] = {
     "grow": 2,
-    "convert": 3,
+    "convert": 4,
     "views": 8,
     "budget": 17,
     "fit": 27,
     "export": 20,
     "evaluate": 20,
     "report": 14,
-    "lod": 13,
-    "compare": 11,
+    "lod": 14,
+    "compare": 12,
     "frames": 2,
-    "library": 6,
+    "library": 7,
     "forest": 3,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""

@@ -79,11 +79,12 @@ def quantized(tree: dict[str, Any], views: list[bytes], cards: Cards) -> list[by
 def quantized_tree(glb: bytes) -> bytes:
     """The GLB of a tree that :func:`~bbfit.blender.conversion.tree_as_glb` wrote, with integers in place of floats.
 
-    It has the same place and size in about half of the bytes. Positions have 16 bits: a unit is 1/32,767 of half of a mesh's longest side.
-    Normals have 8 bits, and texture coordinates 16 if all of a primitive's are in [0, 1]. Others, and colors, stay as they are.
+    It has the same place and size in half of the bytes or less. Positions have 16 bits: a unit is 1/32,767 of half of a mesh's longest
+    side. Normals have 8 bits, and texture coordinates 16 if all of a primitive's are in [0, 1]. Others, and colors, stay as they are.
+    What changes nothing is left out: texture coordinates that no texture uses, and indices where each names a vertex of its own.
     """
     tree, views = split_glb(glb)
-    geometry = _Geometry(tree, with_short_indices(tree, views))
+    geometry = _Geometry(tree, _without_unused(tree, with_short_indices(tree, views)))
     for number, mesh in enumerate(tree["meshes"]):
         attributes = [primitive["attributes"] for primitive in mesh["primitives"]]
         for each in attributes:
@@ -101,6 +102,51 @@ def quantized_tree(glb: bytes) -> bytes:
                 _rescale(node, unit, origin)
     geometry.require()
     return joined_glb(tree, geometry.views)
+
+
+def _without_unused(tree: dict[str, Any], views: list[bytes]) -> list[bytes]:
+    """The contents of the buffer views of a tree without what changes nothing, see :func:`quantized_tree`; the JSON changes in place.
+
+    Each primitive has accessors of its own.
+    """
+    accessors, views = tree["accessors"], list(views)
+    primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
+    for primitive in primitives:
+        attributes = primitive["attributes"]
+        sets = _texture_sets(tree["materials"][primitive["material"]]) if "material" in primitive else 0
+        for name in [key for key in attributes if key.startswith("TEXCOORD_") and int(key.removeprefix("TEXCOORD_")) >= sets]:
+            del attributes[name]
+        points = accessors[attributes["POSITION"]]["count"]
+        if "indices" in primitive and (corners := accessors[primitive["indices"]])["count"] == points:
+            order = np.frombuffer(views[corners["bufferView"]], {_UNSIGNED_SHORT: "<u2", _UNSIGNED_INT: "<u4"}[corners["componentType"]])
+            if len(np.unique(order)) == points:
+                for view in (accessors[number]["bufferView"] for number in attributes.values()):
+                    views[view] = np.frombuffer(views[view], np.uint8).reshape(points, -1)[order].tobytes()
+                del primitive["indices"]
+    places = [(primitive["attributes"], name) for primitive in primitives for name in primitive["attributes"]]
+    places += [(primitive, "indices") for primitive in primitives if "indices" in primitive]
+    tree["accessors"] = _kept(accessors, places)
+    pictures = [(image, "bufferView") for image in tree.get("images", ()) if "bufferView" in image]
+    numbered = _kept(list(enumerate(tree["bufferViews"])), [*((accessor, "bufferView") for accessor in tree["accessors"]), *pictures])
+    tree["bufferViews"] = [view for _, view in numbered]
+    return [views[number] for number, _ in numbered]
+
+
+def _kept(items: list[Any], places: list[tuple[dict[str, Any], str]]) -> list[Any]:
+    """Those of the items whose numbers are at these places, which get the new numbers."""
+    numbers = {old: new for new, old in enumerate(sorted({own[key] for own, key in places}))}
+    for own, key in places:
+        own[key] = numbers[own[key]]
+    return [items[number] for number in numbers]
+
+
+def _texture_sets(part: Any) -> int:
+    """How many sets of texture coordinates a material, or a part of it, needs: up to the last one that a texture uses."""
+    parts = list(part.values()) if isinstance(part, dict) else part if isinstance(part, list) else []
+    own = 0
+    if isinstance(part, dict) and isinstance(part.get("index"), int):  # a textureInfo of glTF, whose transform may name another set
+        own = 1 + part.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", part.get("texCoord", 0))
+    return max([own, *map(_texture_sets, parts)])
 
 
 def _rescale(node: dict[str, Any], unit: float, origin: NDArray[np.float64]) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -130,18 +131,21 @@ def test_programs_that_read_integers_get_them(crossed: BillboardCloud) -> None:
 
 
 def _tree_of_floats() -> bytes:
-    """Two meshes as Blender writes them, at three nodes, of which one is turned and mirrored; the second mesh repeats its texture."""
-    random, contents = np.random.default_rng(3), list[bytes]()
-    tree: dict[str, Any] = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 1, 2]}], "accessors": [], "bufferViews": []}
+    """Two meshes as Blender writes them, at three nodes, of which one is turned and mirrored. The second mesh repeats its texture.
+
+    The first primitive shares vertices. The second has a material without a texture.
+    """
+    random, contents = np.random.default_rng(3), [cv2.imencode(".png", np.zeros((1, 1, 3), np.uint8))[1].tobytes()]
+    tree: dict[str, Any] = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 1, 2]}], "accessors": [], "bufferViews": [{}]}
 
     def put(values: np.ndarray, kind: int, shape: str, **more: Any) -> int:
         contents.append(values.astype(KINDS[kind]).tobytes())
         tree["bufferViews"].append({"target": 34963 if shape == "SCALAR" else 34962})
         accessor = {"bufferView": len(contents) - 1, "componentType": kind, "count": len(values), "type": shape}
         tree["accessors"].append(accessor | more)
-        return len(contents) - 1
+        return len(tree["accessors"]) - 1
 
-    def primitive(count: int, repeats: float) -> dict[str, Any]:
+    def primitive(count: int, repeats: float, material: int, corners: np.ndarray) -> dict[str, Any]:
         points = random.normal(size=(count, 3)).astype("f4") * [1, 5, 2] + [3, 4, 5]
         bounds = {"min": points.min(0).astype("f4").tolist(), "max": points.max(0).astype("f4").tolist()}
         normals = random.normal(size=(count, 3))
@@ -149,27 +153,33 @@ def _tree_of_floats() -> bytes:
             "POSITION": put(points, 5126, "VEC3", **bounds),
             "NORMAL": put(normals / np.linalg.norm(normals, axis=1, keepdims=True), 5126, "VEC3"),
             "TEXCOORD_0": put(repeats * random.random((count, 2)), 5126, "VEC2"),
+            "TEXCOORD_1": put(random.random((count, 2)), 5126, "VEC2"),
         }
-        return {"attributes": attributes, "indices": put(random.permutation(count), 5125, "SCALAR"), "material": 0}
+        return {"attributes": attributes, "indices": put(corners, 5125, "SCALAR"), "material": material}
 
-    tree["materials"] = [{"doubleSided": True}]
-    tree["meshes"] = [{"primitives": [primitive(90, 1), primitive(30, 1)]}, {"primitives": [primitive(60, 7)]}]
+    shared = np.concatenate([np.arange(90), random.permutation(90)])
+    tree |= {"images": [{"bufferView": 0, "mimeType": "image/png"}], "textures": [{"source": 0}]}
+    tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}, {"doubleSided": True}]
+    parts = [primitive(90, 1, 0, shared), primitive(30, 1, 1, random.permutation(30)), primitive(60, 7, 0, random.permutation(60))]
+    tree["meshes"] = [{"primitives": parts[:2]}, {"primitives": parts[2:]}]
     turn = np.array([0.1, -0.5, 0.3, 0.8]) / np.linalg.norm([0.1, -0.5, 0.3, 0.8])
     placed = {"rotation": turn.tolist(), "scale": [-2.0, 3.0, 0.5], "translation": [1.0, 2.0, 3.0]}
     tree["nodes"] = [{"mesh": 0}, {"mesh": 0} | placed, {"mesh": 1, "translation": [0.0, -9.0, 0.0]}]
     return joined_glb(tree, contents)
 
 
-def _world(glb: bytes) -> list[np.ndarray]:
-    """The points of each primitive of each node of a GLB, in the world."""
+def _corners(glb: bytes, name: str) -> list[np.ndarray]:
+    """An attribute at the corners of the triangles of each primitive of each node of a GLB, positions in the world."""
     tree, contents = split_glb(glb)
-    points = list[np.ndarray]()
+    found = list[np.ndarray]()
     for node in tree["nodes"]:
         turned = quaternion_matrix(np.roll(node.get("rotation", (0, 0, 0, 1)), 1))[:3, :3] * node.get("scale", (1, 1, 1))
         for primitive in tree["meshes"][node["mesh"]]["primitives"]:
-            own = array(tree, contents, primitive["attributes"]["POSITION"])
-            points.append(own @ turned.T + node.get("translation", (0, 0, 0)))
-    return points
+            if name in primitive["attributes"]:
+                own = array(tree, contents, primitive["attributes"][name])
+                own = own[array(tree, contents, primitive["indices"]).astype(int).ravel()] if "indices" in primitive else own
+                found.append(own @ turned.T + node.get("translation", (0, 0, 0)) if name == "POSITION" else own)
+    return found
 
 
 def test_a_tree_stays_where_it_is_in_half_of_the_bytes(tmp_path: Path) -> None:
@@ -178,20 +188,39 @@ def test_a_tree_stays_where_it_is_in_half_of_the_bytes(tmp_path: Path) -> None:
     for name, glb in (("floats", floats), ("integers", integers)):
         (tmp_path / f"{name}.glb").write_bytes(glb)
         assert [each for each in messages(tmp_path / f"{name}.glb") if each["severity"] <= WARNING] == []
-    for got, expected in zip(_world(integers), _world(floats), strict=True):
-        # Half of the longest side of a mesh is at most 15 m here, which one node stretches by 3.
-        np.testing.assert_allclose(got, expected, rtol=0, atol=0.5 * 3 * np.sqrt(3) * 15 / 32_767)
+    # Half of the longest side of a mesh is at most 15 m here, which one node stretches by 3.
+    for name, error in (("POSITION", 0.5 * 3 * np.sqrt(3) * 15 / 32_767), ("NORMAL", 0.5 / 127)):
+        for got, expected in zip(_corners(integers, name), _corners(floats, name), strict=True):
+            np.testing.assert_allclose(got, expected, rtol=0, atol=1.001 * error)
+    # The material of the second primitive, at the first two nodes, has no texture.
+    textured = [values for number, values in enumerate(_corners(floats, "TEXCOORD_0")) if number not in (1, 3)]
+    for got, expected in zip(_corners(integers, "TEXCOORD_0"), textured, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1.001 * 0.5 / 65_535)
+    assert _corners(integers, "TEXCOORD_1") == []
     tree, contents = split_glb(integers)
-    before, stored = split_glb(floats)
-    for mesh, kind in zip(tree["meshes"], (_UNSIGNED_SHORT, 5126), strict=True):
-        for primitive in mesh["primitives"]:
-            attributes = primitive["attributes"]
-            assert tree["accessors"][attributes["TEXCOORD_0"]]["componentType"] == kind
-            for name, error in (("NORMAL", 0.5 / 127), ("TEXCOORD_0", 0.5 / 65_535)):
-                got, expected = array(tree, contents, attributes[name]), array(before, stored, attributes[name])
-                np.testing.assert_allclose(got, expected, rtol=0, atol=1.001 * error)
-            np.testing.assert_array_equal(array(tree, contents, primitive["indices"]), array(before, stored, primitive["indices"]))
+    own = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
+    kinds = [tree["accessors"][each["attributes"]["TEXCOORD_0"]]["componentType"] for each in (own[0], own[2])]
+    assert kinds == [_UNSIGNED_SHORT, 5126]  # the coordinates of the second mesh exceed 1
+    assert ["indices" in each for each in own] == [True, False, False]
     assert tree["extensionsRequired"] == tree["extensionsUsed"] == [EXTENSION]
-    # A vertex and its index: 3 + 3 + 2 floats and 4 bytes, then 8 + 4 + 4 (or 8) and 2 bytes.
-    assert sum(map(len, stored)) == 180 * 36
-    assert sum(map(len, contents)) == 120 * 18 + 60 * 22
+    # Without the picture, a vertex has 8 + 4 bytes and its texture coordinates, 4 or 8, and an index 2.
+    picture = contents[tree["images"][0]["bufferView"]]
+    assert cv2.imdecode(np.frombuffer(picture, np.uint8), -1).shape == (1, 1, 3)
+    assert sum(map(len, contents)) - len(picture) == 90 * 16 + 180 * 2 + 30 * 12 + 60 * 20
+
+
+@pytest.mark.parametrize(
+    ("texture", "sets"),
+    [
+        ({}, 0),
+        ({"normalTexture": {"index": 3}}, 1),
+        ({"occlusionTexture": {"index": 0, "texCoord": 1, "strength": 0.5}}, 2),
+        ({"emissiveTexture": {"index": 0, "texCoord": 1, "extensions": {"KHR_texture_transform": {"texCoord": 0}}}}, 1),
+        ({"extensions": {"KHR_materials_transmission": {"transmissionTexture": {"index": 0, "texCoord": 1}}}}, 2),
+    ],
+)
+def test_texture_coordinates_that_a_texture_uses_stay(texture: dict[str, Any], sets: int) -> None:
+    tree, contents = split_glb(_tree_of_floats())
+    tree["materials"][1] |= texture
+    after, _ = split_glb(quantized_tree(joined_glb(tree, contents)))
+    assert sum(name.startswith("TEXCOORD_") for name in after["meshes"][0]["primitives"][1]["attributes"]) == sets
