@@ -227,7 +227,7 @@ def _join_stage(
     files = [each.file if isinstance(each, _Thinned) else each.folder / "cloud.safetensors" for each in made]
     scores = [each.folder / "metrics.json" for each in made if not isinstance(each, _Thinned)]
     digests = [digest_file(file) for file in (*files, *scores)]
-    inputs = (original and digest_file(original), digests, views.fingerprint, config, export.resolve(), out.stem)
+    inputs = (original and digest_file(original), digests, views.fingerprint, config, export.key, out.stem)
     return Stage("join", inputs, _outputs(out, folder, config, export), work, algorithm="lod")
 
 

@@ -239,14 +239,16 @@ def test_seconds_of_a_bake_outlive_it(tmp_path: Path) -> None:
 
 
 def test_trees_are_compared_by_means_and_spreads(tmp_path: Path) -> None:
-    """Two seeds of a species, a file, and a file without triangles: means of three, and the reason for the fourth."""
+    """Two seeds of a species, a file, one without triangles, and a damaged one: means of three, and reasons for the others."""
     config = replace(SMALL, systems=("bbfit", "crossed", "slicing", "draco"), workers=1)
     trimesh.PointCloud([[0, 0, 0], [0, 1, 0], [1, 0, 0]]).export(tmp_path / "points.ply")
-    trees = (TREE, tmp_path / "points.ply")
+    (tmp_path / "bad.glb").write_bytes(TREE.read_bytes()[:3000])
+    trees = (tmp_path / "bad.glb", TREE, tmp_path / "points.ply")
     stages = replace(STAGES, grow=GrowConfig(detail=0.1))
     done = compare_trees(tmp_path / "out", config, stages, species=("apple",), seeds=(0, 1), trees=trees)
     assert list(done.rows) == ["apple_0", "apple_1", "tree"]
-    assert list(done.failures) == ["points"] and "points.ply" in done.failures["points"]
+    assert list(done.failures) == ["bad", "points"]
+    assert all(f"{name}." in reason for name, reason in done.failures.items())
     every = [{row.system: row for row in rows} for rows in done.rows.values()]
     assert every[0]["crossed"].measures != every[1]["crossed"].measures
     systems = {each.system: each for each in summaries(done.rows)}
@@ -296,6 +298,8 @@ def test_a_package_that_was_missing_is_used_once_it_is_there(tmp_path: Path, mon
     finished = Outcome({"rows": [row.to_json()]}, None, "here")
     skipped = replace(row, costs=CompareCosts(), note="draco: the package DracoPy is not installed")
     assert _is_complete(finished) and not _is_complete(replace(finished, facts={"rows": [skipped.to_json()]}))
+    for damaged in (None, {}, {"rows": 3}, {"rows": [{}]}, {"rows": [row.to_json() | {"costs": {"vertices": "many"}}]}):
+        assert not _is_complete(replace(finished, facts=damaged))
 
 
 def test_a_tree_whose_textures_alone_are_too_large_gets_a_note(tmp_path: Path) -> None:
@@ -330,7 +334,7 @@ def test_bad_input(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="mip_files: only bbfit run, fit, sweep and export"):
         compare(TREE, tmp_path, SMALL, replace(STAGES, export=ExportConfig(mip_files=True)))
     (tmp_path / "bad.glb").write_bytes(TREE.read_bytes()[:3000])
-    with pytest.raises(InputError, match=r"bad\.glb"):
+    with pytest.raises(InputError, match=r"no tree succeeded; bad: .*bad\.glb"):
         compare_trees(tmp_path / "out", SMALL, STAGES, trees=(tmp_path / "bad.glb",))
     with pytest.raises(InputError, match="seeds: expected different ones"):
         compare_trees(tmp_path / "out", SMALL, STAGES, species=("apple",), seeds=(1, 1))

@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from bbfit.checks import InputError, fail
 from bbfit.comparison.config import CompareConfig
 from bbfit.comparison.one_tree import checked_systems, compare
 from bbfit.comparison.subject import is_missing
 from bbfit.files import write_bytes
+from bbfit.inputs import reading
 from bbfit.outputs import Written, claimed_folder
 from bbfit.pipeline import RunConfig
 from bbfit.provenance import VERSIONS, cache_key, identity
@@ -21,7 +23,7 @@ from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.species import load_species
 from bbfit.workers.choice import workers_of
 from bbfit.workers.results import Results
-from bbfit.workers.sources import Source, seeded_sources
+from bbfit.workers.sources import Source, seeded_sources, task_inputs
 from bbfit.workers.tasks import Facts, Outcome, Task
 
 _TABLES = ("summary.csv", "summary.md", "pareto.png")
@@ -71,7 +73,7 @@ def compare_trees(
     Raises
     ------
     InputError, OSError
-        If there are no trees, an option or a file is unusable, or the folder cannot be written to. Finished results are kept.
+        If there are no trees, none succeeds, an option is unusable, or the folder cannot be written to. Finished results are kept.
     """
     config, stages, on_progress = config or CompareConfig(), stages or RunConfig(), on_progress or silent
     chosen = seeded_sources(species, seeds, trees, stages.grow.species_file)
@@ -82,6 +84,9 @@ def compare_trees(
         outcomes = _compared(folder, chosen, config, stages, on_progress)
         rows = {name: _rows(outcome) for name, outcome in outcomes.items() if outcome.reason is None}
         failures = {name: outcome.reason for name, outcome in outcomes.items() if outcome.reason is not None}
+        if not rows:
+            name, reason = next(iter(failures.items()))
+            fail("compare", f"no tree succeeded; {name}: {reason}")
         write_bytes(folder / "summary.csv", summary_csv(rows))
         write_bytes(folder / "summary.md", summary_markdown(rows, failures).encode(errors="backslashreplace"))
         compare_plot(summaries(rows), folder / "pareto.png")
@@ -97,16 +102,19 @@ def _compared(
     with workers_of(config) as workers:
         for source, seed in chosen:
             place, grow = folder / "trees" / source.name, replace(stages.grow, seed=seed)
-            tree = None if source.tree is None else TreeFile.open(source.tree, stages.limits)
+            try:
+                tree = None if source.tree is None else TreeFile.open(source.tree, stages.limits)
+            except InputError as error:  # a damaged file
+                outcomes[source.name] = Outcome(None, str(error), "")
+                continue
             kind = tree.digest if tree else (load_species(source.species, grow.species_file), grow)
-            key = cache_key("compare", source.name, kind, config.compared, stages.views, stages.fit, stages.export.resolve(), VERSIONS)
+            key = cache_key("compare", source.name, kind, config.compared, stages.views, stages.fit, stages.export.key, VERSIONS)
             earlier = results.get(key)
-            if earlier is not None and earlier.reason is None and _is_complete(earlier) and (place / "compare.json").is_file():
+            if earlier is not None and _is_complete(earlier) and (place / "compare.json").is_file():
                 outcomes[source.name] = earlier
                 continue
             pending[source.name] = key
-            files = {"tree": tree and tree.files, "species_file": source.species and grow.species_file, "hdri": stages.views.hdri}
-            inputs = {name: paths if isinstance(paths, tuple) else (paths,) for name, paths in files.items() if paths}
+            inputs = task_inputs(source, tree, grow.species_file, stages.views.hdri)
             arguments = (config, replace(stages, grow=grow), source.species)
             workers.submit(Task(source.name, compare_tree, inputs, place, arguments, alone=True))
         on_progress("trees", len(outcomes), len(chosen))
@@ -137,8 +145,12 @@ def compare_tree(inputs: Mapping[str, Path], folder: Path, config: CompareConfig
 
 
 def _is_complete(outcome: Outcome) -> bool:
-    """Whether no system was skipped because a package was missing, which may have been installed since."""
-    return not any(is_missing(row.note) for row in _rows(outcome))
+    """Whether a stored outcome has the rows of all systems. One was skipped if a package was missing, which may be installed by now."""
+    try:
+        with reading("result", outcome.where, "remove it"):
+            return outcome.reason is None and not any(is_missing(row.note) for row in _rows(outcome))
+    except InputError:  # a damaged file
+        return False
 
 
 def _rows(outcome: Outcome) -> tuple[CompareRow, ...]:

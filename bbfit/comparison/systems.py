@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from bbfit.checks import InputError, check_record
+from bbfit.checks import InputError
 from bbfit.comparison.config import CompareConfig
 from bbfit.comparison.own_systems import own_systems
 from bbfit.comparison.rival_systems import rival_systems
@@ -68,7 +68,7 @@ class Systems:
             costs = CompareCosts(result.planes, result.vertices, size, round(result.seconds, 1), shaded, result.shader, triangles)
             write_json(folder / "result.json", CompareRow(system, chosen.title, costs, measures, result.note, light, far).to_json())
 
-        shared = (subject.stages.fit, subject.stages.export.resolve(), _VERSIONS)
+        shared = (subject.stages.fit, subject.stages.export.key, _VERSIONS)
         inputs = (system, subject.tree.digest, subject.views.full_fingerprint, chosen.inputs, subject.config.tree_height, *shared)
         outputs = (
             f"{system}/result.json",
@@ -88,7 +88,6 @@ class Systems:
         content = read_json("result", folder / "result.json")
         with reading("result", folder / "result.json", "remove it, then start bbfit compare again"):
             row = CompareRow.from_json(content)
-            check_record("row", row, CompareRow)
             drawing = drawing_cost(row.far, row.costs.triangles, subject.config.fragments_per_triangle)
             return replace(row, title=chosen.title, costs=replace(row.costs, drawing=drawing))
 

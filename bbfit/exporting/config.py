@@ -166,6 +166,14 @@ class ExportConfig:
             chosen["textures"] = "png" if ktx2_missing() else "ktx2"
         return ResolvedExport(**chosen)
 
+    @property
+    def key(self) -> tuple[ResolvedExport, Outline | None]:
+        """What a cache key contains: the resolved options and the requested outline.
+
+        :meth:`comparable`, :meth:`compact` and :meth:`outlines` choose an outline only if none is requested.
+        """
+        return self.resolve(), self.outline
+
     def check(self) -> None:
         """Require that the encoder of the requested textures is installed."""
         if self.textures == "ktx2" and (missing := ktx2_missing()):

@@ -24,7 +24,7 @@ from bbfit.tree_files.tree_file import MESH_SUFFIXES, TreeFile
 from bbfit.trees.species import load_species
 from bbfit.workers.choice import workers_of
 from bbfit.workers.results import Results
-from bbfit.workers.sources import Source, seeded_sources
+from bbfit.workers.sources import Source, seeded_sources, task_inputs
 from bbfit.workers.tasks import Facts, Outcome, Task, Workers
 
 
@@ -135,12 +135,11 @@ def _submitted(
     place, grow = folder / WORK / source.name, replace(stages.grow, seed=seed)
     tree = None if source.tree is None else TreeFile.open(source.tree, stages.limits)
     kind = tree.digest if tree else (load_species(source.species, grow.species_file), grow)
-    key = cache_key("library", source.name, kind, config.levels, stages.views, stages.fit, with_textures(stages.export).resolve(), VERSIONS)
+    key = cache_key("library", source.name, kind, config.levels, stages.views, stages.fit, with_textures(stages.export).key, VERSIONS)
     earlier = results.get(key)
     if earlier is not None and _is_current(earlier.facts, place):
         return earlier
-    files = {"tree": tree and tree.files, "species_file": source.species and grow.species_file, "hdri": stages.views.hdri}
-    inputs = {name: paths if isinstance(paths, tuple) else (paths,) for name, paths in files.items() if paths}
+    inputs = task_inputs(source, tree, grow.species_file, stages.views.hdri)
     arguments = (source.name, source.species, config, replace(stages, grow=grow))
     workers.submit(Task(source.name, library_tree, inputs, place, arguments))
     return key

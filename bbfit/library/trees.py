@@ -93,7 +93,7 @@ def _cards_stage(folder: Path, built: LodResult, export: ExportConfig) -> Stage:
     inputs = (
         [digest_file(path) for path in clouds],
         [asdict(level) for level in levels],
-        export.resolve(),
+        export.key,
         VERSIONS["export"],
     )
     return Stage(CARDS, inputs, tuple(card_file(level) for level in levels), work, algorithm="library")

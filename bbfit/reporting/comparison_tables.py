@@ -98,12 +98,13 @@ class CompareRow:
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> CompareRow:
-        """The row that :meth:`to_json` returned."""
+        """The row that :meth:`to_json` returned. Errors of any kind if it is damaged, to be caught where it is read."""
         costs = CompareCosts(**content["costs"])
-        check_record("costs", costs, CompareCosts)
         measures = None if content["measures"] is None else Measures.from_json(content["measures"])
         far = None if content["far"] is None else FarScore(**content["far"])
-        return CompareRow(**{**content, "costs": costs, "measures": measures, "far": far})
+        row = CompareRow(**{**content, "costs": costs, "measures": measures, "far": far})
+        check_record("row", row, CompareRow)
+        return row
 
 
 def compare_csv(rows: Sequence[CompareRow]) -> bytes:

@@ -30,7 +30,7 @@ from bbfit.trees.species import load_species
 from bbfit.views.dataset import ViewDataset
 from bbfit.workers.choice import workers_of
 from bbfit.workers.results import Results
-from bbfit.workers.sources import Source, sources
+from bbfit.workers.sources import Source, sources, task_inputs
 from bbfit.workers.tasks import Outcome, Task, Workers
 
 TABLES = ("table.csv", "table.md", "table.png")
@@ -185,8 +185,7 @@ class _Sweep:
             self._submit_runs(source, earlier, workers)
             return
         self._pending[name] = key, identity({"tree": source.species or str(source.tree), "views": views})
-        files = {"tree": tree and tree.files, "species_file": source.species and grow.species_file, "hdri": views.hdri}
-        inputs = {kind: paths if isinstance(paths, tuple) else (paths,) for kind, paths in files.items() if paths}
+        inputs = task_inputs(source, tree, grow.species_file, views.hdri)
         workers.submit(Task(name, prepare_tree, inputs, self._folder_of(source), (self._stages, source.species), alone=True))
 
     def _submit_runs(self, source: Source, outcome: Outcome, workers: Workers) -> None:
@@ -213,7 +212,7 @@ class _Sweep:
         """Submit the run of a cell, unless its result exists or the same run is already submitted."""
         fit, export = self._cells[number].config, self._stages.export
         versions = {name: VERSIONS[name] for name in ("export", "evaluate")}
-        request = {"fit": fit_inputs(views, fit, mesh), "export": export.resolve(), "views": views.full_fingerprint, "versions": versions}
+        request = {"fit": fit_inputs(views, fit, mesh), "export": export.key, "views": views.full_fingerprint, "versions": versions}
         key = cache_key("fit", request)[:_DIGITS]
         earlier = self._results.get(key)
         if earlier and self._is_final(earlier):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bbfit.checks import check_count, check_file, check_folder, fail
+from bbfit.tree_files.tree_file import TreeFile
 from bbfit.trees.species import load_species
 
 
@@ -70,6 +71,14 @@ def seeded_sources(
     if len({source.name for source, _ in made}) < len(made):
         fail("trees", "two trees have the same name", "rename one, or omit one")
     return made
+
+
+def task_inputs(source: Source, tree: TreeFile | None, species_file: Path | None, hdri: Path | None) -> dict[str, tuple[Path, ...]]:
+    """The input files of a task that grows or renders a tree: those of ``tree``, or the file with its species, and the environment."""
+    inputs = {"tree": tree.files} if tree else {}
+    if source.species is not None and species_file is not None:
+        inputs["species_file"] = (species_file,)
+    return inputs if hdri is None else inputs | {"hdri": (hdri,)}
 
 
 def _plain(name: str) -> str:
