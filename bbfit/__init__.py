@@ -1,4 +1,4 @@
-"""bbfit: a 3D tree as a handful of textured planes that look like it from every side."""
+"""bbfit: a 3D tree as textured planes that look like it from every side."""
 
 from typing import Any
 

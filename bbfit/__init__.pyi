@@ -12,7 +12,9 @@ from .evaluation.report import Report as Report
 from .evaluation.scoring import evaluate as evaluate
 from .exporting.config import ExportConfig as ExportConfig
 from .exporting.config import LodConfig as LodConfig
+from .exporting.config import ThinConfig as ThinConfig
 from .exporting.model import export as export
+from .exporting.trees import thin_tree as thin_tree
 from .fitting.config import FitConfig as FitConfig
 from .fitting.loop import FitResult as FitResult
 from .fitting.loop import fit as fit

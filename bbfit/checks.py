@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from decimal import Decimal, DecimalException
 from functools import cache
 from math import inf
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origi
 
 _LONGEST_MESSAGE = 4000
 _LARGEST_NUMBER = 10**30
+_FACTORS, _LARGEST_AMOUNT = {"k": 1_000, "m": 1_000_000}, 10**15
 
 
 class InputError(ValueError):
@@ -124,6 +126,20 @@ def _check(name: str, value: Any, hint: Any) -> None:
             if arguments[0] is int:
                 check_count(name, value, int(limits.low))
             check_range(name, value, limits.low, limits.high, open_low=limits.open_low, open_high=limits.open_high)
+
+
+def amount(name: str, value: int | str) -> int:
+    """A whole number, or one with k (thousands) or M (millions) after it, as in ``200k`` and ``1.5M``."""
+    if not isinstance(value, str):
+        return value
+    factor = _FACTORS.get(value[-1:].lower(), 1)
+    try:
+        number = Decimal(value if factor == 1 else value[:-1]) * factor
+    except DecimalException:
+        fail(name, f"{value!r} is no number", "write for example 200000, 200k or 1.5M")
+    if not number.is_finite() or abs(number) > _LARGEST_AMOUNT or number != int(number):
+        fail(name, f"{value!r} is not a whole number", "write for example 200000, 200k or 1.5M")
+    return int(number)
 
 
 def check_record(name: str, value: Any, hint: Any) -> None:

@@ -155,16 +155,16 @@ def check_levels(config: LodConfig, stages: RunConfig, *, mesh: bool) -> None:
 
 def _built(tree: TreeFile, out: Path, folder: Path, config: LodConfig, stages: RunConfig, on_progress: OnProgress) -> LodResult:
     """The stages of :func:`build_lod` in a claimed folder. The options were checked."""
-    record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
+    record = Record(folder, inputs=[*tree.files, stages.views.hdri])
     converted = {"convert": (ORIGINAL,)} if _converts(tree, config) else {}
     thinned = {f"thin {count}": (thinned_file(count),) for count in config.thinned}
-    record.check({"join": _outputs(out, folder, config, stages.export)} | converted | thinned)
+    record.check({"join": _outputs(out, folder, stages.export)} | converted | thinned)
     output_folder("work", folder / LEVELS)
     record.run(views_stage(folder, tree, stages.views), on_progress)
     views = ViewDataset.load(folder / "views", limits=stages.limits)
     export = with_textures(export_config(views, stages.outlined))
     original = _original(record, tree, config, export, on_progress) if config.original else None
-    meshes = [_thinned(record, tree, count, views, stages, export, on_progress) for count in config.thinned]
+    meshes = [_thinned(record, tree, count, views, stages, export, on_progress) for count in _smaller(config, views)]
     stages = replace(stages, tree=tree.path if tree.is_mesh else None)
     runs = [_fitted(folder, stages, planes, on_progress) for planes in config.planes]
     record.run(_join_stage(folder, out, original, [*meshes, *runs], views, config, export, stages.limits), on_progress)
@@ -228,7 +228,7 @@ def _join_stage(
     scores = [each.folder / "metrics.json" for each in made if not isinstance(each, _Thinned)]
     digests = [digest_file(file) for file in (*files, *scores)]
     inputs = (original and digest_file(original), digests, views.fingerprint, config, export.key, out.stem)
-    return Stage("join", inputs, _outputs(out, folder, config, export), work, algorithm="lod")
+    return Stage("join", inputs, _outputs(out, folder, export), work, algorithm="lod")
 
 
 @dataclass(frozen=True)
@@ -267,7 +267,7 @@ def _mesh_costs(file: TreeFile, views: ViewSet) -> dict[Outline | None, DrawingC
     return {None: mesh_cost(tree_triangles(file), views)}
 
 
-def _outputs(out: Path, folder: Path, config: LodConfig, export: ExportConfig) -> tuple[str, ...]:
+def _outputs(out: Path, folder: Path, export: ExportConfig) -> tuple[str, ...]:
     levels = level_file(glob.escape(out.stem), "*")
     shipped = (LOD_FILE, levels, *program_file_names(export.profile, out.stem))
     return ("lod.png", *(f"{LEVELS}/{name}" for name in shipped), os.path.relpath(out, folder))
@@ -299,6 +299,16 @@ def _thinned(
     stage, train, test = pictures_stage(record.folder, file, views, stages.views, stage=f"render {count}")
     record.run(stage, on_progress)
     return _Thinned(file, train, test)
+
+
+def _smaller(config: LodConfig, views: ViewDataset) -> list[int]:
+    """The numbers of triangles of thinned-out levels. One that the tree does not exceed stands for the tree, unless that is a level too."""
+    faces = (views.request and views.request.tree.faces) or math.inf
+    larger = sum(count >= faces for count in config.thinned)
+    same = larger if config.original else max(0, larger - 1)
+    if same:
+        _log.warning("the tree has %s triangles; no level has %s", f"{faces:,}", " or ".join(map(str, config.thinned[:same])))
+    return [*config.thinned[same:]]
 
 
 def thinned_file(count: int | str) -> str:

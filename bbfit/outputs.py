@@ -7,6 +7,7 @@ A folder that bbfit writes to has up to two hidden files. ``.bbfit.lock`` is loc
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import logging
 import os
@@ -54,11 +55,11 @@ def output_folder(name: str, path: str | Path) -> Path:
     return path
 
 
-def check_room(name: str, folder: Path, needed: int) -> None:
-    """Require that ``needed`` bytes are free on the disk of an existing folder. ``InputError`` calls the option ``name``."""
+def check_room(folder: Path, needed: int) -> None:
+    """Require that ``needed`` bytes are free on the disk of an existing output folder."""
     free = shutil.disk_usage(folder).free
     if free < needed:
-        fail(name, f"{folder} is on a disk with {free:,} free bytes, and {needed:,} may be needed", f"{_OTHER} or free the disk")
+        fail("out", f"{folder} is on a disk with {free:,} free bytes, and {needed:,} may be needed", f"{_OTHER} or free the disk")
 
 
 @contextlib.contextmanager
@@ -204,7 +205,8 @@ class Written:
                 continue
             if not keep_changed:
                 fail("out", f"{path} has changed since bbfit wrote it", "move it away, or choose another place for the results")
-            aside = next(place for place in _asides(path) if not place.exists())
+            places = (path.with_name(f"{path.name}.changed{number if number > 1 else ''}") for number in itertools.count(1))
+            aside = next(place for place in places if not place.exists())
             path.rename(aside)
             _log.warning("%s has changed since bbfit wrote it; it is now %s", path, aside.name)
         with self._changing():
@@ -261,11 +263,3 @@ class Written:
                 write_json(self._folder / WRITTEN_FILE, {"written": self._files, "begun": self._begun})
             else:
                 (self._folder / WRITTEN_FILE).unlink(missing_ok=True)
-
-
-def _asides(path: Path) -> Iterator[Path]:
-    yield path.with_name(f"{path.name}.changed")
-    number = 2
-    while True:
-        yield path.with_name(f"{path.name}.changed{number}")
-        number += 1

@@ -135,11 +135,6 @@ class RunConfig:
         """The options of the export without a budget, with rectangles for the preset ``thesis`` unless an outline is given."""
         return self.export.comparable() if self.fit.preset == "thesis" else self.export
 
-    def seeded(self, seed: int) -> RunConfig:
-        """The same options with one seed for growing, rendering and fitting."""
-        views, fit = replace(self.views, seed=seed), replace(self.fit, seed=seed)
-        return replace(self, grow=replace(self.grow, seed=seed), views=views, fit=fit)
-
 
 @dataclass(frozen=True)
 class RunResult:
@@ -320,7 +315,7 @@ def _record(out: str | Path, head: dict[str, Any], config: RunConfig, inputs: It
     with claimed_folder("out", out) as folder:
         record = Record(folder, head, [path for path in inputs if path is not None])
         record.check(outputs)
-        check_room("out", folder, _ROOM)
+        check_room(folder, _ROOM)
         yield record
 
 

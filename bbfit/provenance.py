@@ -28,9 +28,9 @@ VERSIONS: Mapping[str, int] = {
     "report": 14,
     "lod": 14,
     "compare": 12,
-    "frames": 2,
+    "frames": 3,
     "library": 7,
-    "forest": 3,
+    "forest": 4,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""
 EXECUTION = {"affects_result": False}

@@ -241,8 +241,3 @@ def test_an_obj_of_a_z_up_tree_is_z_up(views_folder: Path, tmp_path: Path) -> No
     vertices = json.loads((tmp_path / "out" / "metrics.json").read_text())["vertices"]
     model = shipped_model(result.cloud).cards.vertex_count
     assert vertices == {"model": model, "original": 5000, "ratio": model / 5000}
-
-
-def test_one_seed_is_that_of_all_stages() -> None:
-    seeded = CONFIG.seeded(7)
-    assert (seeded.grow.seed, seeded.views.seed, seeded.fit.seed) == (7, 7, 7) and seeded.seeded(0) == CONFIG

@@ -79,14 +79,14 @@ def realized() -> list[PlacedMesh]:
     import bpy
 
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    meshes: dict[tuple[int, ...], Any] = {}
+    meshes: dict[tuple[Any, ...], Any] = {}
     placed = list[PlacedMesh]()
     for instance in depsgraph.object_instances:
         evaluated = instance.object
         if evaluated.type != "MESH" or not instance.show_self:  # curves, texts and so on occur again as the meshes made of them
             continue
         own = {index: slot.material for index, slot in enumerate(evaluated.material_slots) if slot.link == "OBJECT"}
-        key = (evaluated.data.as_pointer(), *(material.as_pointer() if material else 0 for material in own.values()))
+        key = (evaluated.data.as_pointer(), *((index, material.as_pointer() if material else 0) for index, material in own.items()))
         if key not in meshes:
             mesh = bpy.data.meshes.new_from_object(evaluated, preserve_all_data_layers=True, depsgraph=depsgraph)
             mesh.name = evaluated.original.data.name if evaluated.original and evaluated.original.data else evaluated.name

@@ -23,6 +23,10 @@ BARK_SEEN = 0.5
 LEAF_TRIANGLES, BARK_TRIANGLES = 1, 16
 # Leaves with pictures keep the triangles of a rectangle.
 RECTANGLE = 2
+# Leaves are modeled as fronts and backs if more than this share of their triangles has another one of the same corners.
+DOUBLE = 0.5
+# Vertices of split bark are one if they are so near each other, in meters. Blender merges none at a distance of 0.
+MERGED = 1e-6
 # Bark and foliage may exceed their numbers of triangles by this factor. If more remain, further parts go, at least a tenth of them at a
 # time, in at most so many attempts.
 OVERSHOOT, ATTEMPTS, FEWER = 1.01, 8, 0.9
@@ -30,7 +34,11 @@ OVERSHOOT, ATTEMPTS, FEWER = 1.01, 8, 0.9
 
 @dataclass(frozen=True)
 class Islands:
-    """The connected components ("islands") of a mesh of P vertices and T triangles."""
+    """The connected components ("islands") of a mesh of P vertices and T triangles.
+
+    Triangles are connected if they share a vertex, or the ends of an edge of one material have the same places: files split vertices where
+    normals differ, as those of flat faces do.
+    """
 
     labels: np.ndarray
     """Island of each vertex, [P]."""
@@ -44,6 +52,10 @@ class Islands:
     """Diagonal of the bounding box of each triangle's island, [T]."""
     centers: np.ndarray
     """The mean of each island's vertices, [I, 3]."""
+    double: np.ndarray
+    """Whether another triangle of the same material has the same corners, [T]."""
+    split: bool
+    """Whether islands consist of parts that share no vertices."""
 
 
 def thinned(meshes: list[Any], triangles: int) -> list[list[Any]]:
@@ -55,9 +67,9 @@ def thinned(meshes: list[Any], triangles: int) -> list[list[Any]]:
     Then leaves are enlarged about their centers until each material of foliage has its former area (Cook et al., "Stochastic
     Simplification of Aggregate Detail", SIGGRAPH 2007).
     """
-    points = np.concatenate([coordinates(mesh) for mesh in meshes])
-    length = FOLIAGE_LENGTH * float(np.linalg.norm(np.ptp(points, axis=0)))
     originals = [islands(mesh) for mesh in meshes]
+    points = np.concatenate([coordinates(mesh)[np.unique(each.triangles)] for mesh, each in zip(meshes, originals, strict=True)])
+    length = FOLIAGE_LENGTH * float(np.linalg.norm(np.ptp(points, axis=0)))
     leaves = [foliage(original, length) for original in originals]
     bark = [~each for each in leaves]
     leaf_area, bark_area = (
@@ -67,9 +79,11 @@ def thinned(meshes: list[Any], triangles: int) -> list[list[Any]]:
     share = leaf_area / max(leaf_area + BARK_SEEN * bark_area, 1e-30)
     of_leaves = min(sum(int(each.sum()) for each in leaves), round(share * triangles))
     textured = any(shows_picture(mesh, original.materials[each]) for mesh, original, each in zip(meshes, originals, leaves, strict=True))
+    doubled = sum(int((original.double & each).sum()) for original, each in zip(originals, leaves, strict=True))
+    sides = 2 if doubled > DOUBLE * sum(int(each.sum()) for each in leaves) else 1
     stems = reduced(meshes, originals, bark, triangles - of_leaves, BARK_TRIANGLES, by_area=True)
     rest = triangles - sum(len(mesh.loop_triangles) for mesh in stems if mesh)
-    crowns = reduced(meshes, originals, leaves, rest, RECTANGLE if textured else LEAF_TRIANGLES, by_area=False)
+    crowns = reduced(meshes, originals, leaves, rest, RECTANGLE if textured else LEAF_TRIANGLES, by_area=False, sides=sides)
     for original, crown in zip(originals, crowns, strict=True):
         if crown:
             restore_area(crown, original)
@@ -88,12 +102,12 @@ def foliage(original: Islands, length: float) -> np.ndarray:
 
 
 def reduced(
-    meshes: list[Any], originals: list[Islands], chosen: list[np.ndarray], triangles: int, least: float, *, by_area: bool
+    meshes: list[Any], originals: list[Islands], chosen: list[np.ndarray], triangles: int, least: float, *, by_area: bool, sides: int = 1
 ) -> list[Any]:
     """The ``chosen`` triangles of each mesh, reduced to about ``triangles`` of all; ``None`` where nothing remains.
 
-    As many islands remain as can have ``least`` triangles in the mean. Islands stay whole if they have fewer in the mean, or no more than a
-    rectangle, which would vanish as a whole. ``by_area``: the larger an island, the likelier it remains.
+    As many islands remain as can have ``least`` triangles a side in the mean. Islands stay whole if they have fewer in the mean, or no more
+    than a rectangle, which would vanish as a whole. ``by_area``: the larger an island, the likelier it remains.
     """
     import bpy
 
@@ -102,11 +116,11 @@ def reduced(
     if triangles < 1 or not count:
         return [None for _ in meshes]
     mean = total / count
-    share = triangles / count / (mean if mean <= RECTANGLE else min(least, mean))
+    share = triangles / count / (mean if mean <= sides * RECTANGLE else min(sides * least, mean))
     made = list[Any]()
     for _ in range(ATTEMPTS):
         bpy.data.batch_remove([mesh for mesh in made if mesh])
-        made = collapsed(meshes, originals, sampled(originals, chosen, share, by_area=by_area), triangles)
+        made = collapsed(meshes, originals, sampled(originals, chosen, share, by_area=by_area), triangles, merge=by_area)
         got = sum(len(mesh.loop_triangles) for mesh in made if mesh)
         if got <= OVERSHOOT * triangles or share * count <= 1:
             break
@@ -128,8 +142,11 @@ def sampled(originals: list[Islands], chosen: list[np.ndarray], share: float, *,
     return kept
 
 
-def collapsed(meshes: list[Any], originals: list[Islands], kept: list[np.ndarray], triangles: int) -> list[Any]:
-    """The ``kept`` triangles of each mesh, whose edges collapse until about ``triangles`` of all are left."""
+def collapsed(meshes: list[Any], originals: list[Islands], kept: list[np.ndarray], triangles: int, *, merge: bool) -> list[Any]:
+    """The ``kept`` triangles of each mesh, whose edges collapse until about ``triangles`` of all are left.
+
+    ``merge`` joins vertices of the same place first, in meshes whose islands share none: edges of single triangles collapse to nothing.
+    """
     import bpy
 
     ratio = triangles / max(sum(int(each.sum()) for each in kept), 1)
@@ -138,7 +155,7 @@ def collapsed(meshes: list[Any], originals: list[Islands], kept: list[np.ndarray
         if not each.any():
             made.append(None)
             continue
-        part = bpy.data.objects.new("part", only(mesh, original, each))
+        part = bpy.data.objects.new("part", only(mesh, original, each, merge=merge and original.split))
         bpy.context.scene.collection.objects.link(part)
         if ratio < 1:
             modifier = part.modifiers.new("bbfit", "DECIMATE")
@@ -167,7 +184,7 @@ def spread(points: np.ndarray) -> np.ndarray:
     return values
 
 
-def only(mesh: Any, original: Islands, kept: np.ndarray) -> Any:
+def only(mesh: Any, original: Islands, kept: np.ndarray, *, merge: bool) -> Any:
     """A copy of a mesh with the polygons of the ``kept`` triangles alone; an island is kept as a whole or not at all."""
     import bmesh
 
@@ -178,6 +195,8 @@ def only(mesh: Any, original: Islands, kept: np.ndarray) -> Any:
     copy, edited = mesh.copy(), bmesh.new()
     edited.from_mesh(mesh)
     bmesh.ops.delete(edited, geom=[face for face in edited.faces if not stays[face.index]], context="FACES")
+    if merge:
+        bmesh.ops.remove_doubles(edited, verts=edited.verts, dist=MERGED)
     edited.to_mesh(copy)
     edited.free()
     return copy
@@ -185,9 +204,6 @@ def only(mesh: Any, original: Islands, kept: np.ndarray) -> Any:
 
 def islands(mesh: Any) -> Islands:
     """Compute the connected components of a mesh."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     mesh.calc_loop_triangles()
     triangles = np.empty((len(mesh.loop_triangles), 3), np.int32)
     mesh.loop_triangles.foreach_get("vertices", triangles.ravel())
@@ -197,17 +213,40 @@ def islands(mesh: Any) -> Islands:
     mesh.loop_triangles.foreach_get("polygon_index", polygons)
     materials = np.empty(len(mesh.polygons), np.int32)
     mesh.polygons.foreach_get("material_index", materials)
-    edges = triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
-    points = coordinates(mesh)
-    graph = coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), (len(points), len(points)))
-    number, labels = connected_components(graph, directed=False)
+    points, materials = coordinates(mesh), materials[polygons]
+    links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
+    own, _ = connected(links, len(points))
+    places = np.unique(points, axis=0, return_inverse=True)[1].ravel()
+    edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges = np.where((places[edges[:, :1]] <= places[edges[:, 1:]]), edges, edges[:, ::-1])
+    first, second = equal_pairs(places[edges], np.repeat(materials, 3))
+    number, labels = connected(np.concatenate([links, np.column_stack([edges[first, 0], edges[second, 0]])]), len(points))
     low, high = np.full((number, 3), np.inf), np.full((number, 3), -np.inf)
     np.minimum.at(low, labels, points)
     np.maximum.at(high, labels, points)
     lengths = np.linalg.norm(high - low, axis=-1)[labels[triangles[:, 0]]]
     counts = np.maximum(np.bincount(labels, minlength=number), 1)
     centers = np.stack([np.bincount(labels, points[:, axis], number) / counts for axis in range(3)], -1)
-    return Islands(labels, triangles, materials[polygons], areas, lengths, centers)
+    double = np.zeros(len(triangles), bool)
+    double[np.concatenate(equal_pairs(np.sort(places[triangles], axis=1), materials))] = True
+    return Islands(labels, triangles, materials, areas, lengths, centers, double, split=number < own)
+
+
+def equal_pairs(rows: np.ndarray, materials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers of rows that are equal, with equal materials, one after another: those of the first and of the second of each pair."""
+    keys = [materials, *rows.T]
+    order = np.lexsort(keys)
+    same = np.logical_and.reduce([key[order[1:]] == key[order[:-1]] for key in keys])
+    return order[:-1][same], order[1:][same]
+
+
+def connected(links: np.ndarray, count: int) -> tuple[int, np.ndarray]:
+    """The number of connected components of ``count`` vertices with ``links``, [L, 2], and the component of each vertex."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(len(links), bool), (links[:, 0], links[:, 1])), (count, count))
+    return connected_components(graph, directed=False)
 
 
 def coordinates(mesh: Any) -> np.ndarray:

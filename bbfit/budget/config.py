@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from decimal import Decimal, DecimalException
 from typing import Annotated
 
-from bbfit.checks import Range, check_count, check_fields, fail
-
-_FACTORS, _MOST = {"k": 1_000, "m": 1_000_000}, 10**15
+from bbfit.checks import Range, amount, check_count, check_fields, fail
 
 
 @dataclass(frozen=True)
@@ -59,17 +56,3 @@ class BudgetConfig:
         limits = {"texels": self.most_texels, "bytes": self.most_bytes}
         halves = {name: max(1, limit // 2) for name, limit in limits.items() if limit is not None}
         return replace(self, **halves)  # type: ignore[arg-type]
-
-
-def amount(name: str, value: int | str) -> int:
-    """A whole number, or one with k (thousands) or M (millions) after it, as in ``200k`` and ``1.5M``."""
-    if not isinstance(value, str):
-        return value
-    factor = _FACTORS.get(value[-1:].lower(), 1)
-    try:
-        number = Decimal(value if factor == 1 else value[:-1]) * factor
-    except DecimalException:
-        fail(name, f"{value!r} is no number", "write for example 200000, 200k or 1.5M")
-    if not number.is_finite() or abs(number) > _MOST or number != int(number):
-        fail(name, f"{value!r} is not a whole number", "write for example 200000, 200k or 1.5M")
-    return int(number)

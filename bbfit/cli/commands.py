@@ -14,7 +14,7 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.checks import fail
 from bbfit.cli.console import out_console, progress, show, show_missing_encoder
 from bbfit.cli.viewing import WatchConfig, watched
-from bbfit.exporting.config import ExportConfig, LodConfig, check_effect
+from bbfit.exporting.config import ExportConfig, LodConfig, ThinConfig, check_effect
 from bbfit.fitting.config import FitConfig
 from bbfit.inputs import InputLimits
 from bbfit.trees.config import GrowConfig
@@ -264,7 +264,7 @@ def export_command(
     check_effect(replace(given, outline=export.outline), out)
     names = names_beside(out, texture=True, normals=billboards.surface is not None, mip_files=export.resolve().mip_files)
     stale = [name for name in names_beside(out, normals=True, mip_files=True) if name not in names]
-    check_room("out", out.parent, 16 * len(billboards.texels))  # four bytes a texel for up to three pictures and all levels
+    check_room(out.parent, 16 * len(billboards.texels))  # four bytes a texel for up to three pictures and all levels
     with single_files("bbfit export", out.parent, names, [cloud], stale), progress() as on_progress:
         shipped = described_by_run(shipped_model(billboards, export, on_progress=on_progress), cloud)
         paths = shipped.save(out)
@@ -275,6 +275,38 @@ def export_command(
         nodes, vertices = shipped.cards.node_count, shipped.cards.vertex_count
         out_console.print(f"nodes {nodes:,}, draw calls {nodes:,}, vertices {vertices:,}", soft_wrap=True)
     show_missing_encoder(export)
+
+
+def thin_command(
+    tree: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TREE")],
+    /,
+    out: Path,
+    thin: ThinConfig = ThinConfig(),  # noqa: B008
+    limits: InputLimits = InputLimits(),  # noqa: B008
+) -> None:
+    """Thin a tree out to a number of bytes or triangles: fewer and larger leaves on simpler branches, as one GLB.
+
+    It keeps the materials of the tree, which need lights. No billboards are made.
+
+    For example: bbfit thin tree.glb --out small.glb --bytes 2M --profile three
+
+    Args:
+        tree: A tree (.glb .gltf .obj .ply .stl .fbx .usd .usda .usdc .usdz .blend).
+        out: The file, ending in .glb.
+        thin: How far it is thinned out.
+        limits: What the tree may refer to, and how large it may be.
+    """
+    from bbfit.exporting.lod import glb_counts
+    from bbfit.exporting.trees import check_thin, thin_tree
+    from bbfit.outputs import single_files
+    from bbfit.tree_files.tree_file import TreeFile
+
+    check_thin(out, thin)
+    source = TreeFile.open(tree, limits)
+    with single_files("bbfit thin", out.parent, [out.name], source.files), progress() as on_progress:
+        thin_tree(source, out, thin, on_progress=partial(on_progress, "thin"))
+    vertices, triangles = glb_counts(out.read_bytes())
+    out_console.print(f"{out}  {out.stat().st_size:,} bytes, {vertices:,} vertices, {triangles:,} triangles", soft_wrap=True)
 
 
 def lod_command(

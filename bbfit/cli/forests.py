@@ -16,7 +16,7 @@ from bbfit.inputs import InputLimits
 def forest_command(
     placements: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PLACEMENTS]")] = None,
     /,
-    library: Path = Path("library"),
+    library: Path = Path("runs/library"),
     out: Path = Path("runs/forest"),
     forest: ForestConfig = ForestConfig(),  # noqa: B008
     register: RegisterConfig = RegisterConfig(),  # noqa: B008
@@ -27,7 +27,7 @@ def forest_command(
 
     Interrupted and started again, it resumes where it stopped.
 
-    For example: bbfit forest trees.csv --library library --out runs/forest
+    For example: bbfit forest trees.csv --library runs/library --out runs/forest
 
     Args:
         placements: Register of trees: a table (.csv .tsv .txt) with a header, or GeoJSON with points (.geojson .json). Without it, give

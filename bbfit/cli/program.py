@@ -26,6 +26,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "fit": commands.fit_command,
     "evaluate": commands.evaluate_command,
     "export": commands.export_command,
+    "thin": commands.thin_command,
     "lod": commands.lod_command,
     "view": viewing.view_command,
     "sweep": studies.sweep_command,
@@ -78,7 +79,7 @@ def _parse(args: Sequence[str]) -> Callable[[], None]:
             return tyro.extras.subcommand_cli_from_dict(
                 {name: deferred(command) if name in args else described(command) for name, command in COMMANDS.items()},
                 prog="bbfit",
-                description="Compress a 3D tree into a handful of textured planes that look like it from every side.",
+                description="Compress a 3D tree into textured planes that look like it from every side.",
                 args=args,
                 config=(tyro.conf.DisallowNone,),  # an option that is left out is None
             )

@@ -78,7 +78,7 @@ def compare(
     if needs_blender(Path(out)):
         check_blender(stages.views)
     with claimed_folder("out", out) as folder:
-        record = Record(folder, inputs=[*tree.files, *([stages.views.hdri] if stages.views.hdri else [])])
+        record = Record(folder, inputs=[*tree.files, stages.views.hdri])
         record.check({"tables": _TABLES} | ({} if tree.suffix in GLTF_SUFFIXES else {"convert": ("tree.glb",)}))
         if earlier == 0 and requested == 0 and stages.views.suns:
             needing = " and ".join(system for system in systems if system in LIT)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from bbfit.budget.config import BudgetConfig
 from bbfit.comparison.config import CompareConfig
@@ -17,66 +18,57 @@ from bbfit.geometry.cloud import BillboardCloud
 from bbfit.pipeline import RunConfig, fitted, prepare
 from bbfit.rivals.fluffed import fluffed
 
+Simplify = Callable[[FitConfig, Subject, Path], SystemResult]
+"""Makes a system with the options of its fit, for a tree, in a folder."""
+
 
 def fits(config: CompareConfig, shared: FitConfig) -> dict[str, tuple[FitConfig, BudgetConfig]]:
     """The options of the systems that are fits of bbfit. Fields that a system does not set come from the shared options."""
-    default, count = FitConfig(), config.billboards
-    own = {
-        "bbfit-default": FitConfig(),
-        "bbfit-default-blend": FitConfig(alpha="blend"),
-        "bbfit-default-coverage": FitConfig(alpha="coverage"),
-        "bbfit-rectangles": FitConfig(),
-        "bbfit-small": FitConfig(alpha="blend", texel_density=0.4),
-        "bbfit-fine": FitConfig(alpha="blend", billboards=config.most, texel_density=1.6),
-        "bbfit": FitConfig(billboards=count),
-        "bbfit-few": FitConfig(alpha="blend", billboards=config.few),
-        "bbfit-blend": FitConfig(alpha="blend", billboards=count),
-        "bbfit-many": FitConfig(alpha="blend", billboards=config.many, locality=0.0),
-        "bbfit-medium": FitConfig(alpha="blend", billboards=config.medium),
-        "bbfit-most": FitConfig(alpha="blend", billboards=config.most),
-        "bbfit-most-coverage": FitConfig(alpha="coverage", billboards=config.most),
-        "thesis": FitConfig(preset="thesis", billboards=4, sides="pair"),
-        "bbfit-maps": FitConfig(billboards=count, light="maps"),
-        "baked-maps": FitConfig(billboards=count, light="maps", map_steps=0),
-    }
-    open_fields = {
-        system: [entry.name for entry in fields(FitConfig) if getattr(fit, entry.name) == getattr(default, entry.name)]
-        for system, fit in own.items()
-    }
-    made = {
-        system: (replace(fit, **{name: getattr(shared, name) for name in open_fields[system]}), BudgetConfig())
-        for system, fit in own.items()
-    }
+    made = {name: (replace(shared, **options), BudgetConfig()) for name, (_, options, _) in _table(config).items()}
     return made | {"bbfit-bytes": (replace(shared, alpha="blend", max_texels=None), BudgetConfig(bytes=1))}  # the size is known later
+
+
+def _table(config: CompareConfig) -> dict[str, tuple[str, dict[str, Any], Simplify]]:
+    """The title of each system without a budget, the options that it sets, and how it is made."""
+    bounded, count = partial(_fitted, outlines=False), config.billboards
+    return {
+        "bbfit-default": ("bbfit, its default, mask", {}, _fitted),
+        "bbfit-default-blend": ("bbfit, its default, blend", {"alpha": "blend"}, _fitted),
+        "bbfit-default-coverage": ("bbfit, its default, coverage", {"alpha": "coverage"}, _fitted),
+        "bbfit-rectangles": ("bbfit, its default, mask, rectangles", {}, bounded),
+        "bbfit-small": ("bbfit, its default, blend, 0.4 texels a pixel", {"alpha": "blend", "texel_density": 0.4}, _fitted),
+        "bbfit-fine": (
+            f"bbfit, {config.most} billboards, blend, 1.6 texels a pixel",
+            {"alpha": "blend", "billboards": config.most, "texel_density": 1.6},
+            bounded,
+        ),
+        "bbfit": (f"bbfit, {count} billboards, mask", {"billboards": count}, bounded),
+        "bbfit-few": (f"bbfit, {config.few} billboards, blend", {"alpha": "blend", "billboards": config.few}, bounded),
+        "bbfit-blend": (f"bbfit, {count} billboards, blend", {"alpha": "blend", "billboards": count}, bounded),
+        "bbfit-many": (
+            f"bbfit, {config.many} large billboards, blend",
+            {"alpha": "blend", "billboards": config.many, "locality": 0.0},
+            bounded,
+        ),
+        "bbfit-medium": (f"bbfit, {config.medium} billboards, blend", {"alpha": "blend", "billboards": config.medium}, bounded),
+        "bbfit-most": (f"bbfit, {config.most} billboards, blend", {"alpha": "blend", "billboards": config.most}, bounded),
+        "bbfit-most-coverage": (f"bbfit, {config.most} billboards, coverage", {"alpha": "coverage", "billboards": config.most}, bounded),
+        "thesis": ("the thesis, 4 double billboards, L2", {"preset": "thesis", "billboards": 4, "sides": "pair"}, bounded),
+        "bbfit-maps": (f"bbfit, {count} billboards, mask, fitted maps", {"billboards": count, "light": "maps"}, bounded),
+        "baked-maps": (f"bbfit, {count} billboards, mask, baked maps", {"billboards": count, "light": "maps", "map_steps": 0}, bounded),
+    }
 
 
 def own_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]:
     """The fits of bbfit by their names."""
-    chosen, count = fits(config, shared), config.billboards
-    bounded = partial(_fitted, outlines=False)
-    named: dict[str, tuple[str, Callable[[FitConfig, Subject, Path], SystemResult]]] = {
-        "bbfit-default": ("bbfit, its default, mask", _fitted),
-        "bbfit-default-blend": ("bbfit, its default, blend", _fitted),
-        "bbfit-default-coverage": ("bbfit, its default, coverage", _fitted),
-        "bbfit-rectangles": ("bbfit, its default, mask, rectangles", bounded),
-        "bbfit-small": ("bbfit, its default, blend, 0.4 texels a pixel", _fitted),
-        "bbfit-fine": (f"bbfit, {config.most} billboards, blend, 1.6 texels a pixel", bounded),
-        "bbfit": (f"bbfit, {count} billboards, mask", bounded),
-        "bbfit-few": (f"bbfit, {config.few} billboards, blend", bounded),
-        "bbfit-blend": (f"bbfit, {count} billboards, blend", bounded),
-        "bbfit-many": (f"bbfit, {config.many} large billboards, blend", bounded),
-        "bbfit-medium": (f"bbfit, {config.medium} billboards, blend", bounded),
-        "bbfit-most": (f"bbfit, {config.most} billboards, blend", bounded),
-        "bbfit-most-coverage": (f"bbfit, {config.most} billboards, coverage", bounded),
-        "bbfit-bytes": ("bbfit, blend, in bbfit's bytes", _budgeted),
-        "thesis": ("the thesis, 4 double billboards, L2", bounded),
-        "bbfit-maps": (f"bbfit, {count} billboards, mask, fitted maps", bounded),
-        "baked-maps": (f"bbfit, {count} billboards, mask, baked maps", bounded),
+    chosen = fits(config, shared)
+    systems = {name: System(title, partial(made, chosen[name][0]), chosen[name]) for name, (title, _, made) in _table(config).items()}
+    budgeted, inputs = partial(_budgeted, chosen["bbfit-bytes"][0]), (*chosen["bbfit-bytes"], *chosen["bbfit"])
+    fluffy = f"bbfit, {config.billboards} billboards, mask, baked maps, spherical normals"
+    return systems | {
+        "bbfit-bytes": System("bbfit, blend, in bbfit's bytes", budgeted, inputs),
+        "fluffed": System(fluffy, _fluffed, chosen["baked-maps"]),
     }
-    systems = {name: System(title, partial(fitted, chosen[name][0]), chosen[name]) for name, (title, fitted) in named.items()}
-    systems["bbfit-bytes"] = replace(systems["bbfit-bytes"], inputs=(*chosen["bbfit-bytes"], *chosen["bbfit"]))
-    fluffy = f"bbfit, {count} billboards, mask, baked maps, spherical normals"
-    return systems | {"fluffed": System(fluffy, _fluffed, chosen["baked-maps"])}
 
 
 def _fitted(fit: FitConfig, subject: Subject, folder: Path, *, outlines: bool = True) -> SystemResult:

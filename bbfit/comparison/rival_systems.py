@@ -1,4 +1,4 @@
-"""The systems that are not bbfit's own."""
+"""The systems that are not fits of bbfit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 
-from bbfit.blender.conversion import tree_as_glb
 from bbfit.blender.pictures import render_pictures
 from bbfit.comparison.config import CompareConfig
 from bbfit.comparison.own_systems import fits
@@ -20,7 +19,7 @@ from bbfit.evaluation.shading import triangle_fragments
 from bbfit.exporting.config import ExportConfig
 from bbfit.exporting.lod import glb_counts
 from bbfit.exporting.model import shipped_model
-from bbfit.exporting.vertex_formats import quantized_tree
+from bbfit.exporting.trees import thinned
 from bbfit.files import write_bytes
 from bbfit.fitting.config import FitConfig
 from bbfit.geometry.camera import Camera
@@ -43,14 +42,11 @@ from bbfit.views.view_set import ViewSet
 _RECTANGLE = ExportConfig(outline="rectangle")
 # The triangles of a quad.
 _QUAD = torch.tensor([[0, 1, 2], [0, 2, 3]])
-# Blender thins a tree out to a number of triangles. It takes a few attempts to find the number that fills a size in bytes: at least this
-# share of it. Each attempt aims a little below it.
-_THINNING_ATTEMPTS, _CLOSE, _AIM = 5, 0.95, 0.98
 _THINNED = "Blender; fewer, larger leaves; vertices of integers"
 
 
 def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]:
-    """The systems that are not bbfit's own, by their names. Some depend on the size of bbfit's fit."""
+    """The systems that are not fits of bbfit, by their names. Some depend on the size of bbfit's fit."""
     size, count, crossed = fits(config, shared)["bbfit"], config.billboards, config.crossed
     few, more, steps = config.mesh_vertices, config.mesh_vertices_many, config.mesh_steps
     return {
@@ -65,12 +61,14 @@ def rival_systems(config: CompareConfig, shared: FitConfig) -> dict[str, System]
         "octahedral-mask": _impostor(config, "mask", alpha="mask"),
         "decimated-vertices": System(f"decimated to {4 * count} vertices", partial(_decimated, vertices=4 * count), (count,)),
         "decimated-bytes": System("decimated to bbfit's bytes", _decimated_to_size, size),
-        "thinned": System("thinned out to bbfit's bytes", _thinned, size),
+        "thinned": System("thinned out to bbfit's bytes", _thinned_to_size, size),
         "thinned-large": System(
-            f"thinned out to {config.large_bytes:,} bytes", partial(_thinned, limit=config.large_bytes), (config.large_bytes,)
+            f"thinned out to {config.large_bytes:,} bytes", partial(_thinned, size=config.large_bytes), (config.large_bytes,)
         ),
         "thinned-triangles": System(
-            f"thinned out to {config.thinned_triangles:,} triangles", _thinned_to_triangles, (config.thinned_triangles,)
+            f"thinned out to {config.thinned_triangles:,} triangles",
+            partial(_thinned, triangles=config.thinned_triangles),
+            (config.thinned_triangles,),
         ),
         "height-fields": System("the tree as coded height fields", _height_fields),
         "draco": System("the tree, with Draco", _draco),
@@ -164,41 +162,16 @@ def _decimated_to_size(subject: Subject, folder: Path) -> SystemResult:
     return _decimated(subject, folder, size=subject.most_bytes)
 
 
-def _thinned(subject: Subject, folder: Path, limit: int | None = None) -> SystemResult:
-    """Thin the tree out (Cook et al. 2007) to at most ``limit`` bytes, or to the size of ``bbfit``'s model."""
+def _thinned(subject: Subject, folder: Path, *, triangles: int | None = None, size: int | None = None) -> SystemResult:
+    """Thin the tree out (Cook et al. 2007), as ``bbfit thin`` does it."""
     started = time.perf_counter()
-    limit = limit or subject.most_bytes
-    request = subject.views.request
-    assert request and request.tree.faces
-    faces, models, counts = request.tree.faces, list[bytes](), list[int]()
-    triangles = faces * limit // subject.tree.bytes
-    while len(models) < _THINNING_ATTEMPTS and (triangles := max(1, min(faces, triangles))) not in counts:
-        models.append(_thinned_glb(subject, folder, triangles))
-        counts.append(triangles)
-        size = len(models[-1])
-        if _CLOSE * limit <= size <= limit:
-            break
-        # The bytes of a triangle: those of the first file with its materials, later those by which files differ.
-        each = size / triangles if len(counts) < 2 else (size - len(models[-2])) / (triangles - counts[-2])
-        triangles = int(triangles + (_AIM * limit - size) / each) if each > 0 else triangles // 2
-    fitting = [model for model in models if len(model) <= limit]
-    model = max(fitting, key=len) if fitting else min(models, key=len)
-    note = _THINNED if fitting else f"{_THINNED}; no smaller size is possible"
+    model = thinned(subject.tree, triangles=triangles, size=size, quantized=True, on_attempt=subject.on(folder, "thin"))
+    note = _THINNED if size is None or len(model) <= size else f"{_THINNED}; no smaller size is possible"
     return _rendered(model, subject, folder, time.perf_counter() - started, note)
 
 
-def _thinned_to_triangles(subject: Subject, folder: Path) -> SystemResult:
-    started = time.perf_counter()
-    model = _thinned_glb(subject, folder, subject.config.thinned_triangles)
-    return _rendered(model, subject, folder, time.perf_counter() - started, _THINNED)
-
-
-def _thinned_glb(subject: Subject, folder: Path, triangles: int) -> bytes:
-    """The tree thinned out as ``bbfit lod --thinned`` does it, with vertices of integers."""
-    path = tree_as_glb(subject.tree, folder / "thinned.glb", triangles=triangles)
-    model = quantized_tree(path.read_bytes())
-    path.unlink()
-    return model
+def _thinned_to_size(subject: Subject, folder: Path) -> SystemResult:
+    return _thinned(subject, folder, size=subject.most_bytes)
 
 
 def _draco(subject: Subject, folder: Path) -> SystemResult:

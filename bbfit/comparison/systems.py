@@ -32,7 +32,7 @@ from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views.dataset import ViewDataset
 
 # The results of every system also depend on the versions of these algorithms.
-_VERSIONS = {name: VERSIONS[name] for name in ("budget", "fit", "export", "evaluate")}
+_VERSIONS = {name: VERSIONS[name] for name in ("convert", "budget", "fit", "export", "evaluate")}
 
 
 class Systems:

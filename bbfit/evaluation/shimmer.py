@@ -22,7 +22,7 @@ def score_shimmer(draw: Draw, pairs: TurnedViews, antialiased: Draw | None = Non
     """Compare the change of a model between neighboring views with that of the tree, at each of :data:`SIDES` that the views allow.
 
     The change of two pictures is their mean absolute difference (:func:`change`); the ratio is that of the sums over all pairs, so a pair
-    in which little happens counts little. The tree's pictures are averaged to each size by area (:func:`~bbfit.evaluation.sizes.shrunk`).
+    in which little happens counts little. The tree's pictures are averaged to each size by area (:func:`~bbfit.images.shrunk`).
     The model is drawn at that size, one picture per camera, because a viewer does not average either.
 
     ``draw`` returns what a batch of B cameras sees: premultiplied RGBA over nothing, [B, H, W, 4], which is then clamped to [0, 1].

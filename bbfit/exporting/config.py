@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from bbfit.checks import Count, Range, check_fields, fail
+from bbfit.checks import Count, Range, amount, check_count, check_fields, fail
 from bbfit.geometry.alpha import AlphaKind, AlphaMode, Cutoff
 
 Up = Literal["auto", "y", "z"]
@@ -82,8 +82,8 @@ class ExportConfig:
     alpha_cutoff: Cutoff | None = None
     """Least alpha that is drawn with mask, in (0, 1). Default: the cutoff that the textures were fitted for."""
     split: bool | None = None
-    """With blend: cut billboards that cross, and give each piece a node, so that programs that sort nodes draw them in the right order.
-    This costs vertices; mask and hash ignore it.
+    """With blend: cut billboards that cross, and spread the pieces over nodes that programs draw in the right order.
+    This costs vertices; mask, coverage and hash ignore it.
     Default: only for a profile whose program sorts nodes."""
     outline: Outline | None = None
     """What is drawn of each billboard. pieces: convex pieces around its visible parts, so that few empty pixels are shaded;
@@ -223,6 +223,35 @@ class ResolvedExport(ExportConfig):
     def has_mips(self) -> bool:
         """Whether the model's textures include mip levels of their own."""
         return self.textures == "ktx2" and self.mipmaps is not False
+
+
+@dataclass(frozen=True)
+class ThinConfig:
+    """How far a tree is thinned out, and for which program. At least one limit must be given; both hold at once."""
+
+    bytes: int | str | None = None
+    """Most bytes of the file with its textures, such as 500k or 2M."""
+    triangles: Count | None = None
+    """Most triangles. A shared mesh counts once for each of its objects."""
+    profile: Profile | None = None
+    """Program that will open the file; it decides whether vertices are integers. Default: any program."""
+    quantized: bool | None = None
+    """Store vertices as integers (KHR_mesh_quantization), in about half of the bytes. Default: for a profile that reads them."""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.bytes is not None:
+            check_count("bytes", amount("bytes", self.bytes))
+
+    @property
+    def most_bytes(self) -> int | None:
+        """``bytes`` as a number."""
+        return None if self.bytes is None else amount("bytes", self.bytes)
+
+    @property
+    def integers(self) -> bool:
+        """Whether vertices are integers."""
+        return ExportConfig(profile=self.profile, quantized=self.quantized).resolve().quantized
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def lod_glb(models: Sequence[bytes], levels: Sequence[LodLevel], profile: str | 
         tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), "MSFT_lod"})
     _scene(tree)["nodes"] = roots[:1]
     tree["asset"]["generator"] = generator()
-    return joined_glb(tree, views)
+    return joined_glb({key: value for key, value in tree.items() if value != []}, views)
 
 
 def is_self_contained(path: Path) -> bool:

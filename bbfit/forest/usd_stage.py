@@ -5,6 +5,7 @@ https://openusd.org/release/api/class_usd_geom_point_instancer.html
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
@@ -154,13 +155,39 @@ def _write_part(stage: Any, prototype: Prototype, part: Part, number: int, mater
             normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
             mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
             mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        if "TEXCOORD_0" in attributes:
-            uvs = _array(prototype, attributes["TEXCOORD_0"]) * [1, -1] + [0, 1]  # USD counts from the bottom
+        if part.scale.prod() < 0:
+            mesh.CreateOrientationAttr(UsdGeom.Tokens.leftHanded)
+        described = _materials(prototype)[primitive["material"]] if "material" in primitive else {}
+        pbr = described.get("pbrMetallicRoughness", {})
+        if "COLOR_0" in attributes and "baseColorTexture" not in pbr:
+            colors = _array(prototype, attributes["COLOR_0"])[:, :3] * pbr.get("baseColorFactor", [1, 1, 1, 1])[:3]
+            shown = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+            shown.Set(Vt.Vec3fArray.FromNumpy(colors.astype(np.float32)))
+        if (name := _texture_coordinates(pbr.get("baseColorTexture", {}))) in attributes:
+            uvs = _transformed(pbr.get("baseColorTexture", {}), _array(prototype, attributes[name])) * [1, -1] + [0, 1]  # from the bottom
             st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
             st.Set(Vt.Vec2fArray.FromNumpy(uvs.astype(np.float32)))
         if "material" in primitive:
-            mesh.CreateDoubleSidedAttr(bool(_materials(prototype)[primitive["material"]].get("doubleSided", False)))
+            mesh.CreateDoubleSidedAttr(bool(described.get("doubleSided", False)))
             UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(materials[primitive["material"]])
+
+
+def _transform(texture: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What the extension KHR_texture_transform of a reference to a texture says."""
+    transform: Mapping[str, Any] = texture.get("extensions", {}).get("KHR_texture_transform", {})
+    return transform
+
+
+def _texture_coordinates(texture: Mapping[str, Any]) -> str:
+    """The attribute with the coordinates of a reference to a texture."""
+    return f"TEXCOORD_{_transform(texture).get('texCoord', texture.get('texCoord', 0))}"
+
+
+def _transformed(texture: Mapping[str, Any], uvs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coordinates in the picture of a reference to a texture: scaled, rotated against the clock, and moved, in this order."""
+    transform = _transform(texture)
+    cos, sin = math.cos(angle := transform.get("rotation", 0.0)), math.sin(angle)
+    return uvs * transform.get("scale", [1, 1]) @ np.array([[cos, -sin], [sin, cos]]) + transform.get("offset", [0, 0])
 
 
 def _write_material(stage: Any, out: Path, prototype: Prototype, number: int, textures: set[str]) -> Any:
@@ -200,7 +227,14 @@ def _write_material(stage: Any, out: Path, prototype: Prototype, number: int, te
         if mode != "OPAQUE":
             opacity.ConnectToSource(texture.CreateOutput("a", Sdf.ValueTypeNames.Float))
     else:
-        shown.Set(Gf.Vec3f(*map(float, color)))
+        if number in _colored(prototype):
+            reader = UsdShade.Shader.Define(stage, f"{path}/vertices")
+            reader.CreateIdAttr("UsdPrimvarReader_float3")
+            reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
+            reader.CreateInput("fallback", Sdf.ValueTypeNames.Float3).Set(Gf.Vec3f(*map(float, color)))
+            shown.ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float3))
+        else:
+            shown.Set(Gf.Vec3f(*map(float, color)))
         opacity.Set(alpha if mode != "OPAQUE" else 1.0)
     if mode == "MASK":
         surface.CreateInput("opacityThreshold", Sdf.ValueTypeNames.Float).Set(float(described.get("alphaCutoff", 0.5)))
@@ -208,10 +242,20 @@ def _write_material(stage: Any, out: Path, prototype: Prototype, number: int, te
     return material
 
 
+def _colored(prototype: Prototype) -> set[int]:
+    """The materials of meshes whose vertices have colors."""
+    primitives = [primitive for mesh in prototype.document["meshes"] for primitive in mesh["primitives"]]
+    return {primitive["material"] for primitive in primitives if "material" in primitive and "COLOR_0" in primitive["attributes"]}
+
+
 def check_usd_textures(document: Mapping[str, Any], name: str) -> None:
     """Require that the textures of the tree ``name``, whose glTF is ``document``, are PNG or JPEG, which USD knows. Raises InputError."""
     if any("source" not in texture for texture in document.get("textures", [])):
-        fail("usd", f"the tree {name} of the library has no PNG or JPEG texture", "build the library with PNG too")
+        fail(
+            "usd",
+            f"the tree {name} of the library has no PNG or JPEG texture",
+            "build the library with PNG too, or without original and thinned trees whose files have others",
+        )
 
 
 def _texture(out: Path, prototype: Prototype, index: int, textures: set[str]) -> str:

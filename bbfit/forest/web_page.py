@@ -40,7 +40,8 @@ _DISTANCES = (200, 300, 400, 500, 700, 1000, 1500, 2000, 3000, 4000, 6000, 8000)
 _HINT = "build the library again"
 # The modules that lod_field_three.js imports, with the names that it takes from the global of the frame's page.
 _MODULES = {
-    "three": "Box3, BufferAttribute, DynamicDrawUsage, Frustum, Group, InstancedBufferAttribute, InstancedMesh, MathUtils, Matrix4, Sphere, Vector3",
+    "three": "Box3, BufferAttribute, DynamicDrawUsage, Frustum, Group, InstancedBufferAttribute, InstancedMesh, MathUtils, Matrix4, "
+    "Sphere, Vector3",
     "three/addons/loaders/GLTFLoader.js": "GLTFLoader",
 }
 

@@ -118,7 +118,7 @@ def library_stage(
         views = {name: ViewDataset.load(folder / WORK / name / "views", limits=stages.limits) for name in names}
         entries = [_entry(tree, views[name], levels[name], models, shared, export) for name, tree in zip(names, trees, strict=True)]
         passed()
-        check_room("out", folder, sum(map(len, (*textures.values(), *models.values()))))
+        check_room(folder, sum(map(len, (*textures.values(), *models.values()))))
         (folder / LIBRARY_FILE).unlink(missing_ok=True)  # until all files are there, the folder is no library
         (folder / TREES).mkdir(exist_ok=True)
         for file, data in {**textures, **models}.items():

@@ -197,7 +197,7 @@ def loss_chart(losses: Sequence[float]) -> Chart:
     """The loss of each step (:func:`~bbfit.reporting.plots.draw_losses`)."""
     figure = _figure(3.4, left=0.72)
     axes = figure.subplots()
-    draw_losses(axes, losses, "loss")
+    draw_losses(axes, losses)
     _plain(axes)
     return Chart(_svg(figure, "loss"), {})
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import Any
 from bbfit.budget.choice import pareto_front
 from bbfit.reporting.comparison_tables import FAR, CompareCosts, CompareRow, far_figures, far_markdown
 from bbfit.reporting.plots import write_figure
-from bbfit.reporting.sweep_tables import markdown
+from bbfit.reporting.text import csv_bytes, markdown
 
 COSTS = {
     "bytes": "bytes",
@@ -143,15 +141,15 @@ def _point(system: SystemSummary, cost: str, quality: str) -> tuple[Spread, Spre
 
 def summary_csv(rows: Mapping[str, Sequence[CompareRow]]) -> bytes:
     """CSV with one line for each system of each tree: its costs, PSNR and FLIP over the backgrounds and over white, and its note."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     names = list(CompareCosts.__dataclass_fields__)
-    writer.writerow(["tree", "system", *names, "psnr", "flip", "white_psnr", "white_flip", *(f"far_{name}" for name in FAR), "note"])
+    table: list[list[Any]] = [
+        ["tree", "system", *names, "psnr", "flip", "white_psnr", "white_flip", *(f"far_{name}" for name in FAR), "note"]
+    ]
     for tree, row in ((tree, row) for tree, of_tree in rows.items() for row in of_tree):
         over = None if row.measures is None else row.measures.over
         figures = [None] * 4 if over is None else [over.mean.psnr, over.mean.flip, over.white.psnr, over.white.flip]
-        writer.writerow([tree, row.system, *vars(row.costs).values(), *figures, *far_figures(row.far), row.note])
-    return text.getvalue().encode(errors="backslashreplace")
+        table.append([tree, row.system, *vars(row.costs).values(), *figures, *far_figures(row.far), row.note])
+    return csv_bytes(table)
 
 
 def summary_markdown(rows: Mapping[str, Sequence[CompareRow]], failures: Mapping[str, str]) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -20,7 +18,7 @@ from bbfit.evaluation.scoring import OriginalTree, view_angles
 from bbfit.files import write_bytes
 from bbfit.images import encode_png, over_color, premultiply, read_rgba, to_bytes
 from bbfit.reporting.plots import FAINT, INK, PAPER, picture_font, spread_views
-from bbfit.reporting.sweep_tables import markdown
+from bbfit.reporting.text import csv_bytes, markdown
 from bbfit.views.view_set import ViewSet
 
 # Tiles of the picture: side in pixels, tiles per row, size of the text.
@@ -109,16 +107,14 @@ class CompareRow:
 
 def compare_csv(rows: Sequence[CompareRow]) -> bytes:
     """CSV with one line per system: all measures and costs."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     costs = [entry.name for entry in fields(CompareCosts)]
     names = [*_MEASURES, *(f"far_{name}" for name in FAR), *(f"light_{name}" for name in _LIGHT)]
-    writer.writerow(["system", "title", *costs, *names, "note"])
+    table: list[list[Any]] = [["system", "title", *costs, *names, "note"]]
     for row in rows:
         light = [None if row.light is None else row.light[name] for name in _LIGHT]
         scores = [*_measures(row.measures), *far_figures(row.far), *light]
-        writer.writerow([row.system, row.title, *vars(row.costs).values(), *scores, row.note])
-    return text.getvalue().encode(errors="backslashreplace")
+        table.append([row.system, row.title, *vars(row.costs).values(), *scores, row.note])
+    return csv_bytes(table)
 
 
 def far_figures(score: FarScore | None) -> list[float | None]:

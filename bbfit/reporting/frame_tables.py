@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -13,7 +11,7 @@ from bbfit.checks import check_record
 from bbfit.files import read_json
 from bbfit.inputs import reading
 from bbfit.reporting.plots import write_figure
-from bbfit.reporting.sweep_tables import markdown
+from bbfit.reporting.text import csv_bytes, markdown
 
 FRAMES_FILE = "frames.json"
 """The file of all rows, of the machine, and of what frames take time for."""
@@ -118,11 +116,7 @@ def fastest(rows: Sequence[FrameRow]) -> set[str]:
 
 def frames_csv(rows: Sequence[FrameRow]) -> bytes:
     """CSV with one line for each field."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([field.name for field in fields(FrameRow)])
-    writer.writerows([["" if value is None else value for value in vars(row).values()] for row in rows])
-    return text.getvalue().encode(errors="backslashreplace")
+    return csv_bytes([[field.name for field in fields(FrameRow)], *([*vars(row).values()] for row in rows)])
 
 
 def frames_json(rows: Sequence[FrameRow], costs: Sequence[FrameCosts], machine: Machine) -> dict[str, Any]:

@@ -35,7 +35,7 @@ from bbfit.reporting.charts import (
 )
 from bbfit.reporting.plots import magma, spread_views
 from bbfit.reporting.suns import UnderSun, under_suns
-from bbfit.reporting.sweep_tables import percent
+from bbfit.reporting.text import percent
 from bbfit.reporting.threejs import drawing_script, library_page, page_light
 from bbfit.views.lit import LitViews
 from bbfit.views.view_set import ViewSet

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from bbfit.exporting.lod import LodLevel
-from bbfit.reporting.sweep_tables import markdown
+from bbfit.reporting.text import markdown
 
 if TYPE_CHECKING:
     from rich.table import Table

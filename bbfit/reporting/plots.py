@@ -132,20 +132,20 @@ def plain_figure(
     return figure
 
 
-def loss_plot(losses: Sequence[float], path: str | Path, *, label: str = "loss") -> None:
+def loss_plot(losses: Sequence[float], path: str | Path) -> None:
     """Write a PNG with :func:`draw_losses`, completely or not at all."""
     figure = plain_figure((9, 5), 120)
     axes = figure.add_subplot()
-    draw_losses(axes, losses, label)
+    draw_losses(axes, losses)
     axes.grid(True, color="#e4e7ea", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     write_figure(figure, path)
 
 
-def draw_losses(axes: Axes, losses: Sequence[float], label: str) -> None:
+def draw_losses(axes: Axes, losses: Sequence[float]) -> None:
     """Draw the loss of each step on a logarithmic axis, with its running mean over a fiftieth of the steps; InputError without losses.
 
-    Values that are not finite and positive leave a gap. ``label`` is the name of the vertical axis.
+    Values that are not finite and positive leave a gap.
     """
     from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, StrMethodFormatter
 
@@ -173,7 +173,7 @@ def draw_losses(axes: Axes, losses: Sequence[float], label: str) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.set_xlabel("step")
-    axes.set_ylabel(label)
+    axes.set_ylabel("loss")
 
 
 def pareto_plot(choice: Choice, path: str | Path, *, cost: Cost = "vertices") -> None:

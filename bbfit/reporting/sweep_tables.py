@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -11,6 +9,7 @@ from typing import Any
 
 from bbfit.evaluation.measures import ThesisScale
 from bbfit.evaluation.published import RATIOS_PERCENT, Experiment, published_figures
+from bbfit.reporting.text import csv_bytes, markdown, percent
 
 BILLBOARDS = "billboards"
 _MEANS = "Means over the held-out views. PSNR, SSIM and FLIP are also means over four backgrounds: white, black, grass and sky."
@@ -114,19 +113,19 @@ _COLUMNS = {
 def table_csv(rows: Sequence[SweepRow]) -> bytes:
     """CSV with one line per run: tree, labels, status, measures, costs, and the thesis's results (``published_``)."""
     labels = label_names(rows)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     published = ("rmse", "ssim", "psnr", "sre")
     last = ("billboards_fitted", "texels", "seconds", "folder")
-    writer.writerow(["tree", *labels, "status", "reason", "steps", *_COLUMNS, *(f"published_{name}" for name in published), *last])
+    table: list[list[Any]] = [
+        ["tree", *labels, "status", "reason", "steps", *_COLUMNS, *(f"published_{name}" for name in published), *last]
+    ]
     for row in rows:
         facts = row.facts or {}
         start = [row.tree, *(row.labels.get(name, "") for name in labels), "failed" if row.reason else "done", row.reason or "", row.steps]
         values = [_at(facts.get("report"), path) for path in _COLUMNS.values()]
         figures = asdict(row.published) if row.published else {}
         end = [*map(figures.get, published), facts.get("billboards"), facts.get("texels"), row.seconds, row.folder]
-        writer.writerow([*start, *values, *end])
-    return text.getvalue().encode(errors="backslashreplace")
+        table.append([*start, *values, *end])
+    return csv_bytes(table)
 
 
 def table_markdown(rows: Sequence[SweepRow]) -> str:
@@ -259,20 +258,6 @@ def vertex_table(rows: Sequence[SweepRow]) -> str:
 def label_names(rows: Sequence[SweepRow]) -> list[str]:
     """Names of all labels, in the order of the grid."""
     return list(dict.fromkeys(name for row in rows for name in row.labels))
-
-
-def percent(ratio: float, digits: int = 3) -> str:
-    """A ratio of at least 0 in percent, with so many significant digits, or more in front of the point."""
-    value = 100 * ratio
-    if 0 < value < 1e-4:  # where the format below turns to powers of ten
-        return "< 0.0001 %"
-    return f"{value:,.0f} %" if value >= 10 ** (digits - 1) else f"{value:.{digits}g} %"
-
-
-def markdown(head: Sequence[str], table: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [head, ["---"] * len(head), *table]
-    return "".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |\n" for line in lines)
 
 
 def _at(value: Any, path: tuple[str, ...]) -> Any:

@@ -10,7 +10,8 @@ from bbfit.exporting.lod import LodLevel
 from bbfit.reporting.comparison_summary import summaries
 from bbfit.reporting.comparison_tables import CompareRow
 from bbfit.reporting.frame_tables import FrameRow
-from bbfit.reporting.sweep_tables import MEASURES, SweepRow, label_names, percent
+from bbfit.reporting.sweep_tables import MEASURES, SweepRow, label_names
+from bbfit.reporting.text import percent
 from bbfit.trees.species import Species
 
 if TYPE_CHECKING:

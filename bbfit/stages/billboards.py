@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import time
 from collections.abc import Callable
 from dataclasses import asdict, fields
@@ -21,6 +19,7 @@ from bbfit.fitting.loop import Step, fit, fit_inputs
 from bbfit.inputs import reading
 from bbfit.provenance import EXECUTION, VERSIONS
 from bbfit.reporting.plots import Cost, loss_plot, pareto_plot
+from bbfit.reporting.text import csv_bytes
 from bbfit.stages.stage import OnProgress, Stage
 from bbfit.tree_files.tree_file import TreeFile
 from bbfit.views.dataset import ViewDataset
@@ -102,7 +101,7 @@ def fit_stage(
         cloud = result.cloud if limit is None else fitted_within_bytes(views, result, *limit, on_step=after)
         seconds = result.seconds + time.perf_counter() - started
         cloud.save(folder / "cloud.safetensors")
-        write_bytes(folder / "loss.csv", _loss_table(result.losses))
+        write_bytes(folder / "loss.csv", csv_bytes([("step", "loss"), *enumerate(result.losses, 1)]))
         loss_plot(result.losses, folder / "loss.png")
         return seconds
 
@@ -128,11 +127,3 @@ def _known_trials(path: Path, key: str) -> list[Trial]:
             return trials
     except InputError:
         return []
-
-
-def _loss_table(losses: list[float]) -> bytes:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["step", "loss"])
-    writer.writerows(enumerate(losses, 1))
-    return text.getvalue().encode()

@@ -59,13 +59,13 @@ class Stage:
 class Record:
     """The finished stages of a folder, with their inputs, outputs and seconds. They are stored in ``run.json``."""
 
-    def __init__(self, folder: Path, head: Mapping[str, Any] | None = None, inputs: Iterable[Path] = ()) -> None:
+    def __init__(self, folder: Path, head: Mapping[str, Any] | None = None, inputs: Iterable[Path | None] = ()) -> None:
         """Read the record of ``folder``, if it exists.
 
         ``head`` contains the other fields of the record (:func:`record_head`), by default those that it has. ``inputs`` are files that no
         stage may replace.
         """
-        self.folder, self.skipped, self._inputs = folder, list[str](), tuple(inputs)
+        self.folder, self.skipped, self._inputs = folder, list[str](), tuple(filter(None, inputs))
         path = folder / RECORD_FILE
         try:
             earlier = read_json("run", path) if path.is_file() else {}

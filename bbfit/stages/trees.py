@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from bbfit.blender.config import ViewsConfig
-from bbfit.blender.conversion import tree_as_glb
 from bbfit.blender.pictures import PICTURES_FILE, render_pictures
 from bbfit.blender.request import ViewsRequest
 from bbfit.blender.views_folder import render_views
-from bbfit.exporting.vertex_formats import quantized_tree
-from bbfit.files import write_bytes
+from bbfit.exporting.trees import convert_tree
 from bbfit.layout import REQUEST_FILE
 from bbfit.outputs import output_folder
 from bbfit.provenance import digest_file
@@ -57,9 +55,7 @@ def convert_stage(
 
     def work(on_progress: OnProgress) -> None:
         on_progress("convert", 0, 1)
-        path = tree_as_glb(tree, folder / name, triangles=triangles)
-        if quantized:
-            write_bytes(path, quantized_tree(path.read_bytes()))
+        convert_tree(tree, folder / name, triangles=triangles, quantized=quantized)
         on_progress("convert", 1, 1)
 
     return Stage(stage, (tree.digest, triangles, quantized), (name,), work, algorithm="convert")

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from bbfit.budget.config import amount
-from bbfit.checks import Count, Range, check_count, check_fields, fail
+from bbfit.checks import Count, Range, amount, check_count, check_fields, fail
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from trimesh.visual.material import PBRMaterial
 
 from bbfit.blender.config import ViewsConfig
 from bbfit.blender.views_folder import render_views
+from bbfit.glb import split_glb
 
 FORMATS = (".glb", ".gltf", ".obj", ".ply", ".stl", ".fbx", ".usd", ".usda", ".usdc", ".usdz", ".blend")
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # (x, y, z) -> (x, -z, y)
@@ -127,3 +129,14 @@ def broken_blender(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest
     folder = tmp_path_factory.mktemp("broken")
     (folder / "bpy.py").write_text("import os, sys; sys.stderr.write('Fra: 1\\nout of luck\\n'); sys.stderr.flush(); os.abort()")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH")))))
+
+
+def load(path: Path) -> trimesh.Trimesh:
+    """All triangles of a file in its own world."""
+    return trimesh.load(path, process=False).to_geometry()
+
+
+def parts(path: Path) -> tuple[dict[str, Any], dict[str, trimesh.Trimesh]]:
+    """The JSON of a GLB and its meshes by the name of their material."""
+    scene = trimesh.load(path, process=False)
+    return split_glb(path.read_bytes())[0], {mesh.visual.material.name: mesh for mesh in scene.geometry.values()}

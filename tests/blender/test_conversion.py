@@ -1,4 +1,7 @@
-"""Trees of any format as one GLB: where things are, what they look like, how many triangles are left, what is refused."""
+"""Trees of any format as one GLB: where things are, what they look like, how many triangles are left, what is refused.
+
+``test_thinning.py`` has more about trees that are thinned out.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ import io
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,26 +22,15 @@ from bbfit.blender.processes import BlenderError
 from bbfit.checks import InputError, InputTypeError, MissingFileError
 from bbfit.glb import split_glb
 
-from .conftest import box, run_in_blender, thing
+from .conftest import box, load, parts, run_in_blender, thing
 
 CARDS, RINGS = 400, 8000
-
-
-def load(path: Path) -> trimesh.Trimesh:
-    """All triangles of a file in its own world."""
-    return trimesh.load(path, process=False).to_geometry()
 
 
 def corners(mesh: trimesh.Trimesh) -> np.ndarray:
     """The corners of all triangles in an order that does not depend on that of the file, [3 T, 3]."""
     points = np.asarray(mesh.triangles).reshape(-1, 3)
     return points[np.lexsort(points.round(3).T)]
-
-
-def parts(path: Path) -> tuple[dict[str, Any], dict[str, trimesh.Trimesh]]:
-    """The JSON of a GLB and its meshes by the name of their material."""
-    scene = trimesh.load(path, process=False)
-    return split_glb(path.read_bytes())[0], {mesh.visual.material.name: mesh for mesh in scene.geometry.values()}
 
 
 def complaints(*files: Path) -> set[str]:
@@ -166,78 +157,6 @@ def test_the_number_of_triangles_is_kept_and_the_leaves_keep_their_area(leafy: P
         assert complaints(out) == set()
         if wanted > 2 * CARDS:
             assert len(found["leaf"].faces) == 2 * CARDS
-
-
-def twiggy(path: Path) -> Path:
-    """A trunk, 2,000 separate twigs and 3,000 leaves of two triangles in eight clusters along a line, without textures."""
-    random, meshes = np.random.default_rng(4), dict[str, trimesh.Trimesh]()
-    trunk = trimesh.creation.cylinder(0.2, segment=[[0, 0, 0], [8, 0, 0]], sections=32)
-    starts = random.uniform([0, 0.2, -1], [8, 2, 1], (2000, 3))
-    twigs = [trimesh.creation.cylinder(0.005, segment=[start, start + np.array([0, 0.2, 0])], sections=8) for start in starts]
-    middles = np.stack([np.repeat(np.arange(8), 375), *random.uniform(-1, 1, (2, 3000))], -1)
-    across, down = (0.05 * np.linalg.qr(random.normal(size=(3000, 3, 3)))[0][:, :2]).transpose(1, 0, 2)
-    corners_ = np.stack([middles - across, middles + down, middles + across, middles - down], 1).reshape(-1, 3)
-    faces = (4 * np.arange(3000)[:, None, None] + [[0, 1, 2], [0, 2, 3]]).reshape(-1, 3)
-    meshes["leaf"] = trimesh.Trimesh(corners_, faces, process=False)
-    meshes["bark"] = trimesh.util.concatenate([trunk, *twigs])
-    for name, mesh in meshes.items():
-        mesh.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(name=name, baseColorFactor=[90, 90, 50, 255]))
-    trimesh.Scene(meshes).export(str(path))
-    return path
-
-
-def test_a_tree_of_many_twigs_keeps_its_leaves_its_trunk_and_whole_twigs(tmp_path: Path) -> None:
-    """64,000 triangles of twigs could only collapse to far more than the 2,000 that are requested of all."""
-    tree = twiggy(tmp_path / "twiggy.glb")
-    before = parts(tree)[1]
-    _, after = parts(tree_as_glb(tree, tmp_path / "few.glb", triangles=2000))
-    assert 1900 <= sum(len(mesh.faces) for mesh in after.values()) <= 2000
-    assert after["leaf"].area == pytest.approx(before["leaf"].area, rel=1e-4)
-    np.testing.assert_allclose(after["bark"].bounds[:, 0], [0, 8], atol=0.01)  # the trunk is whole
-    assert len(after["bark"].split(only_watertight=False)) > 20
-    lengths = [np.ptp(part.vertices, axis=0).max() for part in after["bark"].split(only_watertight=False)]
-    assert np.median(lengths) == pytest.approx(0.2, abs=0.02)
-    # Each cluster keeps an eighth of the leaves. Chance would vary by 16 % of that.
-    shares = np.bincount(after["leaf"].triangles_center[:, 0].round().astype(int), minlength=8) / len(after["leaf"].faces)
-    np.testing.assert_allclose(shares, 1 / 8, rtol=0.05)  # measured 0.042
-
-
-def test_leaves_and_bark_of_different_layers_are_thinned_out_together(tmp_path: Path) -> None:
-    """Blender cannot join meshes with colors of vertices to others without losing a material's colors."""
-    scene = trimesh.load(twiggy(tmp_path / "twiggy.glb"), process=False)
-    leaves = next(mesh for mesh in scene.geometry.values() if mesh.visual.material.name == "leaf")
-    leaves.visual = trimesh.visual.ColorVisuals(leaves, vertex_colors=np.tile([[40, 90, 30, 255]], (len(leaves.vertices), 1)))
-    scene.export(str(tmp_path / "colored.glb"))
-    few = load(tree_as_glb(tmp_path / "colored.glb", tmp_path / "few.glb", triangles=2000))
-    assert 1900 <= len(few.faces) <= 2000
-    np.testing.assert_allclose(few.bounds, load(tmp_path / "colored.glb").bounds, atol=0.2)
-
-
-def test_leaves_that_cannot_collapse_to_a_triangle_are_fewer(tmp_path: Path) -> None:
-    """Blender leaves a few triangles of each closed surface, such as a needle."""
-    places = np.random.default_rng(5).uniform(-1, 1, (1500, 3))
-    needle = trimesh.creation.icosphere(1).apply_scale([0.005, 0.05, 0.005])
-    meshes = {
-        "leaf": trimesh.util.concatenate([needle.copy().apply_translation(place) for place in places]),
-        "bark": trimesh.creation.cylinder(0.05, segment=[[0, -2, 0], [0, 1, 0]], sections=64),
-    }
-    for name, mesh in meshes.items():
-        mesh.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(name=name, baseColorFactor=[90, 90, 50, 255]))
-    trimesh.Scene(meshes).export(str(tmp_path / "tree.glb"))
-    found = parts(tree_as_glb(tmp_path / "tree.glb", tmp_path / "few.glb", triangles=1000))[1]
-    assert 500 <= sum(len(mesh.faces) for mesh in found.values()) <= 1000  # measured 561
-
-
-def test_few_triangles_of_many_are_evenly_spread_leaves_of_the_finer_tree(tmp_path: Path) -> None:
-    """A coarser tree has no leaf at a place where a finer one has none, so that levels of detail change as little as possible."""
-    tree = twiggy(tmp_path / "twiggy.glb")
-    places = list[np.ndarray]()
-    for count in (9000, 7000):
-        leaf = parts(tree_as_glb(tree, tmp_path / f"{count}.glb", triangles=count))[1]["leaf"]
-        places.append(np.array([part.vertices.mean(0) for part in leaf.split(only_watertight=False)]))
-    assert 1000 < len(places[1]) < len(places[0])
-    distances = np.linalg.norm(places[1][:, None] - places[0][None], axis=-1).min(1)
-    assert np.median(distances) < 0.01
 
 
 def test_normals_stay_and_split_no_vertices(tmp_path: Path) -> None:

@@ -26,9 +26,9 @@ ATLAS = "atlas.png"
 
 
 def square_glb(color: Sequence[float], side: float = 2.0, *, aside: float = 0.0, holes: int = 0, alpha: AlphaKind = "mask") -> bytes:
-    """Two upright squares that cross, one meter above the ground and ``aside`` meters east of the trunk, in one color. Vertices are integers.
+    """Two upright squares that cross, one meter above the ground and ``aside`` meters east of the trunk, of integers.
 
-    With ``holes``, the seed of random numbers, some texels are cut out, and the others are darker or brighter.
+    They have one color. With ``holes``, the seed of random numbers, some texels are cut out, and the others are darker or brighter.
     """
     axis, half = torch.tensor([aside, 1.0, 0.0]), torch.tensor([side / 2, side / 2])
     cloud = even_upright(2, axis=axis, half_extents=half, texture_sizes=torch.tensor([16, 16]))

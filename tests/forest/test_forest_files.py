@@ -274,6 +274,50 @@ def test_usd_textures_wrap_as_those_of_gltf(sampler: bytes, wraps: tuple[str, st
         assert tuple(prim.GetAttribute(f"inputs:{side}").Get() for side in ("wrapS", "wrapT")) == wraps
 
 
+def test_usd_trees_look_as_those_of_gltf(tmp_path: Path) -> None:
+    """Of one whose picture is scaled, turned and moved, and which is mirrored, and one with colors of vertices."""
+    usd, geom, shade = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdShade"))
+    colors = np.random.default_rng(0).uniform(size=(16, 3)).astype("<f4")
+
+    def change(folder: Path) -> None:
+        path = folder / "trees" / "oak_LOD0.glb"
+        content, views = split_glb(path.read_bytes())
+        place = {"scale": [2, 3], "rotation": np.pi / 2, "offset": [0.25, 0.5], "texCoord": 0}
+        picture = content["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+        picture |= {"texCoord": 7, "extensions": {"KHR_texture_transform": place}}
+        content["nodes"][0]["scale"] = [-1, 1, 1]
+        path.write_bytes(joined_glb(content, views))
+        path = folder / "trees" / "oak_LOD1.glb"
+        content, views = split_glb(path.read_bytes())
+        content["materials"][0] = {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 1, 1, 1]}}
+        content["bufferViews"].append({})
+        content["accessors"].append({"bufferView": len(views), "componentType": 5126, "type": "VEC3", "count": 12})
+        content["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = len(content["accessors"]) - 1
+        path.write_bytes(joined_glb(content, [*views, colors[:12].tobytes()]))
+
+    library = damaged(tmp_path / "library", change)
+    build_forest(register(tmp_path), library, tmp_path / "out", ForestConfig(formats=("usd",)))
+    stage = usd.Stage.Open(str(tmp_path / "out" / "usd" / "trees" / "tree_0.usdc"))
+    variants = stage.GetDefaultPrim().GetVariantSet("lod")
+
+    def the(kind: Any) -> Any:
+        return next(kind(prim) for prim in stage.Traverse() if prim.IsA(kind))
+
+    mesh = the(geom.Mesh)
+    points, uvs = np.array(mesh.GetPointsAttr().Get()), np.array(geom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
+    assert mesh.GetOrientationAttr().Get() == "leftHanded"
+    # The corners' coordinates are u along the plane and v = 1 - height / 12 from the top; a quarter turn takes (u, v) to (v, -u).
+    np.testing.assert_allclose(uvs[:, 0], 3 * (1 - points[:, 1] / 12) + 0.25, atol=1e-6)
+    np.testing.assert_allclose(sorted(set(np.round(1 - uvs[:, 1], 5))), [0.5 - 2 / 3, 0.5], atol=1e-4)
+    variants.SetVariantSelection("lod1")
+    mesh = the(geom.Mesh)
+    np.testing.assert_allclose(np.array(mesh.GetDisplayColorAttr().Get()), colors[:12] * [0.5, 1, 1], atol=1e-6)
+    surface = the(shade.Material).ComputeSurfaceSource()[0]
+    (source,) = surface.GetInput("diffuseColor").GetConnectedSources()[0]
+    assert source.source.GetPrim().GetAttribute("inputs:varname").Get() == "displayColor"
+    assert mesh.GetOrientationAttr().Get() == "rightHanded"
+
+
 @pytest.mark.node
 def test_trees_of_integers_have_the_vertices_of_those_of_floats(tmp_path: Path) -> None:
     usd, geom = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom"))

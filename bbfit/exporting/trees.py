@@ -1,0 +1,129 @@
+"""The tree itself as a file that ships: thinned out to a number of triangles or bytes, with vertices of integers on request."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from bbfit.blender.conversion import tree_as_glb
+from bbfit.checks import check_folder, check_output_file, fail
+from bbfit.exporting.config import ThinConfig
+from bbfit.exporting.vertex_formats import quantized_tree
+from bbfit.files import write_bytes
+from bbfit.inputs import InputLimits
+from bbfit.scratch import ScratchFolder
+from bbfit.tree_files.tree_file import TreeFile
+
+ATTEMPTS = 5
+"""Most conversions until a size in bytes is filled."""
+# A size is filled if at least this share of it is used. Each attempt aims a little below it. Roughly how many bytes a triangle takes.
+_CLOSE, _AIM, _TRIANGLE = 0.95, 0.98, 50
+
+
+def thin_tree(
+    tree: str | Path | TreeFile,
+    out: str | Path,
+    config: ThinConfig,
+    *,
+    limits: InputLimits | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write a tree with fewer and larger leaves on simpler branches as one GLB file, Y up in meters.
+
+    How leaves and twigs are chosen is described in :func:`~bbfit.blender.conversion.tree_as_glb`. The materials stay, and need lights.
+
+    Parameters
+    ----------
+    tree
+        A tree in any format that Blender reads (:func:`~bbfit.blender.conversion.tree_as_glb`).
+    out
+        The .glb file to write, in an existing folder. It is replaced atomically.
+    config
+        The largest number of bytes, of triangles, or both. A tree that has no more stays whole.
+    limits
+        How large the tree may be, and what it may refer to.
+    on_progress
+        Called with the number of attempts to fill a size, and the most of them.
+
+    Returns
+    -------
+    Path
+        ``out``.
+
+    Raises
+    ------
+    MissingFileError, InputError
+        If the tree cannot be used, there is no limit, or the tree cannot have so few bytes. Also the other errors of ``tree_as_glb``.
+    BlenderError
+        If Blender crashes.
+    """
+    out, size = Path(out), config.most_bytes
+    check_thin(out, config)
+    tree = TreeFile.open(tree, limits or InputLimits())
+    model = thinned(tree, triangles=config.triangles, size=size, quantized=config.integers, on_attempt=on_progress)
+    if size is not None and len(model) > size:
+        fail("bytes", f"{size:,} are too few for {tree.path}, which has at least {len(model):,} with its textures", "allow more")
+    write_bytes(out, model)
+    return out
+
+
+def check_thin(out: Path, config: ThinConfig) -> None:
+    """Raise the errors of :func:`thin_tree` that do not depend on the tree."""
+    if config.bytes is None and config.triangles is None:
+        fail("thin", "a limit is missing", "for example --bytes 2M, or --triangles 20000")
+    if out.suffix.lower() != ".glb":
+        fail("out", f"{out} ends in {out.suffix or 'nothing'}", "choose a name that ends in .glb")
+    check_folder("out's folder", out.parent)
+    check_output_file("out", out)
+
+
+def thinned(
+    tree: TreeFile,
+    *,
+    triangles: int | None = None,
+    size: int | None = None,
+    quantized: bool,
+    on_attempt: Callable[[int, int], None] | None = None,
+) -> bytes:
+    """The GLB of a tree with at most so many triangles and bytes: the smallest one if it cannot have so few bytes."""
+    on_attempt = on_attempt or (lambda done, total: None)
+    with ScratchFolder() as folder:
+
+        def convert(count: int | None) -> bytes:
+            return convert_tree(tree, folder / "tree.glb", triangles=count, quantized=quantized).read_bytes()
+
+        if size is None:
+            on_attempt(0, 1)
+            model = convert(triangles)
+            on_attempt(1, 1)
+            return model
+        return filled(convert, size, triangles, on_attempt)
+
+
+def filled(convert: Callable[[int], bytes], size: int, most: int | None, on_attempt: Callable[[int, int], None]) -> bytes:
+    """The largest conversion to a number of triangles, at most ``most``, that has at most ``size`` bytes; else the smallest one.
+
+    The number is found by the secant method.
+    """
+    models, counts, triangles = list[bytes](), list[int](), size // _TRIANGLE
+    while len(models) < ATTEMPTS and (triangles := max(1, min(triangles, most or triangles))) not in counts:
+        on_attempt(len(models), ATTEMPTS)
+        models.append(convert(triangles))
+        counts.append(triangles)
+        bytes_now = len(models[-1])
+        if _CLOSE * size <= bytes_now <= size or bytes_now in map(len, models[:-1]):  # close, or the tree has no more or no fewer
+            break
+        # The bytes of a triangle: those of the first file with its materials, later those by which files differ.
+        each = bytes_now / triangles if len(counts) < 2 else (bytes_now - len(models[-2])) / (triangles - counts[-2])
+        triangles = int(triangles + (_AIM * size - bytes_now) / each) if each > 0 else triangles // 2
+    on_attempt(ATTEMPTS, ATTEMPTS)
+    fitting = [model for model in models if len(model) <= size]
+    return max(fitting, key=len) if fitting else min(models, key=len)
+
+
+def convert_tree(tree: TreeFile, out: Path, *, triangles: int | None = None, quantized: bool = False) -> Path:
+    """Do what :func:`~bbfit.blender.conversion.tree_as_glb` does; with ``quantized``, vertices are integers."""
+    path = tree_as_glb(tree, out, triangles=triangles)
+    if quantized:
+        write_bytes(path, quantized_tree(path.read_bytes()))
+    return path
