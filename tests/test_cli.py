@@ -54,7 +54,8 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 @pytest.mark.parametrize(
     "command",
-    [[], ["run"], ["grow"], ["views"], ["fit"], ["evaluate"], ["export"], ["lod"], ["sweep"], ["compare"], ["library"], ["forest"]],
+    [[]]
+    + [[name] for name in ("run", "grow", "views", "fit", "evaluate", "export", "thin", "lod", "sweep", "compare", "library", "forest")],
 )
 def test_help_shows_defaults_and_needs_no_torch(command: list[str]) -> None:
     script = (

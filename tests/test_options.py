@@ -12,7 +12,7 @@ import pytest
 import bbfit
 from bbfit.cli import main
 
-COMMANDS = ("run", "grow", "views", "fit", "evaluate", "export", "lod", "view", "sweep", "compare", "frames", "library", "forest")
+COMMANDS = ("run", "grow", "views", "fit", "evaluate", "export", "thin", "lod", "view", "sweep", "compare", "frames", "library", "forest")
 STAGES = {"views": bbfit.ViewsConfig, "fit": bbfit.FitConfig, "export": bbfit.ExportConfig, "grow": bbfit.GrowConfig}
 QUICK = ["--billboards", "1", "--placement", "even", "--steps", "2"]
 

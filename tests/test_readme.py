@@ -126,7 +126,7 @@ def small(words: list[str]) -> list[str]:
     if command == "library":
         grown = [*grown, "--species", "acer", "--seeds", "0"] if "--species" in given else []
         return [*stages, *grown, *machine, "--planes", "2", "1"]
-    assert command in ("evaluate", "export"), f"how is bbfit {command} made small?"
+    assert command in ("evaluate", "export", "thin"), f"how is bbfit {command} made small?"
     return []
 
 

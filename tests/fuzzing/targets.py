@@ -28,7 +28,7 @@ from bbfit.budget.config import BudgetConfig
 from bbfit.checks import InputError
 from bbfit.evaluation.measures import Colour, Measures, Over, OverBackground, Rgba, ThesisScale
 from bbfit.evaluation.report import Cost, Report, ShimmerScore, SizeMeasures, SizeScore, ViewScore
-from bbfit.exporting.config import ExportConfig
+from bbfit.exporting.config import ExportConfig, ThinConfig
 from bbfit.exporting.lod import LodLevel
 from bbfit.exporting.model import shipped_model
 from bbfit.fitting.config import FitConfig
@@ -660,8 +660,8 @@ def _read_forest(folder: Path) -> None:
 # Options.
 
 _KINDS: dict[str, Any] = {"fit": FitConfig, "views": ViewsConfig, "export": ExportConfig, "grow": GrowConfig, "sweep": SweepConfig}
-_KINDS |= {"budget": BudgetConfig, "limits": InputLimits, "library": LibraryConfig}
-_COMMANDS = ("run", "fit", "views", "evaluate", "export", "lod", "sweep", "compare", "library", "forest")
+_KINDS |= {"budget": BudgetConfig, "limits": InputLimits, "library": LibraryConfig, "thin": ThinConfig}
+_COMMANDS = ("run", "fit", "views", "evaluate", "export", "thin", "lod", "sweep", "compare", "library", "forest")
 
 
 def _options(draw: st.DrawFn) -> Files:
