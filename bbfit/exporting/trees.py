@@ -62,7 +62,11 @@ def thin_tree(
     tree = TreeFile.open(tree, limits or InputLimits())
     model = thinned(tree, triangles=config.triangles, size=size, quantized=config.integers, on_attempt=on_progress)
     if size is not None and len(model) > size:
-        fail("bytes", f"{size:,} are too few for {tree.path}, which has at least {len(model):,} with its textures", "allow more")
+        fail(
+            "bytes",
+            f"{size:,} are too few for {tree.path}, which has at least {len(model):,} with its textures",
+            "allow more, or make its pictures smaller",
+        )
     write_bytes(out, model)
     return out
 
