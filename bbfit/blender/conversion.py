@@ -58,12 +58,7 @@ def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int 
     if triangles is not None:
         check_count("triangles", triangles)
     tree, out = TreeFile.open(tree), Path(out)
-    if out.suffix.lower() != ".glb":
-        fail("out", f"{out} ends in {out.suffix or 'nothing'}", "choose a name that ends in .glb")
-    check_folder("out's folder", out.parent)
-    check_output_file("out", out)
-    if out.exists() and any(out.samefile(file) for file in tree.files):
-        fail("out", f"{out} is the tree itself", "choose another name")
+    check_converted(tree, out)
     require_bpy()
     with BlenderPool(tree_settings(tree)) as pool:
         path = pool.convert(triangles)
@@ -73,3 +68,13 @@ def tree_as_glb(tree: str | Path | TreeFile, out: str | Path, *, triangles: int 
             with path.open("rb") as file:
                 write_pieces(out, iter(partial(file.read, _PIECE), b""))
     return out
+
+
+def check_converted(tree: TreeFile, out: Path) -> None:
+    """Require that a tree can be written to ``out``. Raises ``MissingFileError`` or ``InputError``."""
+    if out.suffix.lower() != ".glb":
+        fail("out", f"{out} ends in {out.suffix or 'nothing'}", "choose a name that ends in .glb")
+    check_folder("out's folder", out.parent)
+    check_output_file("out", out)
+    if out.exists() and any(out.samefile(file) for file in tree.files):
+        fail("out", f"{out} is the tree itself", "choose another name")

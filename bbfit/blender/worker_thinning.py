@@ -185,7 +185,10 @@ def spread(points: np.ndarray) -> np.ndarray:
 
 
 def only(mesh: Any, original: Islands, kept: np.ndarray, *, merge: bool) -> Any:
-    """A copy of a mesh with the polygons of the ``kept`` triangles alone; an island is kept as a whole or not at all."""
+    """A copy of a mesh with the polygons of the ``kept`` triangles alone; an island is kept as a whole or not at all.
+
+    ``merge`` makes vertices of the same place one.
+    """
     import bmesh
 
     polygons = np.empty(len(original.triangles), np.int32)

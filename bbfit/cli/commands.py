@@ -301,8 +301,8 @@ def thin_command(
     from bbfit.outputs import single_files
     from bbfit.tree_files.tree_file import TreeFile
 
-    check_thin(out, thin)
     source = TreeFile.open(tree, limits)
+    check_thin(source, out, thin)
     with single_files("bbfit thin", out.parent, [out.name], source.files), progress() as on_progress:
         thin_tree(source, out, thin, on_progress=partial(on_progress, "thin"))
     vertices, triangles = glb_counts(out.read_bytes())

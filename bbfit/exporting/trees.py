@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from bbfit.blender.conversion import tree_as_glb
-from bbfit.checks import check_folder, check_output_file, fail
+from bbfit.blender.conversion import check_converted, tree_as_glb
+from bbfit.checks import fail
 from bbfit.exporting.config import ThinConfig
 from bbfit.exporting.vertex_formats import quantized_tree
 from bbfit.files import write_bytes
@@ -58,8 +58,8 @@ def thin_tree(
         If Blender crashes.
     """
     out, size = Path(out), config.most_bytes
-    check_thin(out, config)
     tree = TreeFile.open(tree, limits or InputLimits())
+    check_thin(tree, out, config)
     model = thinned(tree, triangles=config.triangles, size=size, quantized=config.integers, on_attempt=on_progress)
     if size is not None and len(model) > size:
         fail(
@@ -71,14 +71,11 @@ def thin_tree(
     return out
 
 
-def check_thin(out: Path, config: ThinConfig) -> None:
-    """Raise the errors of :func:`thin_tree` that do not depend on the tree."""
+def check_thin(tree: TreeFile, out: Path, config: ThinConfig) -> None:
+    """Raise the errors of :func:`thin_tree` that are known before any work."""
     if config.bytes is None and config.triangles is None:
         fail("thin", "a limit is missing", "for example --bytes 2M, or --triangles 20000")
-    if out.suffix.lower() != ".glb":
-        fail("out", f"{out} ends in {out.suffix or 'nothing'}", "choose a name that ends in .glb")
-    check_folder("out's folder", out.parent)
-    check_output_file("out", out)
+    check_converted(tree, out)
 
 
 def thinned(

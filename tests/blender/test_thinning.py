@@ -206,3 +206,5 @@ def test_the_tree_and_files_of_others_are_not_replaced(tmp_path: Path) -> None:
         file.write_bytes(TREE.read_bytes())
         assert main(["thin", str(tree), "--out", str(file), "--triangles", "500"]) == 2
         assert file.read_bytes() == TREE.read_bytes()
+    with pytest.raises(InputError, match="is the tree itself"):
+        thin_tree(tree, tree, ThinConfig(triangles=500))
