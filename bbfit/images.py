@@ -207,6 +207,31 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
     return data.tobytes()
 
 
+def smaller_picture(data: bytes, side: int) -> bytes:
+    """A PNG, JPEG or WebP file with at most ``side`` texels a side, in its format.
+
+    One that is no larger, of another kind, or damaged stays as it is.
+    Each texel is the mean of those that it covers, weighted by alpha. Transparent texels have the color of the nearest visible one.
+    """
+    try:
+        with _opened(data) as picture:
+            kind, scale = picture.format, side / max(picture.size)
+            if scale >= 1 or kind not in ("PNG", "JPEG", "WEBP") or picture.mode not in ("1", "L", "LA", "P", "RGB", "RGBA"):
+                return data
+            sides = [max(1, round(scale * length)) for length in picture.size]
+            mode = "RGBA" if picture.has_transparency_data else "RGB"
+            made = np.array(picture.convert(mode).resize((sides[0], sides[1]), Image.Resampling.BOX))
+    except (OSError, SyntaxError, ValueError, EOFError):  # what Pillow raises for damaged files
+        return data
+    if mode == "RGBA":
+        made = bleed_color(torch.from_numpy(made)).numpy()
+    if kind == "PNG":
+        return encode_png(made)
+    file = io.BytesIO()
+    Image.fromarray(made).save(file, kind, quality=90, exact=True)
+    return file.getvalue()
+
+
 def _with_palette(image: NDArray[np.uint8], palette: NDArray[np.uint8], mode: str) -> bytes:
     """Encode a picture whose colors are those of a palette in the order of :func:`distinct`."""
     order = np.ascontiguousarray(image[..., ::-1]).view(">u4")[..., 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bbfit.checks import InputError, MissingFileError
-from bbfit.images import encode_png, over_color, premultiply, read_rgba, to_bytes, unpremultiply, write_png
+from bbfit.images import encode_png, over_color, premultiply, read_rgba, smaller_picture, to_bytes, unpremultiply, write_png
 
 
 def noise(channels: int = 4) -> NDArray[np.uint8]:
@@ -149,3 +150,29 @@ def test_libpng_says_nothing_of_damaged_pixels(tmp_path: Path, capfd: pytest.Cap
     with pytest.raises(InputError, match=r"cannot be read \(its checksum is wrong\)"):
         read_rgba(tmp_path / "bad.png")
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("kind", ["PNG", "WEBP", "JPEG"])
+def test_a_smaller_picture_has_the_means_of_its_texels_by_alpha(kind: str) -> None:
+    """Left, columns of opaque red alternate with transparent green ones. Right, it is white, with a transparent corner."""
+    texels = np.full((64, 64, 4), 255, np.uint8)
+    texels[:, :16:2], texels[:, 1:16:2] = [200, 0, 0, 255], [0, 200, 0, 0]
+    texels[:16, 48:] = [0, 0, 200, 0]
+    if kind == "JPEG":
+        texels = np.full((64, 64, 3), [90, 120, 60], np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(texels).save(file, kind, lossless=True, exact=True)
+    small = Image.open(io.BytesIO(smaller_picture(file.getvalue(), 32)))
+    found = np.array(small.convert("RGB" if kind == "JPEG" else "RGBA")).astype(int)
+    assert small.format == kind and found.shape[:2] == (32, 32)
+    if kind == "JPEG":
+        assert abs(found - [90, 120, 60]).max() <= 4
+        return
+    assert (abs(found[8:, :6] - [200, 0, 0, 128]) <= 8).all() and (abs(found[8:, 10:] - 255) <= 8).all()
+    assert (found[:8, 24:, 3] == 0).all() and (found[:6, 26:, :3] >= 247).all()  # with the color of its neighbor
+    assert smaller_picture(file.getvalue(), 64) == file.getvalue()
+
+
+@pytest.mark.parametrize("data", [b"", b"no picture", b"\x89PNG\r\n\x1a\n", encode_png(np.zeros((64, 64, 4), np.uint8))[:-40]])
+def test_pictures_that_cannot_be_read_do_not_get_smaller(data: bytes) -> None:
+    assert smaller_picture(data, 4) == data

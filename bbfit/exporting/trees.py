@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 from bbfit.blender.conversion import check_converted, tree_as_glb
@@ -10,6 +12,8 @@ from bbfit.checks import fail
 from bbfit.exporting.config import ThinConfig
 from bbfit.exporting.vertex_formats import quantized_tree
 from bbfit.files import write_bytes
+from bbfit.glb import joined_glb, split_glb
+from bbfit.images import smaller_picture
 from bbfit.inputs import InputLimits
 from bbfit.scratch import ScratchFolder
 from bbfit.tree_files.tree_file import TreeFile
@@ -18,6 +22,9 @@ ATTEMPTS = 5
 """Most conversions until a size in bytes is filled."""
 # A size is filled if at least this share of it is used. Each attempt aims a little below it. Roughly how many bytes a triangle takes.
 _CLOSE, _AIM, _TRIANGLE = 0.95, 0.98, 50
+# Texels of a side that pictures may have if a size in bytes decides.
+_SIDES = tuple(2**power for power in range(14, 5, -1))
+_log = logging.getLogger(__name__)
 
 
 def thin_tree(
@@ -60,12 +67,14 @@ def thin_tree(
     out, size = Path(out), config.most_bytes
     tree = TreeFile.open(tree, limits or InputLimits())
     check_thin(tree, out, config)
-    model = thinned(tree, triangles=config.triangles, size=size, quantized=config.integers, on_attempt=on_progress)
+    model = thinned(
+        tree, triangles=config.triangles, size=size, side=config.texture_size, quantized=config.integers, on_attempt=on_progress
+    )
     if size is not None and len(model) > size:
         fail(
             "bytes",
             f"{size:,} are too few for {tree.path}, which has at least {len(model):,} with its textures",
-            "allow more, or make its pictures smaller",
+            "allow more, or a smaller texture_size" if config.texture_size else "allow more",
         )
     write_bytes(out, model)
     return out
@@ -83,22 +92,51 @@ def thinned(
     *,
     triangles: int | None = None,
     size: int | None = None,
+    side: int | None = None,
     quantized: bool,
     on_attempt: Callable[[int, int], None] | None = None,
 ) -> bytes:
-    """The GLB of a tree with at most so many triangles and bytes: the smallest one if it cannot have so few bytes."""
-    on_attempt = on_attempt or (lambda done, total: None)
+    """The GLB of a tree with at most so many triangles, bytes, and texels a ``side`` of its pictures; see :class:`ThinConfig`.
+
+    It is the smallest possible one if it cannot have so few bytes.
+    """
+    on_attempt, pictures = on_attempt or (lambda done, total: None), SmallerPictures(side, None if size is None else size // 2)
     with ScratchFolder() as folder:
 
         def convert(count: int | None) -> bytes:
-            return convert_tree(tree, folder / "tree.glb", triangles=count, quantized=quantized).read_bytes()
+            return pictures(convert_tree(tree, folder / "tree.glb", triangles=count, quantized=quantized).read_bytes())
 
         if size is None:
             on_attempt(0, 1)
             model = convert(triangles)
             on_attempt(1, 1)
-            return model
-        return filled(convert, size, triangles, on_attempt)
+        else:
+            model = filled(convert, size, triangles, on_attempt)
+    if side is None and pictures.changed:
+        _log.warning("pictures have at most %d texels a side; give --texture-size for others, or allow more bytes", pictures.side)
+    return model
+
+
+class SmallerPictures:
+    """Gives the GLBs of one tree smaller pictures."""
+
+    def __init__(self, side: int | None, size: int | None) -> None:
+        """With at most ``side`` texels a side; or of the most, out of powers of two, with which they have at most ``size`` bytes."""
+        self.side, self.changed = side, False
+        self._size, self._smaller = size, cache(smaller_picture)
+
+    def __call__(self, glb: bytes) -> bytes:
+        """The GLB with smaller pictures."""
+        tree, views = split_glb(glb)
+        places = {image["bufferView"] for image in tree.get("images", ()) if "bufferView" in image}
+        if self.side is None and self._size is not None:
+            sizes = ((side, sum(len(self._smaller(views[place], side)) for place in places)) for side in _SIDES)
+            self.side = next((side for side, size in sizes if size <= self._size), _SIDES[-1])
+        if self.side is None:
+            return glb
+        made = [self._smaller(view, self.side) if place in places else view for place, view in enumerate(views)]
+        self.changed = made != views
+        return joined_glb(tree, made) if self.changed else glb
 
 
 def filled(convert: Callable[[int], bytes], size: int, most: int | None, on_attempt: Callable[[int, int], None]) -> bytes:

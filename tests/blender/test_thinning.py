@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
 from bbfit import ThinConfig, thin_tree
@@ -181,6 +183,43 @@ def test_the_command_fills_a_limit(tmp_path: Path, capsys: pytest.CaptureFixture
     np.testing.assert_allclose(load(out).bounds, load(TREE).bounds, atol=0.2)
     assert main(["thin", str(TREE), "--out", str(out), "--triangles", "500"]) == 0  # a file of its own is replaced
     assert "extensionsRequired" not in split_glb(out.read_bytes())[0] and glb_counts(out.read_bytes())[1] <= 500
+
+
+@pytest.fixture(scope="module")
+def pictured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tree of 5 MB whose leaves have a picture of noise."""
+    crown, noise = leaves(4000), np.random.default_rng(8).integers(0, 255, (1024, 1024, 4), np.uint8)
+    tree = tmp_path_factory.mktemp("pictured") / "tree.glb"
+    leaf = PBRMaterial(name="leaf", baseColorTexture=Image.fromarray(noise), alphaMode="MASK")
+    corners = np.tile([[0, 0], [1, 0], [1, 1], [0, 1]], (4000, 1))
+    crown.visual = trimesh.visual.TextureVisuals(uv=corners, material=leaf)
+    bark = trunk()
+    bark.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(name="bark"))
+    trimesh.Scene({"leaf": crown, "bark": bark}).export(str(tree))
+    assert tree.stat().st_size > 4_000_000
+    return tree
+
+
+def picture(path: Path) -> tuple[int, tuple[int, int]]:
+    """The bytes and the size of the picture of a GLB."""
+    tree, views = split_glb(path.read_bytes())
+    (image,) = tree["images"]
+    data = views[image["bufferView"]]
+    return len(data), Image.open(io.BytesIO(data)).size
+
+
+def test_pictures_leave_half_of_a_size_to_triangles(pictured: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    out = thin_tree(pictured, tmp_path / "thin.glb", ThinConfig(bytes="300k", profile="three"))
+    size, sides = picture(out)
+    assert 285_000 <= out.stat().st_size <= 300_000 and size <= 150_000 and sides == (128, 128)
+    assert "pictures have at most 128 texels a side" in caplog.text
+    caplog.clear()
+    out = thin_tree(pictured, tmp_path / "fine.glb", ThinConfig(bytes="400k", texture_size=256))
+    assert 380_000 <= out.stat().st_size <= 400_000 and picture(out)[1] == (256, 256) and not caplog.text
+    out = thin_tree(pictured, tmp_path / "whole.glb", ThinConfig(triangles=500))
+    assert picture(out)[1] == (1024, 1024)
+    with pytest.raises(InputError, match="allow more, or a smaller texture_size"):
+        thin_tree(pictured, tmp_path / "none.glb", ThinConfig(bytes="100k", texture_size=512))
 
 
 @pytest.mark.parametrize(
