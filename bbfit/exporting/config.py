@@ -234,7 +234,8 @@ class ThinConfig:
     triangles: Count | None = None
     """Most triangles. A shared mesh counts once for each of its objects."""
     texture_size: Annotated[int, Range(1, 16_384)] | None = None
-    """Most texels of a side of the tree's pictures. Default: all; with a limit of bytes, so many that pictures take at most half of it."""
+    """Longest side of the tree's pictures, in texels; larger pictures are scaled down.
+    Default: pictures stay; with a limit of bytes, they take at most half of it."""
     profile: Profile | None = None
     """Program that will open the file; it decides whether vertices are integers. Default: any program."""
     quantized: bool | None = None

@@ -159,6 +159,36 @@ def test_the_number_of_triangles_is_kept_and_the_leaves_keep_their_area(leafy: P
             assert len(found["leaf"].faces) == 2 * CARDS
 
 
+SLOTS = """
+import bpy, os, sys
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.mesh.primitive_cube_add(size=1)
+first = bpy.context.object
+painted = {name: bpy.data.materials.new(name) for name in ("red", "green", "blue")}
+for name in ("red", "green"):
+    first.data.materials.append(painted[name])
+first.data.polygons[0].material_index = 1
+second = bpy.data.objects.new("second", first.data)
+bpy.context.scene.collection.objects.link(second)
+for index, item in enumerate((first, second)):
+    item.material_slots[index].link = "OBJECT"
+    item.material_slots[index].material = painted["blue"]
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1])
+sys.stdout.flush()
+os._exit(0)
+"""
+
+
+def test_objects_of_one_mesh_keep_materials_of_their_own_in_different_slots(tmp_path: Path) -> None:
+    run_in_blender(SLOTS, str(tmp_path / "slots.blend"))
+    tree, _ = split_glb(tree_as_glb(tmp_path / "slots.blend", tmp_path / "out.glb").read_bytes())
+    shown = {
+        node["name"]: {tree["materials"][primitive["material"]]["name"] for primitive in tree["meshes"][node["mesh"]]["primitives"]}
+        for node in tree["nodes"]
+    }
+    assert shown == {"Cube": {"blue", "green"}, "second": {"red", "blue"}}
+
+
 def test_normals_stay_and_split_no_vertices(tmp_path: Path) -> None:
     """Flat leaves of three triangles: Blender keeps their normals face by face, each rounded in its own way."""
     random = np.random.default_rng(2)

@@ -6,6 +6,7 @@ import io
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,9 +18,11 @@ from bbfit import ThinConfig, thin_tree
 from bbfit.blender.conversion import tree_as_glb
 from bbfit.checks import InputError
 from bbfit.cli import main
+from bbfit.exporting.config import LodConfig
 from bbfit.exporting.lod import glb_counts
 from bbfit.exporting.trees import ATTEMPTS, filled
 from bbfit.glb import split_glb
+from bbfit.lod import _smaller
 
 from .conftest import load, parts
 
@@ -183,6 +186,22 @@ def test_the_command_fills_a_limit(tmp_path: Path, capsys: pytest.CaptureFixture
     np.testing.assert_allclose(load(out).bounds, load(TREE).bounds, atol=0.2)
     assert main(["thin", str(TREE), "--out", str(out), "--triangles", "500"]) == 0  # a file of its own is replaced
     assert "extensionsRequired" not in split_glb(out.read_bytes())[0] and glb_counts(out.read_bytes())[1] <= 500
+
+
+@pytest.mark.parametrize(
+    ("original", "thinned", "left"),
+    [
+        (True, (9000, 4808, 4000, 500), [4000, 500]),  # the tree has 4,808 triangles
+        (False, (9000, 4808, 4000, 500), [4808, 4000, 500]),
+        (True, (4000, 500), [4000, 500]),
+        (False, (9000,), [9000]),
+        (True, (9000,), []),
+    ],
+)
+def test_no_level_is_the_tree_again(original: bool, thinned: tuple[int, ...], left: list[int], caplog: pytest.LogCaptureFixture) -> None:
+    views = SimpleNamespace(request=SimpleNamespace(tree=SimpleNamespace(faces=4808)))
+    assert _smaller(LodConfig(original=original, thinned=thinned), views) == left  # type: ignore[arg-type]
+    assert bool(caplog.text) == (len(left) < len(thinned))
 
 
 @pytest.fixture(scope="module")

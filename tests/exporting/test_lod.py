@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from khronos import messages
+from khronos import WARNING, messages
 from PIL import Image
 from test_formats import tree_of
 
@@ -171,3 +171,11 @@ def test_only_whole_files_stand_alone(tree: bytes, tmp_path: Path) -> None:
     for number, (data, expected) in enumerate(cases.items()):
         (path := tmp_path / f"{number}.glb").write_bytes(data)
         assert is_self_contained(path) is expected, number
+
+
+def test_levels_without_any_picture_have_no_empty_lists(tmp_path: Path) -> None:
+    plain = trimesh.Scene(trimesh.creation.box()).export(file_type="glb")
+    models = [plain, plain]
+    (path := tmp_path / "oak.glb").write_bytes(lod_glb(models, levels_of(models)))
+    assert [] not in tree_of(path)[0].values()
+    assert not [message for message in messages(path) if message["severity"] < WARNING]

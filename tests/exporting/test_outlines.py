@@ -28,6 +28,7 @@ from bbfit.geometry.cards import MASK_RIM, Cards
 from bbfit.geometry.cloud import BillboardCloud
 from bbfit.operators.cards.reference import hits
 from bbfit.operators.cards.sheets import sheets_of
+from bbfit.provenance import cache_key
 from bbfit.rendering.cards import CardRenderer, draw_cards
 
 
@@ -221,3 +222,11 @@ def test_bad_input_is_refused() -> None:
         with_pieces(cards, 8, 3, 0.5)
     with pytest.raises(InputError, match="least alpha"):
         with_pieces(cards, 8, 4, 1.5)
+
+
+def test_a_requested_outline_has_a_key_of_its_own() -> None:
+    """It resolves to the default's, but comparisons draw rectangles, and budgets choose, only if none is requested."""
+    free, requested = ExportConfig(), ExportConfig(outline="pieces")
+    assert free.resolve() == requested.resolve() and free.comparable() != requested.comparable()
+    assert cache_key("export", free.key) != cache_key("export", requested.key)
+    assert cache_key("export", free.key) == cache_key("export", ExportConfig().key)
