@@ -219,7 +219,7 @@ def islands(mesh: Any) -> Islands:
     points, materials = coordinates(mesh), materials[polygons]
     links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
     own, _ = connected(links, len(points))
-    places = np.unique(points, axis=0, return_inverse=True)[1].ravel()
+    places = numbered(points)
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     edges = np.where((places[edges[:, :1]] <= places[edges[:, 1:]]), edges, edges[:, ::-1])
     first, second = equal_pairs(places[edges], np.repeat(materials, 3))
@@ -233,6 +233,14 @@ def islands(mesh: Any) -> Islands:
     double = np.zeros(len(triangles), bool)
     double[np.concatenate(equal_pairs(np.sort(places[triangles], axis=1), materials))] = True
     return Islands(labels, triangles, materials, areas, lengths, centers, double, split=number < own)
+
+
+def numbered(points: np.ndarray) -> np.ndarray:
+    """A number for each of the points, [P, 3], at least one; equal points have the same. Takes half of the time of ``np.unique``."""
+    order = np.lexsort(points.T)
+    numbers = np.zeros(len(points), np.int64)
+    numbers[order[1:]] = np.cumsum((points[order[1:]] != points[order[:-1]]).any(-1))
+    return numbers
 
 
 def equal_pairs(rows: np.ndarray, materials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
