@@ -21,7 +21,7 @@ VERSIONS: Mapping[str, int] = {
     "grow": 2,
     "convert": 4,
     "views": 8,
-    "budget": 17,
+    "budget": 18,
     "fit": 27,
     "export": 20,
     "evaluate": 20,

@@ -26,13 +26,15 @@ EACH_TEXELS, BYTES, BYTES_POWER = 100, 6_500, 2.5
 ``EACH_TEXELS`` texels, and which is not above (bytes / ``BYTES``) ** ``BYTES_POWER``: 32 for 26 kB, 128 for 45 kB, 384 for 70 kB. More
 billboards need hardly more texels together, and each takes about 120 bytes besides."""
 MIN_GAIN_DB = 0.75
-"""Least gain, in dB, for which ``auto`` doubles the number of billboards."""
+"""Least gain, in dB, for which ``auto`` doubles the bytes of the model."""
 LEAST_VIEWS = 5
 """Least number of training views. Every fifth of them is for validation."""
 # Most billboards for which evenly placed and two-sided ones are tried too: the more there are, the less it matters.
 _FEW = 8
 # Random difference between two short fits, in dB, and what limits may cost a number of billboards before fewer are tried.
 _NOISE_DB, _LITTLE_DB = 0.15, 0.2
+# What twice as many billboards usually gain, in dB, where no two trials show it.
+_USUAL_GAIN_DB = 0.5
 
 
 @dataclass(frozen=True)
@@ -70,11 +72,14 @@ def choose(
     """Choose the number, sides, placement and texel density of billboards for a budget. The test views are not used.
 
     Every fifth training view is held out for validation. Short fits to the other views are compared there. A limit of vertices alone is
-    spent in full, and by halves and quarters for the curve. For a target or ``auto``, the number of billboards doubles until it reaches the
-    target or gains too little; then the number between the last two that matter is tried. A limit of texels or bytes is first spent on as
-    many billboards as have enough of them, at least 32, and then on more for as long as they are not clearly worse. If none is better,
-    and the limits cost more than 0.2 dB, fewer are tried for as long as both are so. A last trial spends half of the limit, for the curve.
+    spent in full, and by halves and quarters for the curve. A limit of texels or bytes is first spent on as many billboards as have enough
+    of them, at least 32, and then on more for as long as they are not clearly worse. If none is better, and the limits cost more than
+    0.2 dB, fewer are tried for as long as both are so. If a single number is tried, a last trial spends half of the limit, for the curve.
     Few billboards are also tried two-sided, half as many, and evenly placed, unless there is a target.
+
+    A target and ``auto`` begin with the best number within the limits, or with ``FitConfig.most_billboards``. If that reaches the target,
+    fewer are tried where the target is expected, by interpolation. ``auto`` halves the number for as long as PSNR - ``MIN_GAIN_DB``
+    log2(bytes) grows.
 
     All short fits of a number of billboards start from one placement, which a quick search finds. What a limit in bytes leaves for texels
     is estimated from the bytes of earlier trials, and the PSNR at the limit from the trial nearest to it.
@@ -175,15 +180,16 @@ class _Chooser:
         least = min(most, _least(config))
         self._counts = sorted({count for count in COUNTS if least <= count < most} | {most})
         self._spends = budget.texels is not None or budget.bytes is not None
-        self._grows = budget.auto or budget.target_psnr is not None
-        if not self._spends and not self._grows:  # the more vertices the better; fewer are for the curve
-            self._counts = sorted({max(least, most >> halvings) for halvings in range(3)})
-        trials.expected = 4 if self._spends and not self._grows else len(self._counts) + 2 * (budget.target_psnr is None) + self._spends
+        self._lowers = budget.auto or budget.target_psnr is not None
+        if budget.auto or not (self._spends or self._lowers):
+            halvings = range(most.bit_length() if budget.auto else 3)
+            self._counts = sorted({max(least, most >> halving) for halving in halvings})
+        trials.expected = 4 if self._spends or self._lowers else len(self._counts) + 2
 
     def choice(self, validation: tuple[str, ...]) -> Choice:
         """See :func:`choose`. ``validation`` are the names of the validation views."""
         config, budget, done = self._config, self._budget, self._trials.done
-        best = self._best(self._climbed() if self._spends and not self._grows else self._grown())
+        best = self._best(self._series())
         if budget.target_psnr is None:
             best = max([best, *self._others(best.trial.billboards)], key=lambda other: other.psnr)
             if self._spends:
@@ -206,37 +212,47 @@ class _Chooser:
             others.append(spent(self._trials, self._budget, count, self._config.sides, "even"))
         return [other for other in others if other is not None]
 
-    def _grown(self) -> list[Spent]:
-        """Double the number of billboards until it is enough, and then try the numbers between the best one and its neighbors.
+    def _series(self) -> list[Spent]:
+        """Run the trials that determine the number of billboards."""
+        if self._spends:
+            series = self._climbed()
+        else:  # the more vertices the better; fewer are for the curve, or are tried below
+            wanted = self._counts[-1:] if self._lowers else self._counts
+            series = [point for point in map(self._spent, wanted) if point is not None]
+        if series and self._budget.target_psnr is not None:
+            return self._lowered_to(self._budget.target_psnr, series)
+        return self._halved(series) if series and self._budget.auto else series
 
-        If the best one reaches the target, only fewer can be better, and if there is none, only more.
-        """
-        counts, series, tried = self._counts, list[Spent](), list[int]()
-        for count in counts:
-            if self._grows and count & (count - 1) and count not in (counts[0], counts[-1]):
-                continue  # no power of two
-            tried.append(count)
+    def _lowered_to(self, target: float, series: list[Spent]) -> list[Spent]:
+        """Try fewer billboards, where the target is expected, until the next fewer miss it. None are tried if the best one misses it."""
+        tried = {point.trial.billboards: point.psnr for point in series}
+        counts = list(self._counts)
+        while enough := [count for count, psnr in tried.items() if psnr >= target]:
+            most = min(enough)
+            least = max((count for count in tried if count < most), default=0)
+            between = [count for count in counts if least < count < most]
+            if not between:
+                break
+            gain = (tried[most] - tried[least]) / math.log2(most / least) if least else _USUAL_GAIN_DB
+            wanted = math.log2(most) - (tried[most] - target) / gain
+            count = min(between, key=lambda count: abs(math.log2(count) - wanted))
             point = self._spent(count)
-            if point is not None:
-                series.append(point)
-                if self._is_enough(series):
-                    break
-        if not series or not self._grows:
-            return series
-        best, target = self._best(series), self._budget.target_psnr
-        count, met = best.trial.billboards, target is not None and best.psnr >= target
-        fewer = count if target is None else max((other for other in tried if other < count), default=count)
-        more = count if met else min((other for other in tried if other > count), default=count)
-        between = [self._spent(other) for other in counts if fewer < other < more and other != count]
-        return [*series, *(point for point in between if point is not None)]
+            if point is None:  # it exceeds another limit
+                counts.remove(count)
+            else:
+                series = [*series, point]
+                tried[count] = point.psnr
+        return series
 
-    def _is_enough(self, series: list[Spent]) -> bool:
-        """Whether more billboards than the last of ``series`` need not be tried."""
-        if self._budget.target_psnr is not None:
-            return series[-1].psnr >= self._budget.target_psnr
-        if self._budget.auto and len(series) > 2:  # one small gain may be chance, two in a row are not
-            return all(_gain(series[-1 - back], series[-2 - back]) < MIN_GAIN_DB for back in (0, 1))
-        return False
+    def _halved(self, series: list[Spent]) -> list[Spent]:
+        """Try half as many billboards as the most worthwhile of ``series``, and so on until that is not worthwhile."""
+        best = max(series, key=_worth)
+        for count in reversed([count for count in self._counts if count < best.trial.billboards]):
+            point = self._spent(count)
+            if point is None or _worth(point) <= _worth(best):
+                break
+            series, best = [*series, point], point
+        return series
 
     def _climbed(self) -> list[Spent]:
         """Spend the limits on as many billboards as have enough of them, then on more until that is clearly worse, or else on fewer."""
@@ -255,8 +271,10 @@ class _Chooser:
         return max((index for index, count in enumerate(self._counts) if count <= able), default=0)
 
     def _try_half(self, best: Spent) -> None:
-        """Run a trial with half of the limits, for the curve, unless they leave as much as the whole."""
+        """Run a trial with half of the limits, for the curve, unless they leave as much as the whole, or there is a curve already."""
         trial, budget = best.trial, self._budget.half
+        if len({(other.billboards, other.sides, other.placement) for other in self._trials.done}) > 1:
+            return
         if not best.missing and trial.bytes <= (budget.most_bytes or math.inf) and trial.texels <= (budget.most_texels or math.inf):
             return
         count = min(self._counts[self._start(budget)], trial.billboards)
@@ -265,12 +283,14 @@ class _Chooser:
             self._trials.run(count, trial.sides, trial.placement, int(texels))
 
     def _followed(self, series: list[Spent], counts: Sequence[int], patience: float = 0.0, *, fewer: bool = False) -> list[Spent]:
-        """Continue a series until a number of billboards exceeds the limits, or is worse than another by more than ``patience``, in dB.
+        """Continue a series until a number exceeds the limits, reaches the target, or is worse than another by over ``patience``, in dB.
 
         ``fewer`` billboards gain at most what more of them miss, so they are not tried after some that miss little.
         """
         for count in counts:
             least = max((point.psnr for point in series), default=-math.inf) - patience
+            if least + patience >= (self._budget.target_psnr or math.inf):
+                break
             point = self._spent(count, least)
             if point is not None:
                 series = [*series, point]
@@ -285,24 +305,19 @@ class _Chooser:
             least = min(self._trials.done, key=lambda trial: trial.bytes)
             named = "billboard" if least.billboards == 1 else "billboards"
             fail("budget", f"{least.billboards} {named} with {least.bytes:,} bytes exceeds it", "allow more")
+        if budget.auto:
+            return max(series, key=_worth)
         best = max(series, key=lambda point: point.psnr)
         equivalent = [point for point in series if point.psnr >= best.psnr - _NOISE_DB]
-        if budget.vertices is not None or self._grows:  # use all vertices that the budget allows, or draw as few as possible
+        if budget.vertices is not None or budget.target_psnr is not None:  # use all vertices that are allowed, or draw as few as possible
             sign = 1 if budget.vertices is not None else -1
             best = max(equivalent, key=lambda point: (sign * point.trial.vertices, point.psnr))
         if budget.target_psnr is not None:
             sufficient = [point for point in series if point.psnr >= budget.target_psnr]
             return min(sufficient, key=lambda point: (point.trial.vertices, -point.psnr), default=best)
-        if budget.auto:  # follow the Pareto front while a step gains enough
-            front = [series[index] for index in pareto_front([(point.trial.vertices, point.psnr) for point in series])]
-            best = front[0]
-            for point in front[1:]:
-                if _gain(point, best) >= MIN_GAIN_DB:
-                    best = point
         return best
 
 
-def _gain(more: Spent, fewer: Spent) -> float:
-    """Return the gain in dB per doubling of the vertices."""
-    doublings = math.log2(more.trial.vertices / fewer.trial.vertices)
-    return (more.psnr - fewer.psnr) / doublings if doublings > 0 else math.inf
+def _worth(point: Spent) -> float:
+    """What ``auto`` maximizes: PSNR in dB, less what each doubling of the bytes has to gain."""
+    return point.psnr - MIN_GAIN_DB * math.log2(point.trial.bytes)

@@ -15,7 +15,7 @@ import torch
 from billboard_scene import crossing_billboards
 
 from bbfit.budget import trials as trials_module
-from bbfit.budget.choice import MIN_GAIN_DB, START, Choice, choose, pareto_front
+from bbfit.budget.choice import COUNTS, MIN_GAIN_DB, START, Choice, choose, pareto_front
 from bbfit.budget.config import BudgetConfig
 from bbfit.budget.sizes import model_bytes, within_bytes
 from bbfit.budget.spending import _FULL, _GAPS
@@ -46,8 +46,8 @@ def near(wanted: float, granted: float, dense: float) -> bool:
 
 
 MOST = FitConfig().most_billboards
-DOUBLED = [1, 2, 4, 8, 16, 32, 64, 128, 256, MOST]
-"""Numbers of billboards that are tried until they are enough."""
+HALVED = [MOST >> halving for halving in range(MOST.bit_length())]
+"""Numbers of billboards that are tried for as long as fewer are worthwhile."""
 DATA = Path(__file__).resolve().parents[2] / "data"
 Quality = Callable[[int, Sides, Placement], float]
 
@@ -209,7 +209,8 @@ def choosing(views: ViewDataset) -> Choosing:
     def chosen(world: World, budget: BudgetConfig, config: FitConfig | None = None, *, curve: bool = True) -> Choice:
         found = choose(views, config or FitConfig(), budget, known=world.trial)
         assert len(found.trials) == len(world.asked)
-        if curve and budget.target_psnr is None and (budget.texels or budget.bytes):
+        limits = [asked[3] or math.inf for asked in world.asked]
+        if curve and budget.target_psnr is None and (budget.texels or budget.bytes) and limits[-1] <= 0.7 * max(limits):
             world.less = world.asked.pop()
             found = dataclasses.replace(found, trials=found.trials[:-1])
         return found
@@ -455,17 +456,17 @@ def test_bytes_and_texels_hold_at_once(choosing: Choosing) -> None:
     assert {asked[3] for asked in world.asked} == {3000} and found.config.max_texels == 3000
 
 
-@pytest.mark.parametrize("budget", [BudgetConfig(texels=6000, vertices=16), BudgetConfig(bytes=12_000, vertices=16)], ids=str)
+@pytest.mark.parametrize("budget", [BudgetConfig(texels=9000, vertices=48), BudgetConfig(bytes=18_500, vertices=48)], ids=str)
 def test_less_is_tried_for_the_curve_alone(views: ViewDataset, choosing: Choosing, budget: BudgetConfig) -> None:
     """Half of the limit, which does not change the choice, even if it should do better."""
-    world = World(rising, texels=10**6)
+    world = World(rising)
     most = choosing(world, budget)
-    done, texels = len(world.asked), 3000 if budget.texels else AIM * 6000 / 2 - 4 * _GAPS
+    done, texels = len(world.asked), 4500 if budget.texels else AIM * 9250 / 2 - 12 * _GAPS
 
     def better(count: int, sides: Sides, placement: Placement) -> float:
         return rising(count, sides, placement) + 10 * (len(other.asked) > done)
 
-    other = World(better, texels=10**6)
+    other = World(better)
     found = choose(views, FitConfig(), budget, known=other.trial)
     kind = (most.config.billboards, most.config.sides, most.config.placement)
     assert other.asked[done:] == [world.less] == [(*kind, int(texels))]
@@ -474,11 +475,19 @@ def test_less_is_tried_for_the_curve_alone(views: ViewDataset, choosing: Choosin
 
 
 def test_less_has_two_texels_for_each_at_the_least(views: ViewDataset, choosing: Choosing) -> None:
-    world = World(rising)
-    choosing(world, BudgetConfig(texels=16, vertices=16))
-    assert world.less == (4, "one", "clusters", 8)
-    found = choose(views, FitConfig(), BudgetConfig(texels=15, vertices=16), known=World(rising).trial)
-    assert [trial.max_texels for trial in found.trials] == [15] * len(found.trials)
+    world = World(rising, texels=5)
+    choosing(world, BudgetConfig(texels=48, vertices=48))
+    assert world.less == (12, "one", "clusters", 24)
+    found = choose(views, FitConfig(), BudgetConfig(texels=47, vertices=48), known=World(rising, texels=5).trial)
+    assert [trial.max_texels for trial in found.trials] == [47]
+
+
+def test_two_numbers_are_a_curve(views: ViewDataset) -> None:
+    """Nothing is tried for the curve alone if fewer billboards were, or other ways to use the vertices of a few."""
+    for budget, tried in ((BudgetConfig(texels=125_000), [MOST, 256]), (BudgetConfig(texels=3000, vertices=32), [8, 4, 8])):
+        found = choose(views, FitConfig(), budget, known=World(rising).trial)
+        assert [trial.billboards for trial in found.trials] == tried
+        assert {trial.max_texels for trial in found.trials} == {budget.most_texels}
 
 
 def test_a_curve_of_vertices_or_of_limits_that_change_nothing_needs_nothing_else(views: ViewDataset) -> None:
@@ -486,8 +495,8 @@ def test_a_curve_of_vertices_or_of_limits_that_change_nothing_needs_nothing_else
         (BudgetConfig(vertices=16, bytes="1M"), [4, 2, 4]),
         (BudgetConfig(vertices=16, texels="1M"), [4, 2, 4]),
         (BudgetConfig(vertices=16), [1, 2, 4, 2, 4]),
-        (BudgetConfig(auto=True), DOUBLED),
-        (BudgetConfig(texels=500, target_psnr=25), [1, 2, 4, 3]),
+        (BudgetConfig(auto=True), [MOST, MOST // 2]),
+        (BudgetConfig(texels=500, target_psnr=25), [32, 1, 2, 3]),
     ):
         world = World(rising)
         choose(views, FitConfig(), budget, known=world.trial)
@@ -500,115 +509,120 @@ def test_no_trial_is_done_twice(choosing: Choosing) -> None:
     assert len(set(world.asked)) == len(world.asked)
 
 
-def test_a_target_takes_as_few_as_will_do(choosing: Choosing) -> None:
-    """And nothing else is tried, since it would have as many vertices."""
-    world = World(curve(n1=20, n2=22, n3=24, n4=25, n6=26))
-    found = choosing(world, BudgetConfig(target_psnr=24))
-    assert world.line == [1, 2, 4, 3] and world.others == []
-    assert summary(found) == (3, "one", "clusters") and found.met and found.trials[found.chosen].psnr == 24
-    world = World(curve(n1=20, n2=22, n3=24, n4=25, n6=26, n8=26))
-    assert choosing(world, BudgetConfig(target_psnr=25.5)).config.billboards == 6 and world.line == [1, 2, 4, 8, 6]
-    assert choosing(World(world.quality), BudgetConfig(target_psnr=24.5)).config.billboards == 4
+@pytest.mark.parametrize("seed", range(20))
+def test_a_target_takes_as_few_as_will_do(choosing: Choosing, seed: int) -> None:
+    """Whatever the curve looks like, as long as more are better. Nothing else is tried, since it would have as many vertices."""
+    drawn, counts = random.Random(seed), [*COUNTS, MOST]
+    psnrs = sorted(drawn.uniform(20, 30) for _ in counts)
+    target = drawn.uniform(psnrs[0] - 1, psnrs[-1])
+    world = World(curve(**{f"n{count}": psnr for count, psnr in zip(counts, psnrs, strict=True)}))
+    found = choosing(world, BudgetConfig(target_psnr=target))
+    fewest = next(count for count, psnr in zip(counts, psnrs, strict=True) if psnr >= target)
+    assert summary(found) == (fewest, "one", "clusters") and found.met and world.others == []
+    assert found.trials[found.chosen].psnr >= target and len(set(world.line)) == len(world.line)
+
+
+@pytest.mark.parametrize(
+    ("gain", "target", "line"), [(0.5, 22, [MOST, 16, 12]), (0.7, 23.4, [MOST, 12, 32, 24]), (4, 30.5, [MOST, 1, 6, 8])]
+)
+def test_a_target_is_found_by_interpolation(choosing: Choosing, gain: float, target: float, line: list[int]) -> None:
+    """First with what a doubling usually gains, half a decibel, and then with what it gains here."""
+    world = World(lambda count, *kind: 20 + gain * math.log2(count))
+    assert choosing(world, BudgetConfig(target_psnr=target)).met and world.line == line
 
 
 def test_a_target_that_is_not_reached_gives_the_best(choosing: Choosing) -> None:
-    world = World(curve(n1=20, n2=22, n3=24, n4=25, n6=26, n8=25.5))
-    found = choosing(world, BudgetConfig(target_psnr=26.1, vertices=32))
-    assert world.line == [1, 2, 4, 8, 6] and world.others == []
-    assert summary(found) == (6, "one", "clusters") and not found.met
-    found = choosing(World(rising), BudgetConfig(target_psnr=90))
-    assert found.config.billboards == MOST and not found.met
+    for budget, most in ((BudgetConfig(target_psnr=90), MOST), (BudgetConfig(target_psnr=90, vertices=35), 8)):
+        world = World(rising)
+        found = choosing(world, budget)
+        assert world.line == [most] and world.others == [] and summary(found) == (most, "one", "clusters") and not found.met
+    world = World(curve(n32=25, n64=26, n128=25.5))
+    found = choosing(world, BudgetConfig(target_psnr=26.1, texels=3000))
+    assert world.line == [32, 64, 128] and world.others == [] and summary(found) == (64, "one", "clusters") and not found.met
+
+
+def test_a_target_needs_no_more_than_reach_it(choosing: Choosing) -> None:
+    """Limits are first spent on 32 billboards, and on more only until one number reaches the target."""
+    world = World(curve(n32=25, n64=26, n128=27, n24=24))
+    assert choosing(world, BudgetConfig(target_psnr=26, texels=3000)).config.billboards == 64
+    assert world.line == [32, 64]
 
 
 def test_a_target_that_only_more_than_is_allowed_reaches_is_not_reached(choosing: Choosing) -> None:
     """From eight billboards on the model has too many bytes without a texel, and is not tried."""
     world = World(rising, texels=300, bare=lambda count: 3000 * count)
-    found = choosing(world, BudgetConfig(target_psnr=32, bytes=19_700))
-    assert max(world.line) == 6
-    assert (
-        summary(found) == (6, "one", "clusters")
-        and not found.met
-        and found.config.max_texels == pytest.approx((_FULL * 19_700 - 18_000) / 2 - 6 * _GAPS, abs=2)
-    )
+    found = choosing(world, BudgetConfig(target_psnr=32, bytes=22_000))
+    assert world.line == [32, 6] and summary(found) == (6, "one", "clusters") and not found.met
+    assert found.config.max_texels == pytest.approx((_FULL * 22_000 - 18_000) / 2 - 6 * _GAPS, abs=2)
     # A texel limit does not stand in the way: trials keep it.
     found = choosing(World(rising), BudgetConfig(target_psnr=32, texels=500))
     assert summary(found) == (8, "one", "clusters") and found.met and found.config.max_texels == 500
 
 
 def test_a_target_is_not_given_up_for_a_trial_that_is_too_much(choosing: Choosing) -> None:
-    """Three billboards reach it and do not pack at all; four do both."""
-    world = World(rising, size=lambda count, texels: 2 * texels if count != 3 else 10**6)
-    found = choosing(world, BudgetConfig(target_psnr=25, bytes=20_000))
-    assert summary(found) == (4, "one", "clusters") and found.met
-    assert {trial.billboards for trial in found.trials if trial.psnr >= 25} == {3, 4}
+    """Of the numbers that reach it, 24 do not pack at all, and 32 do."""
+    world = World(rising, size=lambda count, texels: 2 * texels if count != 24 else 10**6)
+    found = choosing(world, BudgetConfig(target_psnr=37, bytes=20_000))
+    assert summary(found) == (32, "one", "clusters") and found.met
+    assert {trial.billboards for trial in found.trials if trial.psnr >= 37} == {24, 32}
 
 
 def test_of_all_trials_that_reach_a_target_the_smallest_counts(choosing: Choosing) -> None:
     """Of those within the limit, the last one left less of it. One between them was too large by far."""
     world = World(rising, texels=10**6, size=lambda count, texels: 20_000 if texels <= 50_000 else 400_000)
     found = choosing(world, BudgetConfig(target_psnr=20, bytes=100_000))
-    assert world.line == [1, 1, 1] and found.config.billboards == 1 and found.chosen == 2 and found.met
+    assert world.line[-3:] == [1, 1, 1] and found.config.billboards == 1 and found.chosen == len(found.trials) - 1 and found.met
 
 
 def test_auto_stops_at_the_knee(choosing: Choosing) -> None:
-    """Twice as many are to gain a certain number of decibels; two steps that do not are the end."""
-    world = World(lambda count, sides, placement: 20 + 3 * math.log2(min(count, 4)) + 0.3 * math.log2(max(count / 4, 1)) - (sides != "one"))
-    found = choosing(world, BudgetConfig(auto=True), FitConfig(placement="clusters"))
-    assert world.line == [1, 2, 4, 8, 16, 6] and summary(found) == (4, "one", "clusters") and found.met
-    assert world.others == [(2, "two", "clusters")]
+    """More than 48 are hardly better, and fewer are clearly worse."""
+    world = World(lambda count, *kind: 20 + 3 * math.log2(min(count, 48)) + 0.3 * math.log2(max(count / 48, 1)))
+    found = choosing(world, BudgetConfig(auto=True))
+    assert world.line == [384, 192, 96, 48, 24] and world.others == [] and summary(found) == (48, "one", "clusters") and found.met
 
 
 @pytest.mark.parametrize(("gain", "last"), [(MIN_GAIN_DB + 0.01, MOST), (MIN_GAIN_DB - 0.01, 1)])
 def test_auto_goes_as_far_as_it_pays(choosing: Choosing, gain: float, last: int) -> None:
-    """By what a doubling gains, though most steps are smaller than that."""
+    """By what a doubling of the bytes gains."""
     world = World(lambda count, sides, placement: 20 + gain * math.log2(count) - (sides != "one") - (placement == "even"))
     found = choosing(world, BudgetConfig(auto=True))
-    assert summary(found) == (last, "one", "clusters") and world.line == (DOUBLED if last > 1 else [1, 2, 4])
+    assert summary(found) == (last, "one", "clusters") and world.line == (HALVED if last == 1 else HALVED[:2])
 
 
-def test_auto_steps_over_one_that_was_unlucky(choosing: Choosing) -> None:
-    world = World(curve(n1=20, n2=22, n4=22.5, n8=26, n16=26.2, n32=26.4))
-    assert summary(choosing(world, BudgetConfig(auto=True))) == (8, "one", "clusters")
-    assert world.line == [1, 2, 4, 8, 16, 32, 12]
-
-
-def test_auto_goes_on_to_the_number_between_if_it_pays(choosing: Choosing) -> None:
-    quality = {"n1": 20, "n2": 22, "n4": 24, "n8": 24.6, "n16": 24.7, "even6": 20, "two3": 20}
-    for psnr, best in ((24.3, 4), (24.5, 6)):
-        assert choosing(World(curve(**quality, n6=psnr)), BudgetConfig(auto=True)).config.billboards == best
+def test_auto_counts_bytes_and_not_billboards(choosing: Choosing) -> None:
+    """A small gain is worth many billboards that take few bytes."""
+    quality = lambda count, *kind: 20 + 0.1 * math.log2(count)  # noqa: E731
+    for bare, best in ((10**7, MOST), (0, 1)):
+        assert choosing(World(quality, bare=lambda count, bare=bare: bare), BudgetConfig(auto=True)).config.billboards == best
 
 
 def test_auto_within_a_limit(choosing: Choosing) -> None:
     world = World(rising)
     found = choosing(world, BudgetConfig(auto=True, vertices=24, texels=5000))
-    assert world.line == [1, 2, 4, 6] and summary(found) == (6, "one", "clusters") and found.config.max_texels == 5000
+    assert world.line == [6, 3] and summary(found) == (6, "one", "clusters") and found.config.max_texels == 5000
 
 
 def test_auto_may_spend_the_vertices_of_the_knee_otherwise(choosing: Choosing) -> None:
-    knee = {"n1": 20, "n2": 22, "n3": 23, "n4": 24, "n6": 24.1, "n8": 24.2}
-    assert summary(choosing(World(curve(**knee, two2=24.05)), BudgetConfig(auto=True))) == (2, "two", "clusters")
-    assert summary(choosing(World(curve(**knee, even4=24.05)), BudgetConfig(auto=True))) == (4, "one", "even")
+    knee = {"n12": 24.2, "n6": 24, "n3": 20}
+    budget = BudgetConfig(auto=True, vertices=48)
+    assert summary(choosing(World(curve(**knee, two3=24.05)), budget)) == (3, "two", "clusters")
+    assert summary(choosing(World(curve(**knee, even6=24.05)), budget)) == (6, "one", "even")
 
 
 @pytest.mark.parametrize("better", [-1.1, -0.9, 0.3, 0.9, 1.1])
 def test_a_little_better_may_be_luck(choosing: Choosing, better: float) -> None:
     """Of two that differ by little, the one of more vertices if there is a limit to them, or fewer for a target; otherwise the better."""
-    quality = curve(n1=20, n2=22, n3=23, n4=24, n6=25, n8=26 + better * LUCK, n16=26, n12=24, n24=21, n32=21, n48=21)
-    for budget, expected in (
-        (BudgetConfig(target_psnr=30, vertices=64), 16 if better < 1 else 8),
-        (BudgetConfig(target_psnr=30), 16 if better < -1 else 8),
-        (BudgetConfig(target_psnr=30, texels="1M"), 16 if better < -1 else 8),
-    ):
-        assert choosing(World(quality), budget).config.billboards == expected
     quality = curve(n6=25, n8=26 + better * LUCK, n12=26, n16=21, n24=20.5, n32=20, n48=21)
     for budget, expected in (
+        (BudgetConfig(target_psnr=30, texels="3k", vertices=48), 12 if better < 1 else 8),
+        (BudgetConfig(target_psnr=30, texels="3k"), 12 if better < -1 else 8),
         (BudgetConfig(texels="3k", vertices=48), 12 if better < 1 else 8),
         (BudgetConfig(texels="3k"), 12 if better < 0 else 8),
         (BudgetConfig(bytes="6k"), 12 if better < 0 else 8),
     ):
         world = World(quality)
         assert choosing(world, budget).config.billboards == expected
-        assert world.others == ([] if expected == 12 else [(4, "two", "clusters"), (8, "one", "even")])
+        assert world.others == ([] if expected == 12 or budget.target_psnr else [(4, "two", "clusters"), (8, "one", "even")])
 
 
 @pytest.mark.parametrize(("better", "expected"), [(0.9, 12), (1.1, 6)])
@@ -621,15 +635,15 @@ def test_fewer_than_the_vertices_allow_are_chosen_only_if_they_are_better(choosi
 def test_luck_does_not_make_up_for_a_number(choosing: Choosing) -> None:
     """It is counted from the best, and not from each to the next."""
     step = 0.7 * LUCK
-    quality = curve(n1=26 - 2 * step, n2=26 - step, n4=26, n8=26 - step, n16=26 - 2 * step, n32=26 - 3 * step)
-    assert choosing(World(quality), BudgetConfig(target_psnr=30, vertices=128)).config.billboards == 8
-    assert choosing(World(quality), BudgetConfig(target_psnr=30)).config.billboards == 2
+    quality = curve(n32=26 - 2 * step, n64=26 - step, n128=26, n256=26 - step, n384=26 - 2 * step)
+    assert choosing(World(quality), BudgetConfig(target_psnr=30, texels=3000, vertices=10_000)).config.billboards == 256
+    assert choosing(World(quality), BudgetConfig(target_psnr=30, texels=3000)).config.billboards == 64
 
 
 def test_of_equals_the_first_is_chosen(choosing: Choosing) -> None:
     """Which trial it is, not only what it is like: two-sided ones have the same number of vertices."""
-    found = choosing(World(lambda *kind: 20.0), BudgetConfig(target_psnr=20))
-    assert found.chosen == 0 and len(found.trials) == 1
+    found = choosing(World(lambda *kind: 20.0), BudgetConfig(vertices=8))
+    assert [trial.vertices for trial in found.trials] == [4, 8, 8, 8] and found.chosen == 1
 
 
 # What is fitted for a trial.
