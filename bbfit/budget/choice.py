@@ -25,8 +25,9 @@ EACH_TEXELS, BYTES, BYTES_POWER = 100, 6_500, 2.5
 """Roughly how many billboards limits are first spent on, in views of 256 pixels: the largest number to try of which each may have
 ``EACH_TEXELS`` texels, and which is not above (bytes / ``BYTES``) ** ``BYTES_POWER``: 32 for 26 kB, 128 for 45 kB, 384 for 70 kB. More
 billboards need hardly more texels together, and each takes about 120 bytes besides."""
-MIN_GAIN_DB = 0.75
-"""Least gain, in dB, for which ``auto`` doubles the bytes of the model."""
+MIN_GAIN_DB = 0.35
+"""Least gain of short fits, in dB, for which ``auto`` doubles the bytes of the model. Fits in full gain about 0.4 dB more: 0.79 in place of
+0.48 for an aspen of 48 to 384 billboards, and 0.67 in place of 0.11 for a poplar of 192 to 290 (hard edges, held-out views)."""
 LEAST_VIEWS = 5
 """Least number of training views. Every fifth of them is for validation."""
 # Most billboards for which evenly placed and two-sided ones are tried too: the more there are, the less it matters.

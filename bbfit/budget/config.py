@@ -25,7 +25,7 @@ class BudgetConfig:
     target_psnr: Annotated[float, Range(0, 100, open_low=True)] | None = None
     """PSNR in dB, the mean over four backgrounds, to reach on validation views with as few billboards as possible."""
     auto: bool = False
-    """Choose as many billboards as are worth their bytes: twice the bytes have to gain 0.75 dB."""
+    """Choose as many billboards as are worth their bytes: twice the bytes have to gain 0.35 dB in short fits."""
 
     def __post_init__(self) -> None:
         check_fields(self)
