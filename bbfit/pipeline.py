@@ -150,6 +150,8 @@ class RunResult:
     """The names of the stages whose results were current."""
     missed: float | None = None
     """The target PSNR in dB, if the trials of the budget did not reach it on the validation views."""
+    bound: int | None = None
+    """The largest number of billboards that was allowed, if it keeps the model below half of the bytes of the budget."""
 
 
 @dataclass(frozen=True)
@@ -161,6 +163,8 @@ class Fitted:
     model: ShippedModel
     """What is exported of them."""
     missed: float | None
+    """As in :class:`RunResult`."""
+    bound: int | None
     """As in :class:`RunResult`."""
     seconds: float
     """Seconds that the choice of the model's outline took."""
@@ -230,7 +234,7 @@ def _finished(prepared: Prepared, config: RunConfig, on_progress: OnProgress, on
     record.run(export_stage(record.folder, model, report, max_bytes), on_progress)
     record.run(report_stage(record.folder, report, model, views, _facts(record)), on_progress)
     record.finish()
-    return RunResult(record.folder, made.cloud, report, tuple(record.skipped), made.missed)
+    return RunResult(record.folder, made.cloud, report, tuple(record.skipped), made.missed, made.bound)
 
 
 def fitted(
@@ -256,7 +260,9 @@ def fitted(
     else:
         model = finest_within_bytes(cloud, exports, max_bytes, on_progress)
         record.head["config"]["export"] |= {"outline": model.config.outline, "corners": model.config.corners}
-    return Fitted(cloud, model, missed, time.perf_counter() - started)
+    spare = config.budget.vertices is None and max_bytes is not None and 2 * len(model.glb) < max_bytes
+    bound = fit_config.most_billboards if spare and fit_config.billboards == fit_config.most_billboards else None
+    return Fitted(cloud, model, missed, bound, time.perf_counter() - started)
 
 
 @contextlib.contextmanager

@@ -208,6 +208,25 @@ def test_a_target_that_is_missed_is_told(tmp_path: Path, target: float, missed: 
     assert written(tmp_path)["met"] is (missed is None) and written(tmp_path)["budget"] == {"vertices": 4, "target_psnr": target}
 
 
+@pytest.mark.parametrize(
+    ("budget", "most", "bound"),
+    [
+        (BudgetConfig(bytes="1M"), 2, 2),
+        (BudgetConfig(bytes="1M", vertices=8), 2, None),
+        (BudgetConfig(bytes="20k"), 2, None),
+        (BudgetConfig(texels="1k"), 2, None),
+    ],
+)
+def test_bytes_that_more_billboards_would_use_are_told(tmp_path: Path, budget: BudgetConfig, most: int, bound: int | None) -> None:
+    """Also by a run that finds everything done."""
+    config = RunConfig(fit=dataclasses.replace(FIT, least_billboards=1, most_billboards=most), budget=budget)
+    for skipped in ((), STAGES):
+        result = run(VIEWS, tmp_path, config)
+        assert result.bound == bound and result.skipped == skipped
+    size = (tmp_path / "model.glb").stat().st_size
+    assert bound is None or 2 * size < 10**6
+
+
 def test_the_model_has_no_more_bytes_than_asked_for(tmp_path: Path) -> None:
     """A second run finds it done."""
     config = RunConfig(fit=FIT, budget=BudgetConfig(bytes="20k", vertices=8), export=ExportConfig(padding=48))

@@ -288,6 +288,13 @@ def test_a_missed_target_is_said_and_no_failure(views_folder: Path, tmp_path: Pa
     assert "no short fit within the budget reached 90.5 dB" in " ".join(capsys.readouterr().out.split())
 
 
+def test_bytes_that_are_left_are_said(views_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bounds = ["--least-billboards", "1", "--most-billboards", "2"]
+    assert main(["fit", str(views_folder), "--out", str(tmp_path), *TRIALS, *bounds, "--bytes", "1M"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "less than half of the limit; more billboards look better: allow more than 2 with --most-billboards" in said
+
+
 @pytest.mark.parametrize("command", ["fit", "run"])
 @pytest.mark.parametrize(
     ("options", "says"),

@@ -62,6 +62,9 @@ def show(result: RunResult, *, thesis: bool) -> None:
             f"no short fit within the budget reached {result.missed:g} dB on validation views; this is the best one, fitted for longer",
             style="yellow",
         )
+    if result.bound is not None:
+        said = f"the model takes {result.report.bytes.model:,} bytes, less than half of the limit; more billboards look better"
+        out_console.print(f"{said}: allow more than {result.bound} with --most-billboards", style="yellow", soft_wrap=True)
     out_console.print(
         f"results in {result.folder}: report.html shows all; model.glb, model.obj, metrics.json, cloud.safetensors", soft_wrap=True
     )
