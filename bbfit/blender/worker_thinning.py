@@ -27,6 +27,8 @@ RECTANGLE = 2
 DOUBLE = 0.5
 # Vertices of split bark are one if they are so near each other, in meters. Blender merges none at a distance of 0.
 MERGED = 1e-6
+# The attribute of polygons that holds their island before edges collapse.
+ISLAND = "bbfit_island"
 # Bark and foliage may exceed their numbers of triangles by this factor. If more remain, further parts go, at least a tenth of them at a
 # time, in at most so many attempts.
 OVERSHOOT, ATTEMPTS, FEWER = 1.01, 8, 0.9
@@ -64,8 +66,8 @@ def thinned(meshes: list[Any], triangles: int) -> list[list[Any]]:
     What remains of each mesh are up to two meshes, in the same frame. Bark and foliage share the triangles by the areas that one sees of
     them. Both keep as many parts as can have a few triangles each (``BARK_TRIANGLES``, ``LEAF_TRIANGLES``): leaves evenly, and large parts
     of the bark more likely than small ones, so that the trunk stays. The edges of each kind collapse where this changes its shape least.
-    Then leaves are enlarged about their centers until each material of foliage has its former area (Cook et al., "Stochastic
-    Simplification of Aggregate Detail", SIGGRAPH 2007).
+    Then each leaf gets back its center and its area, and more area for the leaves that are gone (Cook et al., "Stochastic Simplification
+    of Aggregate Detail", SIGGRAPH 2007).
     """
     originals = [islands(mesh) for mesh in meshes]
     points = np.concatenate([coordinates(mesh)[np.unique(each.triangles)] for mesh, each in zip(meshes, originals, strict=True)])
@@ -84,9 +86,11 @@ def thinned(meshes: list[Any], triangles: int) -> list[list[Any]]:
     stems = reduced(meshes, originals, bark, triangles - of_leaves, BARK_TRIANGLES, by_area=True)
     rest = triangles - sum(len(mesh.loop_triangles) for mesh in stems if mesh)
     crowns = reduced(meshes, originals, leaves, rest, RECTANGLE if textured else LEAF_TRIANGLES, by_area=False, sides=sides)
-    for original, crown in zip(originals, crowns, strict=True):
+    for mesh, original, crown in zip(meshes, originals, crowns, strict=True):
         if crown:
-            restore_area(crown, original)
+            restore_leaves(crown, original, coordinates(mesh))
+    for mesh in filter(None, [*stems, *crowns]):
+        mesh.attributes.remove(mesh.attributes[ISLAND])
     return [[mesh for mesh in both if mesh] for both in zip(stems, crowns, strict=True)]
 
 
@@ -187,16 +191,16 @@ def spread(points: np.ndarray) -> np.ndarray:
 def only(mesh: Any, original: Islands, kept: np.ndarray, *, merge: bool) -> Any:
     """A copy of a mesh with the polygons of the ``kept`` triangles alone; an island is kept as a whole or not at all.
 
-    ``merge`` makes vertices of the same place one.
+    ``merge`` makes vertices of the same place one. Polygons have the attribute ``ISLAND``.
     """
     import bmesh
 
-    polygons = np.empty(len(original.triangles), np.int32)
-    mesh.loop_triangles.foreach_get("polygon_index", polygons)
-    stays = np.zeros(len(mesh.polygons), bool)
-    stays[polygons[kept]] = True
+    polygons = polygons_of(mesh)
+    stays, labels = np.zeros(len(mesh.polygons), bool), np.zeros(len(mesh.polygons), np.int32)
+    stays[polygons[kept]], labels[polygons] = True, original.labels[original.triangles[:, 0]]
     copy, edited = mesh.copy(), bmesh.new()
-    edited.from_mesh(mesh)
+    copy.attributes.new(ISLAND, "INT", "FACE").data.foreach_set("value", labels)
+    edited.from_mesh(copy)
     bmesh.ops.delete(edited, geom=[face for face in edited.faces if not stays[face.index]], context="FACES")
     if merge:
         bmesh.ops.remove_doubles(edited, verts=edited.verts, dist=MERGED)
@@ -212,11 +216,9 @@ def islands(mesh: Any) -> Islands:
     mesh.loop_triangles.foreach_get("vertices", triangles.ravel())
     areas = np.empty(len(triangles), np.float32)
     mesh.loop_triangles.foreach_get("area", areas)
-    polygons = np.empty(len(triangles), np.int32)
-    mesh.loop_triangles.foreach_get("polygon_index", polygons)
     materials = np.empty(len(mesh.polygons), np.int32)
     mesh.polygons.foreach_get("material_index", materials)
-    points, materials = coordinates(mesh), materials[polygons]
+    points, materials = coordinates(mesh), materials[polygons_of(mesh)]
     links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
     own, _ = connected(links, len(points))
     places = numbered(points)
@@ -267,17 +269,37 @@ def coordinates(mesh: Any) -> np.ndarray:
     return values
 
 
-def restore_area(mesh: Any, original: Islands) -> None:
-    """Enlarge the islands of a mesh of foliage until each material has its area in ``original``."""
-    current = islands(mesh)
-    points = coordinates(mesh)
-    growth = np.ones(int(current.labels.max(initial=0)) + 1)
+def polygons_of(mesh: Any) -> np.ndarray:
+    """The polygon of each triangle of a mesh, [T]."""
+    polygons = np.empty(len(mesh.loop_triangles), np.int32)
+    mesh.loop_triangles.foreach_get("polygon_index", polygons)
+    return polygons
+
+
+def restore_leaves(mesh: Any, original: Islands, places: np.ndarray) -> None:
+    """Give each remaining leaf of a mesh of foliage its center of area in ``original``, whose vertices have ``places``, and its area there,
+    enlarged so that each material has its area in ``original``. No leaf shrinks, or grows by more than ``MAX_GROWTH``.
+    """
+    current, points = islands(mesh), coordinates(mesh)
+    sources = np.empty(len(mesh.polygons), np.int32)
+    mesh.attributes[ISLAND].data.foreach_get("value", sources)
+    leaf = sources[polygons_of(mesh)]
+    had, before = centers_of_area(original, places, original.labels[original.triangles[:, 0]], len(original.centers))
+    has, after = centers_of_area(current, points, leaf, len(had))
+    growth = np.ones(len(had))
     for material in np.unique(current.materials):
-        before, after = original.materials == material, current.materials == material
-        area = current.areas[after].sum(dtype=np.float64)
-        if area > 0:
-            factor = np.sqrt(original.areas[before].sum(dtype=np.float64) / area)
-            growth[current.labels[current.triangles[after]].ravel()] = np.clip(factor, 1.0, MAX_GROWTH)
-    centers = current.centers[current.labels]
-    mesh.vertices.foreach_set("co", (centers + growth[current.labels, None] * (points - centers)).astype(np.float32).ravel())
+        kept = np.unique(leaf[current.materials == material])
+        missing = original.areas[original.materials == material].sum(dtype=np.float64) / had[kept].sum()
+        growth[kept] = np.clip(np.sqrt(missing * had[kept] / has[kept]), 1.0, MAX_GROWTH)
+    corners, leaves = current.triangles.ravel(), np.repeat(leaf, 3)
+    points[corners] = before[leaves] + growth[leaves, None] * (points[corners] - after[leaves])
+    mesh.vertices.foreach_set("co", points.ravel())
     mesh.update()
+
+
+def centers_of_area(of: Islands, points: np.ndarray, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Areas, [I], and centers of area, [I, 3], of ``count`` parts of a mesh with vertices at ``points``, from the part of each triangle."""
+    weights = np.maximum(of.areas.astype(np.float64), 1e-30)
+    moments = weights[:, None] * points[of.triangles].mean(1)
+    areas = np.maximum(np.bincount(labels, weights, count), 1e-30)
+    return areas, np.stack([np.bincount(labels, moment, count) / areas for moment in moments.T], -1)
