@@ -122,6 +122,35 @@ def trunk(*, flat: bool = False) -> trimesh.Trimesh:
     return trimesh.Trimesh(points, np.arange(len(points)).reshape(-1, 3), vertex_normals=normals, process=False)
 
 
+def stars(count: int) -> tuple[trimesh.Trimesh, np.ndarray, np.ndarray]:
+    """Leaves with eight points, of 16 triangles each, small and large ones, around (0, 3.5, 0); their centers, and their areas."""
+    random, turn = np.random.default_rng(3), np.arange(16) * np.pi / 8
+    reach = np.where(np.arange(16) % 2, 0.03, 0.06) * random.uniform(0.7, 1.3, (count, 16)) * np.where(np.arange(count) % 2, 1, 2)[:, None]
+    frames = np.linalg.qr(random.normal(size=(count, 3, 3)))[0][:, :2]
+    rims = (reach[..., None] * np.stack([np.cos(turn), np.sin(turn)], -1)) @ frames
+    lattice = np.stack(np.meshgrid(*[np.arange(-2, 3) * 0.4] * 3), -1).reshape(-1, 1, 3)
+    middles = lattice[:count] + np.array([0, 3.5, 0])
+    corners = np.concatenate([middles, middles + rims], 1)
+    fan = np.stack([np.zeros(16, int), 1 + np.arange(16), 1 + np.roll(np.arange(16), -1)], -1)
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), (17 * np.arange(count)[:, None, None] + fan).reshape(-1, 3), process=False)
+    areas = mesh.area_faces.reshape(count, 16)
+    return mesh, (areas[..., None] * mesh.triangles_center.reshape(count, 16, 3)).sum(1) / areas.sum(1)[:, None], areas.sum(1)
+
+
+def test_leaves_keep_their_centers_and_areas(tmp_path: Path) -> None:
+    """Of leaves that collapse to a few triangles, large ones stay large, and none moves. They grow for the leaves that are gone."""
+    leaf, centers, areas = stars(125)
+    tree = written(tmp_path / "tree.glb", leaf=leaf, bark=trunk())
+    for triangles in (1200, 400):
+        found = parts(tree_as_glb(tree, tmp_path / f"{triangles}.glb", triangles=triangles))[1]["leaf"]
+        found = trimesh.Trimesh(found.vertices, found.faces)  # merged
+        own = [part.area_faces @ part.triangles_center / part.area for part in found.split(only_watertight=False)]
+        nearest = np.linalg.norm(np.array(own)[:, None] - centers[None], axis=-1)
+        np.testing.assert_allclose(nearest.min(1), 0, atol=2e-4)
+        ratios = np.array([part.area for part in found.split(only_watertight=False)]) / areas[nearest.argmin(1)]
+        np.testing.assert_allclose(ratios, areas.sum() / areas[nearest.argmin(1)].sum(), rtol=2e-3)
+
+
 def written(path: Path, **meshes: trimesh.Trimesh) -> Path:
     """A GLB of meshes with materials of their names."""
     for name, mesh in meshes.items():
