@@ -692,7 +692,7 @@ def test_a_number_is_searched_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trials_module, "find_placement", search)
     monkeypatch.setattr(trials_module, "placement_points", sample)
     found = choose(
-        ViewDataset.load(DATA / "views"), dataclasses.replace(QUICK, placement="clusters"), BudgetConfig(texels="2k", vertices=12)
+        ViewDataset.load(DATA / "views"), dataclasses.replace(QUICK, placement="clusters"), BudgetConfig(texels="2k", vertices=4)
     )
     assert len(searched) == len(set(searched)) and len(sampled) == 1
     tried = [(trial.billboards, trial.sides) for trial in found.trials]
