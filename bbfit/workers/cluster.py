@@ -27,8 +27,8 @@ from bbfit.workers.tasks import Outcome, Task, attempt
 
 Files = dict[str, bytes]
 """The contents of files by their paths relative to a folder."""
-# Without these options, Ray starts a dashboard and prints hints.
-_QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "include_dashboard": False}
+# Without these options, Ray prints hints.
+_QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
 # The color codes in Ray's messages.
 _COLORS = re.compile("\x1b\\[[0-9;]*m")
 
@@ -55,10 +55,10 @@ class RayWorkers:
         if not ray.is_initialized():
             try:
                 with _same_handlers():
-                    if address == "local":
-                        ray.init(**_QUIET)
+                    if address == "local":  # without an address, Ray would join a cluster of this machine, if it finds one
+                        ray.init("local", include_dashboard=False, **_QUIET)
                     else:
-                        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+                        ray.init(address, **_QUIET)
             except (ConnectionError, ValueError, RuntimeError) as error:
                 fail(
                     "ray",

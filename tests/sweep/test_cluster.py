@@ -129,6 +129,11 @@ def test_trees_are_rendered_on_the_cluster_and_their_views_come_back(cluster: Cl
     assert again.kept == 2 and pictures == {path: path.stat().st_mtime_ns for path in (tmp_path / "trees").rglob("images/*.png")}
 
 
+def test_local_workers_do_not_join_a_running_cluster(cluster: Cluster) -> None:
+    with RayWorkers(SweepConfig(ray="local")):
+        assert ray.get_runtime_context().gcs_address != cluster.address
+
+
 def test_failures_on_a_cluster_are_recorded(cluster: Cluster, tmp_path: Path) -> None:
     """Bad input, a fault, and a process that kills itself more often than it is started again."""
     marks = tmp_path / "marks"
