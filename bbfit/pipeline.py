@@ -260,7 +260,7 @@ def fitted(
     else:
         model = finest_within_bytes(cloud, exports, max_bytes, on_progress)
         record.head["config"]["export"] |= {"outline": model.config.outline, "corners": model.config.corners}
-    spare = config.budget.vertices is None and max_bytes is not None and 2 * len(model.glb) < max_bytes
+    spare = max_bytes is not None and 2 * len(model.glb) < max_bytes
     bound = fit_config.most_billboards if spare and fit_config.billboards == fit_config.most_billboards else None
     return Fitted(cloud, model, missed, bound, time.perf_counter() - started)
 

@@ -212,7 +212,7 @@ def test_a_target_that_is_missed_is_told(tmp_path: Path, target: float, missed: 
     ("budget", "most", "bound"),
     [
         (BudgetConfig(bytes="1M"), 2, 2),
-        (BudgetConfig(bytes="1M", vertices=8), 2, None),
+        (BudgetConfig(bytes="1M", vertices=4), 2, None),
         (BudgetConfig(bytes="20k"), 2, None),
         (BudgetConfig(texels="1k"), 2, None),
     ],
@@ -223,8 +223,6 @@ def test_bytes_that_more_billboards_would_use_are_told(tmp_path: Path, budget: B
     for skipped in ((), STAGES):
         result = run(VIEWS, tmp_path, config)
         assert result.bound == bound and result.skipped == skipped
-    size = (tmp_path / "model.glb").stat().st_size
-    assert bound is None or 2 * size < 10**6
 
 
 def test_the_model_has_no_more_bytes_than_asked_for(tmp_path: Path) -> None:

@@ -198,7 +198,11 @@ TRIALS = ["--placement", "even", "--steps", "3", "--views-per-step", "1"]
         (["--texels", "1.5k"], {"texels": "1.5k"}, None),
         (["--bytes", "9k"], {"bytes": "9k"}, None),
         (["--bytes", "9000", "--vertices", "4"], {"vertices": 4, "bytes": 9000}, None),
-        (["--target-psnr", "3"], {"target_psnr": 3.0}, [(1, "one")]),
+        (
+            ["--target-psnr", "3", "--least-billboards", "1", "--most-billboards", "4"],
+            {"target_psnr": 3.0},
+            [(4, "one"), (1, "one")],
+        ),
         (["--auto", "--vertices", "4"], {"vertices": 4, "auto": True}, [(1, "one")]),
     ],
 )
@@ -292,7 +296,7 @@ def test_bytes_that_are_left_are_said(views_folder: Path, tmp_path: Path, capsys
     bounds = ["--least-billboards", "1", "--most-billboards", "2"]
     assert main(["fit", str(views_folder), "--out", str(tmp_path), *TRIALS, *bounds, "--bytes", "1M"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "less than half of the limit; more billboards look better: allow more than 2 with --most-billboards" in said
+    assert "less than half of the limit; more billboards look better near by: allow more than 2 with --most-billboards" in said
 
 
 @pytest.mark.parametrize("command", ["fit", "run"])

@@ -15,6 +15,8 @@ import numpy as np
 FOLIAGE_LENGTH = 0.25
 # Leaves are enlarged by at most this factor to compensate for removed leaves.
 MAX_GROWTH = 4.0
+# How often the growth of leaves is corrected for those that may not grow as much.
+ROUNDS = 8
 # What is seen of the area of a stem, whose far side is hidden, relative to that of a leaf. A quarter is no better.
 BARK_SEEN = 0.5
 # Triangles that a leaf or a part of the bark keeps in the mean. Parts that cannot have them go. Fewer leaves of more triangles each are
@@ -211,14 +213,7 @@ def only(mesh: Any, original: Islands, kept: np.ndarray, *, merge: bool) -> Any:
 
 def islands(mesh: Any) -> Islands:
     """Compute the connected components of a mesh."""
-    mesh.calc_loop_triangles()
-    triangles = np.empty((len(mesh.loop_triangles), 3), np.int32)
-    mesh.loop_triangles.foreach_get("vertices", triangles.ravel())
-    areas = np.empty(len(triangles), np.float32)
-    mesh.loop_triangles.foreach_get("area", areas)
-    materials = np.empty(len(mesh.polygons), np.int32)
-    mesh.polygons.foreach_get("material_index", materials)
-    points, materials = coordinates(mesh), materials[polygons_of(mesh)]
+    (triangles, areas, materials), points = triangles_of(mesh), coordinates(mesh)
     links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
     own, _ = connected(links, len(points))
     places = numbered(points)
@@ -276,30 +271,45 @@ def polygons_of(mesh: Any) -> np.ndarray:
     return polygons
 
 
+def triangles_of(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The triangles of a mesh: their vertices, [T, 3], areas, [T], and material slots, [T]."""
+    mesh.calc_loop_triangles()
+    triangles = np.empty((len(mesh.loop_triangles), 3), np.int32)
+    mesh.loop_triangles.foreach_get("vertices", triangles.ravel())
+    areas = np.empty(len(triangles), np.float32)
+    mesh.loop_triangles.foreach_get("area", areas)
+    materials = np.empty(len(mesh.polygons), np.int32)
+    mesh.polygons.foreach_get("material_index", materials)
+    return triangles, areas, materials[polygons_of(mesh)]
+
+
 def restore_leaves(mesh: Any, original: Islands, places: np.ndarray) -> None:
     """Give each remaining leaf of a mesh of foliage its center of area in ``original``, whose vertices have ``places``, and its area there,
     enlarged so that each material has its area in ``original``. No leaf shrinks, or grows by more than ``MAX_GROWTH``.
     """
-    current, points = islands(mesh), coordinates(mesh)
+    (triangles, areas, materials), points = triangles_of(mesh), coordinates(mesh)
     sources = np.empty(len(mesh.polygons), np.int32)
     mesh.attributes[ISLAND].data.foreach_get("value", sources)
     leaf = sources[polygons_of(mesh)]
-    had, before = centers_of_area(original, places, original.labels[original.triangles[:, 0]], len(original.centers))
-    has, after = centers_of_area(current, points, leaf, len(had))
+    of_original = original.labels[original.triangles[:, 0]]
+    had, before = centers_of_area(places[original.triangles].mean(1), original.areas, of_original, len(original.centers))
+    has, after = centers_of_area(points[triangles].mean(1), areas, leaf, len(had))
     growth = np.ones(len(had))
-    for material in np.unique(current.materials):
-        kept = np.unique(leaf[current.materials == material])
-        missing = original.areas[original.materials == material].sum(dtype=np.float64) / had[kept].sum()
-        growth[kept] = np.clip(np.sqrt(missing * had[kept] / has[kept]), 1.0, MAX_GROWTH)
-    corners, leaves = current.triangles.ravel(), np.repeat(leaf, 3)
+    for material in np.unique(materials):
+        kept = np.unique(leaf[materials == material])
+        wanted = original.areas[original.materials == material].sum(dtype=np.float64)
+        share = wanted / had[kept].sum()
+        for _ in range(ROUNDS):  # leaves that may not grow as much leave their part to the others
+            growth[kept] = np.clip(np.sqrt(share * had[kept] / has[kept]), 1.0, MAX_GROWTH)
+            share *= wanted / (has[kept] @ growth[kept] ** 2)
+    corners, leaves = triangles.ravel(), np.repeat(leaf, 3)
     points[corners] = before[leaves] + growth[leaves, None] * (points[corners] - after[leaves])
     mesh.vertices.foreach_set("co", points.ravel())
     mesh.update()
 
 
-def centers_of_area(of: Islands, points: np.ndarray, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Areas, [I], and centers of area, [I, 3], of ``count`` parts of a mesh with vertices at ``points``, from the part of each triangle."""
-    weights = np.maximum(of.areas.astype(np.float64), 1e-30)
-    moments = weights[:, None] * points[of.triangles].mean(1)
-    areas = np.maximum(np.bincount(labels, weights, count), 1e-30)
-    return areas, np.stack([np.bincount(labels, moment, count) / areas for moment in moments.T], -1)
+def centers_of_area(middles: np.ndarray, areas: np.ndarray, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Areas, [I], and centers of area, [I, 3], of ``count`` parts of a mesh, from the middle, the area and the part of each triangle."""
+    weights = np.maximum(areas.astype(np.float64), 1e-30)
+    total = np.maximum(np.bincount(labels, weights, count), 1e-30)
+    return total, np.stack([np.bincount(labels, weights * along, count) / total for along in middles.T], -1)

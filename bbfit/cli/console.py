@@ -63,7 +63,7 @@ def show(result: RunResult, *, thesis: bool) -> None:
             style="yellow",
         )
     if result.bound is not None:
-        said = f"the model takes {result.report.bytes.model:,} bytes, less than half of the limit; more billboards look better"
+        said = f"the model takes {result.report.bytes.model:,} bytes, less than half of the limit; more billboards look better near by"
         out_console.print(f"{said}: allow more than {result.bound} with --most-billboards", style="yellow", soft_wrap=True)
     out_console.print(
         f"results in {result.folder}: report.html shows all; model.glb, model.obj, metrics.json, cloud.safetensors", soft_wrap=True
