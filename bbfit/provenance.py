@@ -26,10 +26,10 @@ VERSIONS: Mapping[str, int] = {
     "export": 20,
     "evaluate": 20,
     "report": 14,
-    "lod": 15,
-    "compare": 13,
+    "lod": 16,
+    "compare": 14,
     "frames": 3,
-    "library": 8,
+    "library": 9,
     "forest": 4,
 }
 """Version of each algorithm. Increase it when the result for the same inputs changes, so that stored results are computed again."""

@@ -61,6 +61,8 @@ class Program:
     """Whether a pixel has four samples, and masks have smooth edges."""
     mipmaps: bool | None = None
     """As :class:`bbfit.ExportConfig` has it."""
+    split: bool | None = None
+    """As :class:`bbfit.ExportConfig` has it."""
     as_it_comes: bool = False
     """Whether Blender keeps shadows of billboards on each other."""
     eevee: bool = False
@@ -83,6 +85,7 @@ class Program:
 # By the name in the table.
 PROGRAMS = {
     "three.js": Program("three", lights=True),
+    "three.js, not split": Program("three", lights=True, split=False),
     "three.js, smooth edges": Program("three", "smooth=centered", smooth=True),
     "Babylon.js": Program("babylon", "anisotropy=1", lights=True),
     "Babylon.js, anisotropic": Program("babylon", lights=True),
@@ -148,9 +151,11 @@ def measure(views: Path, run: Path, every: int, reduction: int, programs: list[s
         program = PROGRAMS[name]
         if light is None if program.as_it_comes else not (program.lights or light is None):
             continue
+        if program.split is not None and cloud.alpha.kind != "blend":
+            continue  # other modes are never split
         if program.imitated and cloud.alpha.kind != "mask":
             continue  # that drawing is of hard edges
-        config = bbfit.ExportConfig(profile=program.profile, mipmaps=program.mipmaps)
+        config = bbfit.ExportConfig(profile=program.profile, mipmaps=program.mipmaps, split=program.split)
         # What the files depend on.
         same = (
             str(replace(config.resolve(), profile=None)),

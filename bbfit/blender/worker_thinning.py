@@ -15,8 +15,6 @@ import numpy as np
 FOLIAGE_LENGTH = 0.25
 # Leaves are enlarged by at most this factor to compensate for removed leaves.
 MAX_GROWTH = 4.0
-# How often the growth of leaves is corrected for those that may not grow as much.
-ROUNDS = 8
 # What is seen of the area of a stem, whose far side is hidden, relative to that of a leaf. A quarter is no better.
 BARK_SEEN = 0.5
 # Triangles that a leaf or a part of the bark keeps in the mean. Parts that cannot have them go. Fewer leaves of more triangles each are
@@ -27,6 +25,10 @@ LEAF_TRIANGLES, BARK_TRIANGLES = 1, 16
 RECTANGLE = 2
 # Leaves are modeled as fronts and backs if more than this share of their triangles has another one of the same corners.
 DOUBLE = 0.5
+# Leaves are flat if the lengths of their vector areas have at least this share of their areas.
+FLAT = 0.7
+# An equilateral triangle whose circumscribed circle has a radius of 1, and its area.
+CORNERS, AREA = np.array([[0, 1], [0.75**0.5, -0.5], [-(0.75**0.5), -0.5]]), 0.75 * 3**0.5
 # Vertices of split bark are one if they are so near each other, in meters. Blender merges none at a distance of 0.
 MERGED = 1e-6
 # The attribute of polygons that holds their island before edges collapse.
@@ -67,9 +69,9 @@ def thinned(meshes: list[Any], triangles: int) -> list[list[Any]]:
 
     What remains of each mesh are up to two meshes, in the same frame. Bark and foliage share the triangles by the areas that one sees of
     them. Both keep as many parts as can have a few triangles each (``BARK_TRIANGLES``, ``LEAF_TRIANGLES``): leaves evenly, and large parts
-    of the bark more likely than small ones, so that the trunk stays. The edges of each kind collapse where this changes its shape least.
-    Then each leaf gets back its center and its area, and more area for the leaves that are gone (Cook et al., "Stochastic Simplification
-    of Aggregate Detail", SIGGRAPH 2007).
+    of the bark more likely than small ones, so that the trunk stays. Flat leaves without pictures stay whole or become a triangle
+    (:func:`flattened`). The edges of all else collapse where this changes its shape least. Then each leaf gets back its center and its
+    area, and more area for the leaves that are gone (Cook et al., "Stochastic Simplification of Aggregate Detail", SIGGRAPH 2007).
     """
     originals = [islands(mesh) for mesh in meshes]
     points = np.concatenate([coordinates(mesh)[np.unique(each.triangles)] for mesh, each in zip(meshes, originals, strict=True)])
@@ -87,7 +89,10 @@ def thinned(meshes: list[Any], triangles: int) -> list[list[Any]]:
     sides = 2 if doubled > DOUBLE * sum(int(each.sum()) for each in leaves) else 1
     stems = reduced(meshes, originals, bark, triangles - of_leaves, BARK_TRIANGLES, by_area=True)
     rest = triangles - sum(len(mesh.loop_triangles) for mesh in stems if mesh)
-    crowns = reduced(meshes, originals, leaves, rest, RECTANGLE if textured else LEAF_TRIANGLES, by_area=False, sides=sides)
+    if textured or not flat(meshes, originals, leaves, sides):
+        crowns = reduced(meshes, originals, leaves, rest, RECTANGLE if textured else LEAF_TRIANGLES, by_area=False, sides=sides)
+    else:
+        crowns = whole_or_flattened(meshes, originals, leaves, rest, sides)
     for mesh, original, crown in zip(meshes, originals, crowns, strict=True):
         if crown:
             restore_leaves(crown, original, coordinates(mesh))
@@ -105,6 +110,82 @@ def shows_picture(mesh: Any, slots: np.ndarray) -> bool:
 def foliage(original: Islands, length: float) -> np.ndarray:
     """Which triangles are foliage, [T]: those of materials all of whose islands are shorter than ``length``."""
     return ~np.isin(original.materials, original.materials[original.lengths >= length])
+
+
+def flat(meshes: list[Any], originals: list[Islands], leaves: list[np.ndarray], sides: int) -> bool:
+    """Whether leaves are flat and have more than a rectangle's triangles a side in the mean."""
+    wide = whole = triangles = count = 0.0
+    for mesh, original, each in zip(meshes, originals, leaves, strict=True):
+        labels, vectors = facing(original, coordinates(mesh), each, sides)
+        wide += float(np.linalg.norm(summed(labels, vectors), axis=-1).sum())
+        whole += float(np.linalg.norm(vectors, axis=-1).sum())
+        triangles, count = triangles + len(labels), count + len(np.unique(labels))
+    return triangles > RECTANGLE * count and wide >= FLAT * whole
+
+
+def facing(original: Islands, points: np.ndarray, chosen: np.ndarray, sides: int) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers of the sides to which the C ``chosen`` triangles belong, [C], and their vector areas, [C, 3].
+
+    Each island has one number, or with two ``sides`` a number for its front and another for its back.
+    """
+    corners = points[original.triangles[chosen]].astype(np.float64)
+    vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    labels = original.labels[original.triangles[chosen, 0]].astype(np.int64)
+    front = vectors[largest(labels, original.areas[chosen])[labels]]
+    return 2 * labels + ((vectors * front).sum(-1) < 0 if sides == 2 else 0), vectors
+
+
+def largest(labels: np.ndarray, areas: np.ndarray) -> np.ndarray:
+    """The index of the largest among the triangles of each label; 0 for labels without triangles."""
+    order, found = np.argsort(areas, kind="stable"), np.zeros(labels.max(initial=-1) + 1, np.int64)
+    found[labels[order]] = order
+    return found
+
+
+def summed(labels: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Sums of ``values``, [C, K], over the elements of each label."""
+    return np.stack([np.bincount(labels, column) for column in values.T], -1)
+
+
+def whole_or_flattened(meshes: list[Any], originals: list[Islands], leaves: list[np.ndarray], triangles: int, sides: int) -> list[Any]:
+    """About ``triangles`` of the ``leaves`` of each mesh, as many leaves as possible, and of these as many whole ones as possible.
+
+    The others have a triangle a side. A mixture looks better than leaves of two or three triangles.
+    """
+    total = sum(int(each.sum()) for each in leaves)
+    count = sum(len(np.unique(original.labels[original.triangles[each, 0]])) for original, each in zip(originals, leaves, strict=True))
+    kept = sampled(originals, leaves, max(triangles, 0) / (sides * count), by_area=False)
+    share = max(triangles - sides * count, 0) / max(total - sides * count, 1)
+    whole = sampled(originals, kept, share, by_area=False)
+    return [flattened(*each, sides) if each[2].any() else None for each in zip(meshes, originals, kept, whole, strict=True)]
+
+
+def flattened(mesh: Any, original: Islands, kept: np.ndarray, whole: np.ndarray, sides: int) -> Any:
+    """The ``kept`` triangles of a mesh, with one triangle for each side of each leaf that is not ``whole``.
+
+    It has the normal, the area and the center of the side, its second moments of area up to a factor, and its tip where the side has it.
+    """
+    rest = np.flatnonzero(kept & ~whole)
+    points = coordinates(mesh)
+    labels, vectors = facing(original, points, kept & ~whole, sides)
+    numbers, labels = np.unique(labels, return_inverse=True)
+    areas = original.areas[rest].astype(np.float64)
+    corners = points[original.triangles[rest]].astype(np.float64)
+    total, centers = centers_of_area(corners.mean(1), areas, labels, len(numbers))
+    offsets = corners - centers[labels][:, None]
+    middles = offsets.sum(1)
+    moments = np.einsum("tik,til->tkl", offsets, offsets) + middles[:, :, None] * middles[:, None, :]
+    spreads = summed(labels, areas[:, None] * moments.reshape(-1, 9)).reshape(-1, 3, 3) / total[:, None, None]
+    sizes, axes = np.linalg.eigh(spreads)
+    along, across = axes[..., 2], axes[..., 1]
+    skewed = summed(labels, (areas * (middles * along[labels]).sum(-1) ** 3)[:, None])
+    along = np.where(skewed < 0, -1, 1) * along
+    turned = (np.cross(along, across) * summed(labels, vectors)).sum(-1, keepdims=True)
+    across = np.where(turned < 0, -1, 1) * across
+    axes = np.sqrt(np.maximum(sizes[:, 1:], 0))[..., None] * np.stack([across, along], 1)
+    axes *= np.sqrt(total / np.maximum(np.linalg.norm(np.cross(axes[:, 0], axes[:, 1]), axis=-1), 1e-30) / AREA)[:, None, None]
+    places = centers[:, None] + CORNERS @ axes
+    return only(mesh, original, whole, (polygons_of(mesh)[rest[largest(labels, areas)]], places), merge=False)
 
 
 def reduced(
@@ -190,10 +271,11 @@ def spread(points: np.ndarray) -> np.ndarray:
     return values
 
 
-def only(mesh: Any, original: Islands, kept: np.ndarray, *, merge: bool) -> Any:
+def only(mesh: Any, original: Islands, kept: np.ndarray, flat: tuple[np.ndarray, np.ndarray] | None = None, *, merge: bool) -> Any:
     """A copy of a mesh with the polygons of the ``kept`` triangles alone; an island is kept as a whole or not at all.
 
-    ``merge`` makes vertices of the same place one. Polygons have the attribute ``ISLAND``.
+    ``merge`` makes vertices of the same place one. ``flat``: further triangles, which are like polygons of the mesh, [F], and have corners
+    at other places, [F, 3, 3]. Polygons have the attribute ``ISLAND``.
     """
     import bmesh
 
@@ -203,7 +285,13 @@ def only(mesh: Any, original: Islands, kept: np.ndarray, *, merge: bool) -> Any:
     copy, edited = mesh.copy(), bmesh.new()
     copy.attributes.new(ISLAND, "INT", "FACE").data.foreach_set("value", labels)
     edited.from_mesh(copy)
-    bmesh.ops.delete(edited, geom=[face for face in edited.faces if not stays[face.index]], context="FACES")
+    faces = list(edited.faces)
+    for polygon, places in zip(*flat, strict=True) if flat else ():
+        like = faces[polygon]
+        corners = [edited.verts.new(place, loop.vert) for place, loop in zip(places.tolist(), like.loops, strict=False)]
+        for loop, other in zip(edited.faces.new(corners, like).loops, like.loops, strict=False):
+            loop.copy_from(other)
+    bmesh.ops.delete(edited, geom=[face for face in faces if not stays[face.index]], context="FACES")
     if merge:
         bmesh.ops.remove_doubles(edited, verts=edited.verts, dist=MERGED)
     edited.to_mesh(copy)
@@ -297,11 +385,8 @@ def restore_leaves(mesh: Any, original: Islands, places: np.ndarray) -> None:
     growth = np.ones(len(had))
     for material in np.unique(materials):
         kept = np.unique(leaf[materials == material])
-        wanted = original.areas[original.materials == material].sum(dtype=np.float64)
-        share = wanted / had[kept].sum()
-        for _ in range(ROUNDS):  # leaves that may not grow as much leave their part to the others
-            growth[kept] = np.clip(np.sqrt(share * had[kept] / has[kept]), 1.0, MAX_GROWTH)
-            share *= wanted / (has[kept] @ growth[kept] ** 2)
+        missing = original.areas[original.materials == material].sum(dtype=np.float64) / had[kept].sum()
+        growth[kept] = np.clip(np.sqrt(missing * had[kept] / has[kept]), 1.0, MAX_GROWTH)
     corners, leaves = triangles.ravel(), np.repeat(leaf, 3)
     points[corners] = before[leaves] + growth[leaves, None] * (points[corners] - after[leaves])
     mesh.vertices.foreach_set("co", points.ravel())

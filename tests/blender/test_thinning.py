@@ -151,6 +151,16 @@ def test_leaves_keep_their_centers_and_areas(tmp_path: Path) -> None:
         np.testing.assert_allclose(ratios, areas.sum() / areas[nearest.argmin(1)].sum(), rtol=2e-3)
 
 
+def test_leaves_are_whole_or_a_triangle(tmp_path: Path) -> None:
+    """Leaves of two or three triangles look worse than a mixture of both."""
+    leaf, _, _ = stars(125)
+    tree = written(tmp_path / "tree.glb", leaf=leaf, bark=trunk())
+    found = parts(tree_as_glb(tree, tmp_path / "few.glb", triangles=1200))[1]["leaf"]
+    found = trimesh.Trimesh(found.vertices, found.faces)  # merged
+    sizes = Counter(len(part.faces) for part in found.split(only_watertight=False))
+    assert sizes.keys() == {1, 16} and sizes.total() == 125 and sizes[16] >= 15
+
+
 def written(path: Path, **meshes: trimesh.Trimesh) -> Path:
     """A GLB of meshes with materials of their names."""
     for name, mesh in meshes.items():
