@@ -128,7 +128,7 @@ def facing(original: Islands, points: np.ndarray, chosen: np.ndarray, sides: int
 
     Each island has one number, or with two ``sides`` a number for its front and another for its back.
     """
-    corners = points[original.triangles[chosen]].astype(np.float64)
+    corners = points[original.triangles[chosen]]
     vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     labels = original.labels[original.triangles[chosen, 0]].astype(np.int64)
     front = vectors[largest(labels, original.areas[chosen])[labels]]

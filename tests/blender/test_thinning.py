@@ -151,14 +151,20 @@ def test_leaves_keep_their_centers_and_areas(tmp_path: Path) -> None:
         np.testing.assert_allclose(ratios, areas.sum() / areas[nearest.argmin(1)].sum(), rtol=2e-3)
 
 
-def test_leaves_are_whole_or_a_triangle(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sides", [1, 2])
+def test_leaves_are_whole_or_a_triangle_a_side(sides: int, tmp_path: Path) -> None:
     """Leaves of two or three triangles look worse than a mixture of both."""
-    leaf, _, _ = stars(125)
-    tree = written(tmp_path / "tree.glb", leaf=leaf, bark=trunk())
-    found = parts(tree_as_glb(tree, tmp_path / "few.glb", triangles=1200))[1]["leaf"]
-    found = trimesh.Trimesh(found.vertices, found.faces)  # merged
-    sizes = Counter(len(part.faces) for part in found.split(only_watertight=False))
-    assert sizes.keys() == {1, 16} and sizes.total() == 125 and sizes[16] >= 15
+    leaf, centers, _ = stars(125)
+    normals = leaf.face_normals.reshape(125, 16, 3)[:, 0]
+    back = trimesh.Trimesh(leaf.vertices, leaf.faces[:, ::-1], process=False)
+    tree = written(tmp_path / "tree.glb", leaf=trimesh.util.concatenate([leaf, back][:sides]), bark=trunk())
+    found = parts(tree_as_glb(tree, tmp_path / "few.glb", triangles=1200 * sides))[1]["leaf"]
+    nearest = np.linalg.norm(found.triangles_center[:, None] - centers[None], axis=-1).argmin(1)
+    same = (found.face_normals * normals[nearest]).sum(-1)
+    np.testing.assert_allclose(np.abs(same), 1, atol=1e-3)
+    for front in (True, False)[:sides]:
+        sizes = Counter(np.bincount(nearest[(same > 0) == front], minlength=125).tolist())
+        assert sizes.keys() == {1, 16} and sizes[16] >= 15
 
 
 def written(path: Path, **meshes: trimesh.Trimesh) -> Path:
