@@ -113,14 +113,14 @@ def foliage(original: Islands, length: float) -> np.ndarray:
 
 
 def flat(meshes: list[Any], originals: list[Islands], leaves: list[np.ndarray], sides: int) -> bool:
-    """Whether leaves are flat and have more than a rectangle's triangles a side in the mean."""
+    """Whether leaves are flat, and some have more than one triangle a side."""
     wide = whole = triangles = count = 0.0
     for mesh, original, each in zip(meshes, originals, leaves, strict=True):
         labels, vectors = facing(original, coordinates(mesh), each, sides)
         wide += float(np.linalg.norm(summed(labels, vectors), axis=-1).sum())
         whole += float(np.linalg.norm(vectors, axis=-1).sum())
         triangles, count = triangles + len(labels), count + len(np.unique(labels))
-    return triangles > RECTANGLE * count and wide >= FLAT * whole
+    return triangles > count and wide >= FLAT * whole
 
 
 def facing(original: Islands, points: np.ndarray, chosen: np.ndarray, sides: int) -> tuple[np.ndarray, np.ndarray]:
