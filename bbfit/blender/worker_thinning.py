@@ -76,12 +76,9 @@ def thinned(meshes: list[Any], triangles: int) -> list[list[Any]]:
     originals = [islands(mesh) for mesh in meshes]
     points = np.concatenate([coordinates(mesh)[np.unique(each.triangles)] for mesh, each in zip(meshes, originals, strict=True)])
     length = FOLIAGE_LENGTH * float(np.linalg.norm(np.ptp(points, axis=0)))
-    leaves = [foliage(original, length) for original in originals]
+    leaves = [~np.isin(each.materials, each.materials[each.lengths >= length]) for each in originals]
     bark = [~each for each in leaves]
-    leaf_area, bark_area = (
-        sum(float(original.areas[each].sum(dtype=np.float64)) for original, each in zip(originals, kind, strict=True))
-        for kind in (leaves, bark)
-    )
+    leaf_area, bark_area = (sum(float(of.areas[each].sum()) for of, each in zip(originals, kind, strict=True)) for kind in (leaves, bark))
     share = leaf_area / max(leaf_area + BARK_SEEN * bark_area, 1e-30)
     of_leaves = min(sum(int(each.sum()) for each in leaves), round(share * triangles))
     textured = any(shows_picture(mesh, original.materials[each]) for mesh, original, each in zip(meshes, originals, leaves, strict=True))
@@ -105,11 +102,6 @@ def shows_picture(mesh: Any, slots: np.ndarray) -> bool:
     """Whether a material in any of these slots of a mesh has a picture."""
     materials = [mesh.materials[slot] for slot in np.unique(slots) if slot < len(mesh.materials)]
     return any(node.type == "TEX_IMAGE" for material in materials if material and material.node_tree for node in material.node_tree.nodes)
-
-
-def foliage(original: Islands, length: float) -> np.ndarray:
-    """Which triangles are foliage, [T]: those of materials all of whose islands are shorter than ``length``."""
-    return ~np.isin(original.materials, original.materials[original.lengths >= length])
 
 
 def flat(meshes: list[Any], originals: list[Islands], leaves: list[np.ndarray], sides: int) -> bool:
@@ -148,15 +140,21 @@ def summed(labels: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def whole_or_flattened(meshes: list[Any], originals: list[Islands], leaves: list[np.ndarray], triangles: int, sides: int) -> list[Any]:
-    """About ``triangles`` of the ``leaves`` of each mesh, as many leaves as possible, and of these as many whole ones as possible.
-
-    The others have a triangle a side. A mixture looks better than leaves of two or three triangles.
-    """
-    total = sum(int(each.sum()) for each in leaves)
-    count = sum(len(np.unique(original.labels[original.triangles[each, 0]])) for original, each in zip(originals, leaves, strict=True))
-    kept = sampled(originals, leaves, max(triangles, 0) / (sides * count), by_area=False)
-    share = max(triangles - sides * count, 0) / max(total - sides * count, 1)
-    whole = sampled(originals, kept, share, by_area=False)
+    """At most ``triangles`` of all ``leaves``: as many leaves as possible, and as many of these as possible whole."""
+    total, count = sum(int(each.sum()) for each in leaves), count_islands(originals, leaves)
+    share, spare = triangles / (sides * count), max(total - sides * count, 1)
+    intact = (triangles - sides * count) / spare
+    for _ in range(ATTEMPTS):
+        kept = sampled(originals, leaves, max(share, 0), by_area=False)
+        whole = sampled(originals, kept, max(intact, 0), by_area=False)
+        over = sum(int(each.sum()) for each in whole) - triangles
+        over += sides * (count_islands(originals, kept) - count_islands(originals, whole))
+        if over <= 0:
+            break
+        if intact > 0:
+            intact -= (over + len(meshes) * total / count) / spare
+        else:
+            share = min(share, 1) - over / (sides * count)
     return [flattened(*each, sides) if each[2].any() else None for each in zip(meshes, originals, kept, whole, strict=True)]
 
 
@@ -175,8 +173,7 @@ def flattened(mesh: Any, original: Islands, kept: np.ndarray, whole: np.ndarray,
     offsets = corners - centers[labels][:, None]
     middles = offsets.sum(1)
     moments = np.einsum("tik,til->tkl", offsets, offsets) + middles[:, :, None] * middles[:, None, :]
-    spreads = summed(labels, areas[:, None] * moments.reshape(-1, 9)).reshape(-1, 3, 3) / total[:, None, None]
-    sizes, axes = np.linalg.eigh(spreads)
+    sizes, axes = np.linalg.eigh(summed(labels, areas[:, None] * moments.reshape(-1, 9)).reshape(-1, 3, 3) / total[:, None, None])
     along, across = axes[..., 2], axes[..., 1]
     skewed = summed(labels, (areas * (middles * along[labels]).sum(-1) ** 3)[:, None])
     along = np.where(skewed < 0, -1, 1) * along
@@ -186,6 +183,11 @@ def flattened(mesh: Any, original: Islands, kept: np.ndarray, whole: np.ndarray,
     axes *= np.sqrt(total / np.maximum(np.linalg.norm(np.cross(axes[:, 0], axes[:, 1]), axis=-1), 1e-30) / AREA)[:, None, None]
     places = centers[:, None] + CORNERS @ axes
     return only(mesh, original, whole, (polygons_of(mesh)[rest[largest(labels, areas)]], places), merge=False)
+
+
+def count_islands(originals: list[Islands], chosen: list[np.ndarray]) -> int:
+    """The number of islands of the ``chosen`` triangles of all meshes."""
+    return sum(len(np.unique(original.labels[original.triangles[each, 0]])) for original, each in zip(originals, chosen, strict=True))
 
 
 def reduced(
@@ -199,7 +201,7 @@ def reduced(
     import bpy
 
     total = sum(int(each.sum()) for each in chosen)
-    count = sum(len(np.unique(original.labels[original.triangles[each, 0]])) for original, each in zip(originals, chosen, strict=True))
+    count = count_islands(originals, chosen)
     if triangles < 1 or not count:
         return [None for _ in meshes]
     mean = total / count
@@ -286,8 +288,7 @@ def only(mesh: Any, original: Islands, kept: np.ndarray, flat: tuple[np.ndarray,
     copy.attributes.new(ISLAND, "INT", "FACE").data.foreach_set("value", labels)
     edited.from_mesh(copy)
     faces = list(edited.faces)
-    for polygon, places in zip(*flat, strict=True) if flat else ():
-        like = faces[polygon]
+    for like, places in zip(map(faces.__getitem__, flat[0]), flat[1], strict=True) if flat else ():
         corners = [edited.verts.new(place, loop.vert) for place, loop in zip(places.tolist(), like.loops, strict=False)]
         for loop, other in zip(edited.faces.new(corners, like).loops, like.loops, strict=False):
             loop.copy_from(other)
@@ -379,10 +380,9 @@ def restore_leaves(mesh: Any, original: Islands, places: np.ndarray) -> None:
     sources = np.empty(len(mesh.polygons), np.int32)
     mesh.attributes[ISLAND].data.foreach_get("value", sources)
     leaf = sources[polygons_of(mesh)]
-    of_original = original.labels[original.triangles[:, 0]]
-    had, before = centers_of_area(places[original.triangles].mean(1), original.areas, of_original, len(original.centers))
-    has, after = centers_of_area(points[triangles].mean(1), areas, leaf, len(had))
-    growth = np.ones(len(had))
+    labels, count = original.labels[original.triangles[:, 0]], len(original.centers)
+    had, before = centers_of_area(places[original.triangles].mean(1), original.areas, labels, count)
+    (has, after), growth = centers_of_area(points[triangles].mean(1), areas, leaf, count), np.ones(count)
     for material in np.unique(materials):
         kept = np.unique(leaf[materials == material])
         missing = original.areas[original.materials == material].sum(dtype=np.float64) / had[kept].sum()
