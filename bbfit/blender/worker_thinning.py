@@ -140,22 +140,25 @@ def summed(labels: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def whole_or_flattened(meshes: list[Any], originals: list[Islands], leaves: list[np.ndarray], triangles: int, sides: int) -> list[Any]:
-    """At most ``triangles`` of all ``leaves``: as many leaves as possible, and as many of these as possible whole."""
-    total, count = sum(int(each.sum()) for each in leaves), count_islands(originals, leaves)
-    share, spare = triangles / (sides * count), max(total - sides * count, 1)
-    intact = (triangles - sides * count) / spare
-    for _ in range(ATTEMPTS):
-        kept = sampled(originals, leaves, max(share, 0), by_area=False)
-        whole = sampled(originals, kept, max(intact, 0), by_area=False)
-        over = sum(int(each.sum()) for each in whole) - triangles
-        over += sides * (count_islands(originals, kept) - count_islands(originals, whole))
-        if over <= 0:
-            break
-        if intact > 0:
-            intact -= (over + len(meshes) * total / count) / spare
-        else:
-            share = min(share, 1) - over / (sides * count)
-    return [flattened(*each, sides) if each[2].any() else None for each in zip(meshes, originals, kept, whole, strict=True)]
+    """At most ``triangles`` of all ``leaves``: as many leaves as possible, and as many of these as possible whole.
+
+    Both are evenly spread. Leaves that are not whole have a triangle a side.
+    """
+    labels = [original.labels[original.triangles[:, 0]] for original in originals]
+    sizes = [np.bincount(label[each], minlength=len(of.centers)) for label, each, of in zip(labels, leaves, originals, strict=True)]
+    places = [np.flatnonzero(size) for size in sizes]
+    order = np.argsort(np.concatenate([spread(of.centers[place]) for of, place in zip(originals, places, strict=True)]), kind="stable")
+    order = order[: max(triangles, 0) // sides]
+    more = np.concatenate([size[place] for size, place in zip(sizes, places, strict=True)])[order] - sides
+    states = np.zeros(sum(map(len, places)), np.int8)  # 1: flattened, 2: whole
+    states[order] = 1 + (np.cumsum(np.maximum(more, 0)) <= triangles - sides * len(order))
+    made = list[Any]()
+    for mesh, original, each, label, place in zip(meshes, originals, leaves, labels, places, strict=True):
+        state = np.zeros(len(original.centers), np.int8)
+        state[place], states = states[: len(place)], states[len(place) :]
+        kept = each & (state[label] > 0)
+        made.append(flattened(mesh, original, kept, kept & (state[label] == 2), sides) if kept.any() else None)
+    return made
 
 
 def flattened(mesh: Any, original: Islands, kept: np.ndarray, whole: np.ndarray, sides: int) -> Any:
@@ -185,11 +188,6 @@ def flattened(mesh: Any, original: Islands, kept: np.ndarray, whole: np.ndarray,
     return only(mesh, original, whole, (polygons_of(mesh)[rest[largest(labels, areas)]], places), merge=False)
 
 
-def count_islands(originals: list[Islands], chosen: list[np.ndarray]) -> int:
-    """The number of islands of the ``chosen`` triangles of all meshes."""
-    return sum(len(np.unique(original.labels[original.triangles[each, 0]])) for original, each in zip(originals, chosen, strict=True))
-
-
 def reduced(
     meshes: list[Any], originals: list[Islands], chosen: list[np.ndarray], triangles: int, least: float, *, by_area: bool, sides: int = 1
 ) -> list[Any]:
@@ -201,7 +199,7 @@ def reduced(
     import bpy
 
     total = sum(int(each.sum()) for each in chosen)
-    count = count_islands(originals, chosen)
+    count = sum(len(np.unique(original.labels[original.triangles[each, 0]])) for original, each in zip(originals, chosen, strict=True))
     if triangles < 1 or not count:
         return [None for _ in meshes]
     mean = total / count
